@@ -1,0 +1,7 @@
+"""`python -m rigidmd`."""
+
+import sys
+
+from rigidmd.cli import main
+
+sys.exit(main())

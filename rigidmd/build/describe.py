@@ -1,0 +1,63 @@
+"""A system in words: what would happen if it ran, and what was left out."""
+
+from math import inf
+
+import numpy as np
+
+from rigidmd.build.system import System
+from rigidmd.scene import Stage
+from rigidmd.units import FEMTOSECOND
+
+
+def describe(system: System) -> str:
+    """Species, degrees of freedom, terms, stages, memory."""
+    scene, freedom = system.scene, system.freedom
+    lines = [f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites"]
+    for k, m in enumerate(system.species):
+        count = int((system.model.species == k).sum())
+        charge = f", net charge {m.charge:+g} e" if m.charge else ""
+        lines.append(
+            f"  {count} {m.name}: {m.kind}, {len(m.masses)} sites, {m.mass:.4f} u, {m.degrees_of_freedom} degrees of "
+            f"freedom each{charge}"
+        )
+    lines.append(f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation")
+    if system.space.volume < inf:
+        edges = " x ".join(f"{edge:.4f}" for edge in system.space)
+        lines.append(f"  box: {edges} Å, {system.density:.4f} g/cm³")
+    else:
+        lines.append("  no box")
+    lines += [f"  {note}" for note in system.notes]
+    lines.append("\ncompiled in:")
+    for name, term in system.terms.items():
+        reach = f"cut-off {system.cutoff:g} Å, {scene.forces.truncation}" if system.cutoff < inf else "no cut-off"
+        lines.append(f"  {name.replace('_', ' ')}: {len(term.position)} sites, {reach}, neighbour list with a skin of {scene.forces.skin_A:g} Å")
+    if len(system.model.inertia) and system.model.inertia.any():
+        lines.append("  rotation: split rotor")
+    if not scene.forces.tail_correction:
+        pass
+    lines.append("left out:")
+    lines += [f"  {reason}" for reason in system.left_out]
+    lines.append("\nstages:")
+    lines += [f"  {k}: {_stage(stage)}" for k, stage in enumerate(scene.stages)]
+    lines.append(f"\nmemory: about {_size(system) / 1e6:.1f} MB for state, forces and neighbour lists")
+    return "\n".join(lines)
+
+
+def _stage(stage: Stage) -> str:
+    rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
+    text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
+    if stage.ensemble == "nvt":
+        text += f", {stage.temperature_K:g} K by {stage.thermostat.replace('_', ' ')}, {stage.thermostat_time_ps:g} ps"
+    return text
+
+
+def _size(value) -> int:
+    """Bytes of all arrays in nested tuples and dictionaries."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, System):
+        # the start and the state that moves; forces and torques on the bodies, twice while energies are evaluated
+        return 4 * _size(value.state) + _size(value.terms) + _size(value.model)
+    if isinstance(value, dict):
+        value = value.values()
+    return sum(_size(part) for part in value) if isinstance(value, tuple) or hasattr(value, "__iter__") and not isinstance(value, str) else 0

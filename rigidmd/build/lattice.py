@@ -1,0 +1,13 @@
+"""A start from nothing but a count and a box: molecules on a lattice, turned at random."""
+
+import numpy as np
+
+
+def lattice(n: int, edges: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    """n points (n, 3) in a box with these edges, on a nearly cubic lattice; which of its places is drawn at random."""
+    edges = np.asarray(edges)
+    shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
+    while shape.prod() < n:
+        shape[np.argmax(edges / shape)] += 1
+    points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    return (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape

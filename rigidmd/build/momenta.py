@@ -1,0 +1,57 @@
+"""Momenta at a temperature, and the degrees of freedom that share it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.dynamics.advance import Model
+from rigidmd.forces.terms import State
+from rigidmd.units import BOLTZMANN
+
+#: Total momentum below this fraction of the sum of |m v| is rounding, not motion.
+AT_REST = 1e-9
+
+
+class Freedom(NamedTuple):
+    """Degrees of freedom; the three of the total momentum, which is zero and stays so, are not counted."""
+
+    translation: int
+    rotation: int
+
+    @property
+    def total(self) -> int:
+        """Both."""
+        return self.translation + self.rotation
+
+
+def freedom_of(model: Model) -> Freedom:
+    """Degrees of freedom of all molecules together."""
+    turning = (model.inertia > 0).sum(axis=1)
+    return Freedom(max(0, 3 * len(model.species) - 3), int(turning[model.species].sum()))
+
+
+def remove_momentum(model: Model, velocity: np.ndarray) -> bool:
+    """Give every molecule the same push so that the total momentum is zero, in place; False if it was already."""
+    mass = model.mass[model.species]
+    momentum = mass @ velocity
+    if np.abs(momentum).max() <= AT_REST * np.abs(mass[:, None] * velocity).sum():
+        return False
+    velocity -= momentum / mass.sum()
+    return True
+
+
+def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:
+    """Maxwell-Boltzmann momenta, in place: zero total momentum; T_trans and T_rot exactly `temperature` (K)."""
+    thermal = BOLTZMANN * temperature
+    mass = model.mass[model.species]
+    freedom = freedom_of(model)
+    state.velocity[:] = rng.standard_normal(state.velocity.shape) * np.sqrt(thermal / mass)[:, None]
+    remove_momentum(model, state.velocity)
+    kinetic = 0.5 * mass @ (state.velocity**2).sum(axis=1)
+    state.velocity[:] *= np.sqrt(0.5 * freedom.translation * thermal / kinetic) if kinetic > 0 and freedom.translation else 0.0
+    if len(state.angular_momentum_body):
+        spread = np.sqrt(thermal * model.inertia[model.species])
+        state.angular_momentum_body[:] = rng.standard_normal(spread.shape) * spread
+        kinetic = 0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum()
+        if kinetic > 0:
+            state.angular_momentum_body[:] *= np.sqrt(0.5 * freedom.rotation * thermal / kinetic)

@@ -1,0 +1,377 @@
+"""A scene becomes what runs: species, space, start, terms. Everything that can be wrong with that is said at once."""
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.build.lattice import lattice
+from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, remove_momentum
+from rigidmd.build.structure import Arrangement, read_geometry, read_structure
+from rigidmd.dynamics.advance import Model
+from rigidmd.errors import Faults, SceneError, StructureError
+from rigidmd.forces.coulomb import reaction_field, self_energy
+from rigidmd.forces.lennard_jones import lennard_jones, tail
+from rigidmd.forces.pairs import pair_forces
+from rigidmd.forces.sites import BodySites, CentralSites
+from rigidmd.forces.space import Orthorhombic, Space, Unbounded
+from rigidmd.forces.terms import State
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.mechanics.rotor import NoRotor, SplitRotor
+from rigidmd.molecules import Molecule, Site, load_model, molecule, read_molecule
+from rigidmd.scene import Molecules, Scene
+from rigidmd.units import COULOMB, GRAM_PER_CM3
+
+DEFAULT_CUTOFF = 9.0  # Å
+#: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
+#: is 1750 epsilon, which no liquid visits.
+OVERLAP = 0.6
+#: Sites of different molecules closer than this fraction of the smaller molecule's radius stand inside one another.
+INSIDE = 0.2
+
+# Each random purpose has its own stream, so that one more draw here changes nothing there.
+STREAM_LATTICE, STREAM_MOMENTA = 1, 2
+
+
+class Sites(NamedTuple):
+    """Every site of every molecule, for the edges: output and analysis."""
+
+    molecule: np.ndarray  # (s,)
+    offset_body: np.ndarray  # (s, 3)
+    name: np.ndarray  # (s,) text
+    element: np.ndarray  # (s,) text
+    mass: np.ndarray  # (s,)
+
+
+@dataclass
+class System:
+    """What a scene becomes. `state` is the start; nothing else here changes during a run."""
+
+    scene: Scene
+    species: list[Molecule]
+    model: Model
+    space: Space
+    state: State
+    terms: dict[str, NamedTuple]
+    freedom: Freedom
+    constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
+    tail_pressure: float  # u/(Å ps²)
+    sites: Sites
+    from_lattice: bool
+    cutoff: float  # Å
+    left_out: list[str]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def density(self) -> float:
+        """g/cm³; 0 without a box."""
+        return float(self.model.mass[self.model.species].sum()) / self.space.volume / GRAM_PER_CM3
+
+    @property
+    def smallest_diameter(self) -> float:
+        """Smallest Lennard-Jones diameter, or the smallest radius where there is none, Å."""
+        sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
+        return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
+
+    def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
+        """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
+        centre = state.position
+        if wrapped and self.space.volume < inf:
+            edges = np.array(self.space)
+            centre = centre - edges * np.floor(centre / edges)
+        return centre[self.sites.molecule] + self._arms(state)
+
+    def site_velocities(self, state: State) -> np.ndarray:
+        """Velocities (s, 3) of all sites, lab frame, Å/ps."""
+        velocity = state.velocity[self.sites.molecule]
+        if len(state.rotation) == 0:
+            return velocity
+        omega = state.angular_momentum_body * self.model.inverse_inertia[self.model.species]
+        lab = np.einsum("nij,nj->ni", state.rotation, omega)
+        return velocity + np.cross(lab[self.sites.molecule], self._arms(state))
+
+    def _arms(self, state: State) -> np.ndarray:
+        if len(state.rotation) == 0:
+            return np.zeros_like(self.sites.offset_body)
+        return np.einsum("sij,sj->si", state.rotation[self.sites.molecule], self.sites.offset_body)
+
+
+def build(scene: Scene) -> System:
+    """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
+    species = _species(scene)
+    arrangement = _arrange(scene, species)
+    space = Orthorhombic(*arrangement.edges) if arrangement.edges else Unbounded()
+    cutoff = _cutoff(scene, space, species)
+    model = _model(species, arrangement.species)
+    turning = model.inertia.any()
+    n = len(arrangement.species)
+    state = State(
+        np.ascontiguousarray(arrangement.position, dtype=float),
+        np.zeros((n, 3)),
+        np.ascontiguousarray(arrangement.rotation) if turning else np.zeros((0, 3, 3)),
+        np.zeros((n if turning else 0, 3)),
+    )
+    terms, constants, tail_pressure = _terms(scene, species, model, space, cutoff)
+    system = System(
+        scene=scene,
+        species=species,
+        model=model,
+        space=space,
+        state=state,
+        terms=terms,
+        freedom=freedom_of(model),
+        constants=constants,
+        tail_pressure=tail_pressure,
+        sites=_sites(species, arrangement.species),
+        from_lattice=scene.structure is None,
+        cutoff=cutoff,
+        left_out=_left_out(scene, terms, model, space),
+    )
+    _set_momenta(system, arrangement)
+    if scene.structure is not None:
+        system.notes.append(
+            f"{n} molecules read from {scene.structure.file}; atoms against rigid templates: "
+            f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
+        )
+        if faults := _overlaps(system):
+            raise StructureError(str(scene.path(scene.structure.file)), faults)
+    return system
+
+
+def _species(scene: Scene) -> list[Molecule]:
+    found, faults = [], []
+    for k, entry in enumerate(scene.molecules):
+        try:
+            found.append(_one_species(scene, entry))
+        except Faults as error:
+            faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.faults]
+    names = [m.name for m in found]
+    faults += [f"molecules: {name} stands there twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1]
+    if faults:
+        raise SceneError(scene.source, faults)
+    return found
+
+
+def _one_species(scene: Scene, entry: Molecules) -> Molecule:
+    if entry.model is not None:
+        found = load_model(entry.model)
+    elif entry.file is not None and entry.file.endswith(".toml"):
+        found = read_molecule(scene.path(entry.file))
+    else:
+        sites = entry.sites if entry.file is None else _sites_from_file(scene, entry)
+        found = molecule(entry.name or scene.path(entry.file).stem, sites)
+    changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
+    return Molecule(**{**vars(found), **changed})
+
+
+def _sites_from_file(scene: Scene, entry: Molecules) -> tuple[Site, ...]:
+    """Geometry from the file, everything else from the scene's sites, found by atom name or else by element."""
+    path = scene.path(entry.file)
+    faults = []
+    sites = []
+    used = set()
+    for name, element, mass, position in zip(*read_geometry(path), strict=True):
+        match = next((s for s in entry.sites if s.name == name), None) or next(
+            (s for s in entry.sites if s.name == element), None
+        )
+        if match is None:
+            faults.append(f"atom {name}: no entry of sites has this name or is called {element}")
+            continue
+        used.add(match.name)
+        given = match.mass_u if match.mass_u is not None else float(mass)
+        sites.append(
+            match.model_copy(
+                update={"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
+            )
+        )
+    faults += [f"sites: {s.name} is no atom of it" for s in entry.sites if s.name not in used]
+    if faults:
+        raise StructureError(str(path), faults)
+    return tuple(sites)
+
+
+def _arrange(scene: Scene, species: list[Molecule]) -> Arrangement:
+    if scene.structure is not None:
+        path = scene.path(scene.structure.file)
+        found = read_structure(path, species, scene.box.edges, scene.box.periodic, scene.structure.tolerance)
+        faults = []
+        for k, entry in enumerate(scene.molecules):
+            present = int((found.species == k).sum())
+            if entry.count is not None and entry.count != present:
+                faults.append(f"holds {present} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
+        if scene.structure.velocities and found.velocity is None:
+            faults.append("holds no velocities, or not for every atom; leave out structure.velocities = true")
+        if faults:
+            raise StructureError(str(path), faults)
+        return found
+    counts = [entry.count for entry in scene.molecules]
+    mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
+    edges = scene.box.edges or (float(np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))),) * 3
+    rng = np.random.default_rng([scene.seed, STREAM_LATTICE])
+    n = sum(counts)
+    return Arrangement(
+        species=np.repeat(np.arange(len(species)), counts),
+        position=lattice(n, edges, rng),
+        rotation=random_rotations(rng, n),
+        velocity=None,
+        angular_momentum_body=None,
+        edges=edges if scene.box.periodic else None,
+        residual_rms=0.0,
+        residual_max=0.0,
+    )
+
+
+def _cutoff(scene: Scene, space: Space, species: list[Molecule]) -> float:
+    forces = scene.forces
+    cutoff = forces.cutoff_A or (DEFAULT_CUTOFF if space.volume < inf else inf)
+    faults = []
+    half = min(space) / 2
+    if cutoff > half:
+        given = "" if forces.cutoff_A else " (the default)"
+        faults.append(
+            f"forces.cutoff_A = {cutoff:g}{given} is longer than half the shortest edge of the box, {half:.3f} Å: "
+            "a site would meet two images of another. Take a larger box or a shorter cut-off"
+        )
+    for m in species:
+        extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
+        if extent > half:
+            faults.append(f"a molecule of {m.name} is {extent:.2f} Å long, more than half the shortest edge, {half:.3f} Å")
+    start = forces.switch_start_A
+    if start is not None and start >= cutoff:
+        faults.append(f"forces.switch_start_A = {start:g} is not below the cut-off of {cutoff:g} Å")
+    if forces.tail_correction and space.volume == inf:
+        faults.append("forces.tail_correction needs a periodic box: without one there is no liquid beyond the cut-off")
+    if faults:
+        raise SceneError(scene.source, faults)
+    return cutoff
+
+
+def _model(species: list[Molecule], index: np.ndarray) -> Model:
+    inertia = np.array([m.inertia for m in species])
+    with np.errstate(divide="ignore"):
+        inverse = np.where(inertia > 0, 1 / inertia, 0.0)
+    rotor = SplitRotor(inverse) if inertia.any() else NoRotor()
+    return Model(index.astype(np.int64), np.array([m.mass for m in species]), inertia, inverse, rotor)
+
+
+def _sites(species: list[Molecule], index: np.ndarray) -> Sites:
+    counts = np.array([len(m.masses) for m in species])[index]
+
+    def each(values) -> np.ndarray:
+        return np.concatenate([values[k] for k in index])
+
+    return Sites(
+        np.repeat(np.arange(len(index)), counts),
+        each([m.positions_body for m in species]),
+        each([np.array(m.site_names, dtype=object) for m in species]),
+        each([np.array(m.elements, dtype=object) for m in species]),
+        each([m.masses for m in species]),
+    )
+
+
+def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
+    """Sites of a law: chosen[k] lists the sites of species k that take part. (sites, species-wise positions in them)."""
+    counts = np.array([len(c) for c in chosen])[index]
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    member = np.repeat(np.arange(len(index)), counts)
+    offset = np.concatenate([species[k].positions_body[chosen[k]] for k in index])
+    if not offset.any():
+        return CentralSites(first, member)
+    return BodySites(first, member, np.ascontiguousarray(offset))
+
+
+def _terms(scene: Scene, species: list[Molecule], model: Model, space: Space, cutoff: float):
+    """Terms by name, constant energies by name, tail pressure."""
+    forces = scene.forces
+    index = model.species
+    start = forces.switch_start_A or max(0.9 * cutoff, cutoff - 1.0)
+    terms, constants, tail_pressure = {}, {}, 0.0
+    chosen = [np.flatnonzero(m.epsilon > 0) for m in species]
+    if any(len(c) for c in chosen):
+        pairs = [[(m.sigma[i], m.epsilon[i]) for i in c] for m, c in zip(species, chosen, strict=True)]
+        kinds = sorted({pair for of_species in pairs for pair in of_species})
+        kind = np.concatenate([[kinds.index(pair) for pair in pairs[k]] for k in index]).astype(np.int64)
+        sigma, epsilon = np.array(kinds).T
+        law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing)
+        terms["lennard_jones"] = pair_forces(law, space, _taking_part(species, index, chosen), forces.skin_A)
+        if forces.tail_correction:
+            constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
+    chosen = [np.flatnonzero(m.charges != 0) for m in species]
+    if forces.electrostatics != "none" and any(len(c) for c in chosen):
+        charge = np.concatenate([species[k].charges[chosen[k]] for k in index])
+        law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
+        terms["coulomb"] = pair_forces(law, space, _taking_part(species, index, chosen), forces.skin_A)
+        if cutoff < inf:
+            constants["reaction_field_self"] = sum(
+                int((index == k).sum())
+                * self_energy(law._replace(charge=m.charges[c] * np.sqrt(COULOMB)), m.positions_body[c])
+                for k, (m, c) in enumerate(zip(species, chosen, strict=True))
+            )
+    return terms, constants, tail_pressure
+
+
+def _left_out(scene: Scene, terms: dict, model: Model, space: Space) -> list[str]:
+    """What is not compiled, and why."""
+    out = []
+    if "lennard_jones" not in terms:
+        out.append("Lennard-Jones: no site has it")
+    if "coulomb" not in terms:
+        out.append("charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one"))
+    if isinstance(model.rotor, NoRotor):
+        out.append("rotation and torques: every molecule is a point")
+    if space.volume == inf:
+        out.append("periodic images: there is no box")
+    if all(stage.ensemble == "nve" for stage in scene.stages):
+        out.append("thermostat: every stage is nve")
+    if not scene.forces.tail_correction:
+        out.append("tail correction: not asked for")
+    return out
+
+
+def _set_momenta(system: System, arrangement: Arrangement) -> None:
+    scene, state = system.scene, system.state
+    if scene.structure is not None and scene.structure.velocities:
+        state.velocity[:] = arrangement.velocity
+        state.angular_momentum_body[:] = arrangement.angular_momentum_body[: len(state.angular_momentum_body)]
+        if remove_momentum(system.model, state.velocity):
+            system.notes.append("the total momentum of the file's velocities was taken out")
+        return
+    temperature = scene.start.temperature_K
+    if temperature is None:
+        temperature = scene.stages[0].temperature_K
+    draw_momenta(system.model, state, temperature, np.random.default_rng([scene.seed, STREAM_MOMENTA]))
+
+
+def _overlaps(system: System) -> list[str]:
+    """Molecules of a structure that stand in one another: at most five named."""
+    from scipy.spatial import cKDTree
+
+    faults = []
+    positions = system.site_positions(system.state)
+    boxed = system.space.volume < inf
+    if boxed:
+        edges = np.array(system.space)
+        positions = np.mod(positions, edges)
+        positions[positions >= edges] = 0.0
+    sigma = np.concatenate([np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species])
+    start = np.concatenate([[0], np.cumsum([len(m.masses) for m in system.species])])
+    which = np.concatenate([np.arange(start[k], start[k + 1]) for k in system.model.species])
+    diameter = sigma[which]
+    inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
+    tree = cKDTree(positions, boxsize=np.array(system.space) if boxed else None)
+    for i, j in sorted(tree.query_pairs(max(OVERLAP * sigma.max(), inside))):
+        a, b = system.sites.molecule[[i, j]]
+        if a == b:
+            continue
+        step = positions[i] - positions[j]
+        if boxed:
+            step -= edges * np.round(step / edges)
+        distance = float(np.linalg.norm(step))
+        both = diameter[i] > 0 and diameter[j] > 0
+        if distance <= max(inside, OVERLAP * (diameter[i] + diameter[j]) / 2 if both else 0.0):
+            faults.append(
+                f"molecules {a + 1} and {b + 1} overlap: {system.sites.name[i]} and {system.sites.name[j]} "
+                f"are {distance:.3f} Å apart"
+            )
+    return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])

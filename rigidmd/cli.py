@@ -1,0 +1,190 @@
+"""The commands. They print and never compute; what they need is imported when they need it."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+
+EXAMPLES = """examples:
+  rigidmd check systems/water.toml          what would happen, without running
+  rigidmd run systems/water.toml            run it, into runs/water
+  rigidmd run systems/water.toml --set stages.1.timestep_fs=4 -o runs/water4
+  rigidmd energy systems/water.toml --unit kcal/mol
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; the exit code: 0 done, 1 a run that failed, 2 bad input, 130 interrupted."""
+    from rigidmd.errors import RigidMDError, SimulationError
+
+    options = _parser().parse_args(arguments)
+    try:
+        return options.command(options)
+    except SimulationError as error:
+        print(f"rigidmd: {error}", file=sys.stderr)
+        return FAILED
+    except RigidMDError as error:
+        print(f"rigidmd: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("rigidmd: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="rigidmd",
+        description="Molecular dynamics of rigid molecules, from a scene file.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    run = _command(commands, "run", _run, "run a scene", "rigidmd run systems/water.toml -o runs/water")
+    _scene_arguments(run)
+    run.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
+    run.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+    run.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
+
+    energy = _command(
+        commands, "energy", _energy, "energies and forces of the start", "rigidmd energy systems/water_dimer.toml --json"
+    )
+    _scene_arguments(energy)
+    energy.add_argument("--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], default="kJ/mol", help="unit of energy")
+    energy.add_argument("--json", action="store_true", help="print JSON")
+
+    check = _command(
+        commands, "check", _check, "say what would happen, and run nothing", "rigidmd check systems/water_nitrogen.toml"
+    )
+    _scene_arguments(check)
+
+    _command(commands, "models", _models, "list the molecules that come with rigidmd", "rigidmd models")
+    _command(
+        commands, "schema", _schema, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json"
+    )
+    return parser
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser, namespace, values, option_string=None):
+        from importlib.metadata import version
+
+        print(f"rigidmd {version('rigidmd')}")
+        parser.exit()
+
+
+def _command(commands, name: str, function, about: str, example: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name,
+        help=about,
+        description=about[0].upper() + about[1:] + ".",
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(command=function)
+    return parser
+
+
+def _scene_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override a key of the scene by its dotted path (entries of lists count from 0); may be repeated",
+    )
+
+
+def _read_scene(options: argparse.Namespace, **more):
+    from rigidmd.scene import Scene, parse_override
+
+    overrides = dict(parse_override(text) for text in options.overrides)
+    return Scene.read(options.scene, overrides | more)
+
+
+def _run(options: argparse.Namespace) -> int:
+    scene = _read_scene(options, **({} if options.threads is None else {"threads": options.threads}))
+    folder = Path(options.output) if options.output else Path("runs") / scene.name
+    from rigidmd.output.folder import check_folder
+
+    check_folder(folder, options.force)  # before anything slow is imported
+    from rigidmd.output.report import summary_text
+    from rigidmd.simulation import Simulation
+
+    simulation = Simulation(scene, folder, options.force, say=_say)
+    system = simulation.system
+    print(
+        f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites, "
+        f"{system.freedom.total} degrees of freedom; {simulation.threads} threads"
+    )
+    for note in system.notes:
+        print(f"  {note}")
+    results = simulation.run(progress=True)
+    print(summary_text(results.summary))
+    print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
+    return INTERRUPTED if results.interrupted else 0
+
+
+def _say(sentence: str) -> None:
+    """On a terminal only: what takes a moment."""
+    if sys.stderr.isatty():
+        print(f"  {sentence} ...", file=sys.stderr)
+
+
+def _energy(options: argparse.Namespace) -> int:
+    from rigidmd.simulation import start_energy
+    from rigidmd.units import ENERGY_UNITS
+
+    scene = _read_scene(options)
+    found = start_energy(scene, ENERGY_UNITS[options.unit], options.unit)
+    if options.json:
+        print(json.dumps(found, indent=2))
+        return 0
+    unit = options.unit
+    print(f"{scene.name}: energies of the start, {found['molecules']} molecules")
+    for name, value in [*found["components"].items(), ("potential", found["potential"])]:
+        print(f"  {name.replace('_', ' '):<22}{value:>22.10g} {unit}")
+    print(f"  {'kinetic':<22}{found['kinetic']:>22.10g} {unit}")
+    print(f"  {'virial':<22}{found['virial']:>22.10g} {unit}")
+    if found["pressure_bar"] is not None:
+        print(f"  {'pressure':<22}{found['pressure_bar']:>22.10g} bar")
+    print(f"  {'largest force':<22}{found['largest_force_per_A']:>22.10g} {unit}/Å on molecule {found['largest_force_molecule']}")
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    from rigidmd.build.system import build
+    from rigidmd.build.describe import describe
+
+    print(describe(build(_read_scene(options))))
+    return 0
+
+
+def _models(options: argparse.Namespace) -> int:
+    from rigidmd.molecules import available_models, load_model
+
+    for name in available_models():
+        m = load_model(name)
+        moments = " ".join(f"{x:.4f}" for x in m.inertia)
+        print(f"{name:<12}{m.title}")
+        print(f"{'':<12}{len(m.masses)} sites ({' '.join(m.site_names)}), {m.kind}, {m.mass:.4f} u, inertia {moments} u Å²")
+        if m.charges.any():
+            charges = " ".join(f"{q:+.4f}" for q in m.charges)
+            print(f"{'':<12}charges {charges} e, dipole {m.dipole_debye:.3f} D")
+        print(f"{'':<12}{m.source}")
+    return 0
+
+
+def _schema(options: argparse.Namespace) -> int:
+    from rigidmd.scene import Scene
+
+    print(json.dumps(Scene.model_json_schema(), indent=2, default=str))
+    return 0

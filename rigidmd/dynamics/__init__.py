@@ -1,0 +1,1 @@
+"""Steps in time: schemes are rows of coefficients, `advance` is the compiled loop, thermostats are flows of it."""

@@ -1,0 +1,110 @@
+"""The compiled loop: n steps of any scheme, any terms, any thermostat."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from rigidmd.dynamics.thermostats import apply
+from rigidmd.forces.sites import SERIAL
+from rigidmd.forces.terms import OK, load_bodies
+from rigidmd.jit import kernel
+from rigidmd.mechanics.rotor import NoRotor, SplitRotor, turn
+
+
+class Model(NamedTuple):
+    """What never changes during a run."""
+
+    species: np.ndarray  # (n,) species of each molecule
+    mass: np.ndarray  # (species,) u
+    inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
+    inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
+    rotor: SplitRotor | NoRotor
+
+
+class Progress(NamedTuple):
+    """How far `advance` has come, so that it can stop for more memory and go on at the same place."""
+
+    cursor: np.ndarray  # (3,) steps done; kicks done in this step; whether `load` is that of the present positions
+
+
+def new_progress() -> Progress:
+    """Nothing done, load unknown."""
+    return Progress(np.zeros(3, np.int64))
+
+
+@kernel
+def advance(model, state, load, terms, thermostat, kicks, drifts, dt, steps, progress):
+    """Take `steps` steps of dt (ps) of the scheme with these kicks and drifts, counted from progress.cursor[0] = 0.
+
+    The scheme is walked as kick, drift, kick, ..., kick; forces are evaluated before a kick where positions have
+    changed since, so the last evaluation of a step serves the next one. A status code: when it is not OK, state and
+    progress are such that calling again continues without a trace.
+    """
+    cursor = progress.cursor
+    while cursor[0] < steps:
+        while cursor[1] < len(kicks):
+            if cursor[2] == 0:
+                status = load_bodies(terms, state, load)
+                if status != OK:
+                    return status
+                cursor[2] = 1
+            kick(model, state, load, kicks[cursor[1]] * dt)
+            if cursor[1] < len(drifts):
+                drift(model, state, drifts[cursor[1]] * dt)
+                cursor[2] = 0
+            cursor[1] += 1
+        apply(thermostat, model, state, dt)
+        cursor[1] = 0
+        cursor[0] += 1
+    return OK
+
+
+@kernel
+def kick(model, state, load, h):
+    """Exact flow of the potential: V += h F/m, L += h n_body."""
+    if len(state.position) <= SERIAL:
+        for m in range(len(state.position)):
+            _kick_molecule(model.species[m], model.mass, model.inverse_inertia, state, load, m, h)
+    else:
+        _kick_threaded(model.species, model.mass, model.inverse_inertia, state, load, h)
+
+
+@kernel
+def drift(model, state, h):
+    """Flow of the kinetic energy: free flight, exact, and the rotor."""
+    if len(state.position) <= SERIAL:
+        for m in range(len(state.position)):
+            _drift_molecule(model.rotor, model.species[m], state, m, h)
+    else:
+        _drift_threaded(model.rotor, model.species, state, h)
+
+
+@kernel(parallel=True)
+def _kick_threaded(species, mass, inverse_inertia, state, load, h):
+    for m in prange(len(state.position)):
+        _kick_molecule(species[m], mass, inverse_inertia, state, load, m, h)
+
+
+@kernel(parallel=True)
+def _drift_threaded(rotor, species, state, h):
+    for m in prange(len(state.position)):
+        _drift_molecule(rotor, species[m], state, m, h)
+
+
+@kernel
+def _kick_molecule(species, mass, inverse_inertia, state, load, m, h):
+    share = h / mass[species]
+    for k in range(3):
+        state.velocity[m, k] += share * load.force[m, k]
+    if m < len(state.angular_momentum_body):
+        for k in range(3):
+            if inverse_inertia[species, k] > 0:  # no momentum gathers on an axis without inertia
+                state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
+
+
+@kernel
+def _drift_molecule(rotor, species, state, m, h):
+    for k in range(3):
+        state.position[m, k] += h * state.velocity[m, k]
+    turn(rotor, species, state.rotation, state.angular_momentum_body, m, h)

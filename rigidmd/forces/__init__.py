@@ -1,0 +1,1 @@
+"""Force laws, one a file, and the one dispatch over them (`terms`)."""

@@ -1,0 +1,70 @@
+"""The space molecules live in: an orthorhombic periodic box, or none. Chosen by type, so no box costs nothing."""
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import overload
+
+from rigidmd.jit import is_a
+
+
+class Orthorhombic(NamedTuple):
+    """Periodic box with right angles. Edges in Å."""
+
+    x: float
+    y: float
+    z: float
+
+    @property
+    def volume(self) -> float:
+        """Å³"""
+        return self.x * self.y * self.z
+
+
+class Unbounded(NamedTuple):
+    """No box: droplets and clusters in vacuum. The edges are infinite."""
+
+    x: float = inf
+    y: float = inf
+    z: float = inf
+
+    @property
+    def volume(self) -> float:
+        """Infinite."""
+        return inf
+
+
+Space = Orthorhombic | Unbounded
+
+
+def nearest_image(space, dx, dy, dz):
+    """The shortest periodic image of a displacement (Å); itself where there is no box."""
+    raise TypeError("compiled code only")
+
+
+@overload(nearest_image)
+def _nearest_image(space, dx, dy, dz):
+    if is_a(space, Unbounded):
+        return lambda space, dx, dy, dz: (dx, dy, dz)
+
+    def nearest(space, dx, dy, dz):
+        return (
+            dx - space.x * np.rint(dx / space.x),
+            dy - space.y * np.rint(dy / space.y),
+            dz - space.z * np.rint(dz / space.z),
+        )
+
+    return nearest
+
+
+def wrap_index(space, index, count):
+    """Cell index along one axis brought into 0 ... count - 1, or -1 for a cell outside an unbounded space."""
+    raise TypeError("compiled code only")
+
+
+@overload(wrap_index)
+def _wrap_index(space, index, count):
+    if is_a(space, Unbounded):
+        return lambda space, index, count: index if 0 <= index < count else -1
+    return lambda space, index, count: index % count

@@ -1,0 +1,79 @@
+"""How a radial law ends at its cut-off: plain, shift, force_shift, force_switch or switch.
+
+A law is a sum of radial parts v(r). Inside the cut-off a part becomes
+
+    v(r) + constant - integral of p(x) dx,   x = r - start,   p(x) = linear + quadratic x² + cubic x³   (r > start)
+
+so p is what is added to the force -v'; or, for `switch`, v(r) S(r) with S falling from 1 to 0.
+
+| name | what it does | continuous at the cut-off |
+|---|---|---|
+| plain | nothing | nothing |
+| shift | adds a constant (GROMACS potential-shift) | energy |
+| force_shift | subtracts a linear term from the start | energy, force |
+| force_switch | adds a cubic to the force beyond `start` (GROMACS force-switch) | energy, force, its derivative |
+| switch | multiplies the energy by a quintic beyond `start` (OpenMM switching function) | energy, force, its derivative |
+"""
+
+from collections.abc import Callable
+from math import inf
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from rigidmd.jit import kernel
+
+Name = Literal["plain", "shift", "force_shift", "force_switch", "switch"]
+NAMES: tuple[str, ...] = get_args(Name)
+
+
+class Shape(NamedTuple):
+    """Where the ending begins and whether it multiplies (switch) or adds."""
+
+    cutoff: float  # Å, may be infinite
+    start: float  # Å; equal to the cut-off where nothing happens before it
+    switched: bool
+
+
+def shape_of(name: Name, cutoff: float, start: float) -> Shape:
+    """The shape of the ending called `name`; `start` (Å) counts for force_switch and switch only."""
+    if cutoff == inf:
+        return Shape(inf, inf, False)
+    if name == "force_shift":
+        return Shape(cutoff, 0.0, False)
+    if name in ("force_switch", "switch"):
+        return Shape(cutoff, start, name == "switch")
+    return Shape(cutoff, cutoff, False)
+
+
+def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, float, float]]) -> np.ndarray:
+    """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) is its energy v, force -v' and -v''."""
+    if shape.cutoff == inf or name in ("plain", "switch"):
+        return np.zeros(4)
+    v, force, slope = at_cutoff(shape.cutoff)
+    if name == "shift":
+        return np.array([-v, 0.0, 0.0, 0.0])
+    d = shape.cutoff - shape.start
+    if name == "force_shift":
+        return np.array([-v - force * d, -force, 0.0, 0.0])
+    quadratic = (slope - 3 * force / d) / d
+    cubic = (2 * force / d - slope) / d**2
+    return np.array([quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic])
+
+
+@kernel
+def added(end, x):
+    """(energy, force) that an ending adds at x = r - start > 0, its constant not counted."""
+    linear = end[1]
+    quadratic = end[2]
+    cubic = end[3]
+    x2 = x * x
+    return -x * (linear + x2 * (quadratic / 3 + x * cubic / 4)), linear + x2 * (quadratic + x * cubic)
+
+
+@kernel
+def switching(cutoff, start, r):
+    """(S, dS/dr) of the quintic 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start)."""
+    width = cutoff - start
+    t = (r - start) / width
+    return 1 - t * t * t * (10 - t * (15 - 6 * t)), -30 * t * t * (1 - t) ** 2 / width

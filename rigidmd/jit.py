@@ -1,0 +1,76 @@
+"""The door to Numba: how kernels are compiled and cached, and how an overload knows which term it was given.
+
+Numba's disk cache looks only at the file of the function itself; a change in a helper in another file would leave
+callers running old code. So the cache lives in a folder named by a digest of all sources of the package: any change of
+any file starts a new one. `RIGIDMD_CACHE` names another place for it.
+"""
+
+import contextlib
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numba
+from numba import types
+
+PACKAGE = Path(__file__).parent
+UNUSED_AFTER_DAYS = 30.0
+
+# Reassociation and contraction let LLVM keep sums in registers and use FMA. The flags that assume away NaN and
+# infinity are left out: a bad number must stay visible.
+PAIR_FLAGS = {"reassoc", "contract", "nsz", "arcp"}
+
+
+def source_digest() -> str:
+    """Hexadecimal digest of every source file of the package and of Numba's version."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> str:
+    """A writable folder for compiled code; caches of older sources that nobody used for a month are removed."""
+    if named := os.environ.get("RIGIDMD_CACHE"):
+        base = Path(named)
+    else:
+        import platformdirs
+
+        base = Path(platformdirs.user_cache_path("rigidmd"))
+    folder = base / source_digest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        return tempfile.mkdtemp(prefix="rigidmd-cache-")  # a read-only home: compile, keep it for this process only
+    for old in base.iterdir():
+        with contextlib.suppress(OSError):
+            if old.is_dir() and time.time() - old.stat().st_mtime > UNUSED_AFTER_DAYS * 86400:
+                shutil.rmtree(old)
+    return str(folder)
+
+
+CACHE_FOLDER = _cache_folder()
+
+
+def kernel(function=None, *, parallel=False, fastmath=False):
+    """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder."""
+    if function is None:
+        return lambda f: kernel(f, parallel=parallel, fastmath=fastmath)
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = CACHE_FOLDER
+    try:
+        return numba.njit(cache=True, parallel=parallel, fastmath=fastmath, error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def is_a(numba_type, named_tuple) -> bool:
+    """Whether a Numba type is that of the given NamedTuple class; what overloads choose by."""
+    return isinstance(numba_type, types.BaseNamedTuple) and numba_type.instance_class is named_tuple

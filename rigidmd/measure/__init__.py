@@ -1,0 +1,1 @@
+"""What is read off a state: observables and drift. Never writes to it."""

@@ -1,0 +1,90 @@
+"""Energies, temperatures, pressure, momentum and the orthogonality of Q at one moment."""
+
+from math import inf, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.build.system import System
+from rigidmd.dynamics.engine import Engine
+from rigidmd.forces.terms import Load, State
+from rigidmd.mechanics.rotation import orthogonality_error
+from rigidmd.units import BAR, BOLTZMANN
+
+
+class Observation(NamedTuple):
+    """One look at a state, in internal units (Å, ps, u, K, u Å²/ps²)."""
+
+    components: dict[str, float]  # potential energy by term and constant
+    virial: np.ndarray  # (3, 3) molecular
+    kinetic_translation: float
+    kinetic_rotation: float
+    temperature_translation: float  # K; NaN where there is no such motion
+    temperature_rotation: float
+    temperature: float
+    pressure: float  # u/(Å ps²); NaN without a box
+    momentum: np.ndarray  # (3,)
+    orthogonality: float
+    load: Load
+
+    @property
+    def potential(self) -> float:
+        """Sum of the components."""
+        return sum(self.components.values())
+
+    @property
+    def kinetic(self) -> float:
+        """Translation and rotation."""
+        return self.kinetic_translation + self.kinetic_rotation
+
+    @property
+    def energy(self) -> float:
+        """Potential and kinetic."""
+        return self.potential + self.kinetic
+
+    @property
+    def pressure_bar(self) -> float:
+        """Molecular pressure in bar; NaN without a box."""
+        return self.pressure / BAR
+
+    @property
+    def largest_force(self) -> tuple[float, int]:
+        """Largest force on a molecule (u Å/ps²), and which molecule (from 0)."""
+        size = np.linalg.norm(self.load.force, axis=1)
+        return float(size.max()), int(size.argmax())
+
+
+def observe(system: System, engine: Engine, state: State) -> Observation:
+    """Everything at once; one evaluation of forces and energies.
+
+    Pressure is the molecular one, (sum m V² + sum F·R) / 3 V over centres of mass (Allen & Tildesley 2017, 2.7.2).
+    """
+    load, tallies = engine.evaluate(state)
+    components = {name: tally.energy for name, tally in tallies.items()} | system.constants
+    virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
+    model = system.model
+    mass = model.mass[model.species]
+    translation = float(0.5 * mass @ (state.velocity**2).sum(axis=1))
+    rotation = 0.0
+    if len(state.angular_momentum_body):
+        rotation = float(0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum())
+    freedom = system.freedom
+    volume = system.space.volume
+    pressure = (2 * translation + virial.trace()) / (3 * volume) + system.tail_pressure if volume < inf else nan
+    return Observation(
+        components=components,
+        virial=virial,
+        kinetic_translation=translation,
+        kinetic_rotation=rotation,
+        temperature_translation=_temperature(translation, freedom.translation),
+        temperature_rotation=_temperature(rotation, freedom.rotation),
+        temperature=_temperature(translation + rotation, freedom.total),
+        pressure=float(pressure),
+        momentum=mass @ state.velocity,
+        orthogonality=orthogonality_error(state.rotation),
+        load=load,
+    )
+
+
+def _temperature(kinetic: float, freedom: int) -> float:
+    return 2 * kinetic / (freedom * BOLTZMANN) if freedom else nan

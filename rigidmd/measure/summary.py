@@ -1,0 +1,125 @@
+"""The figures a run is judged by, as one dictionary with units in its keys."""
+
+import platform
+from importlib.metadata import version
+from math import isnan, sqrt
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+from rigidmd.build.relief import Relief
+from rigidmd.build.system import System
+from rigidmd.measure.drift import inefficiency, slope
+from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.simulation import Results, Sample
+
+
+def summarise(
+    system: System,
+    results: "Results",
+    relief: Relief | None,
+    threads: int,
+    preparing: float,
+    wall: float,
+    computing: list[float],
+) -> dict:
+    """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps)."""
+    scene = system.scene
+    stages = [
+        _stage(system, results.samples, k, computing[k])
+        for k in range(len(computing))
+        if any(sample.stage == k for sample in results.samples)
+    ]
+    return {
+        "scene": scene.name,
+        "rigidmd_version": version("rigidmd"),
+        "numba_version": numba.__version__,
+        "machine": platform.processor() or platform.machine(),
+        "threads": threads,
+        "seed": scene.seed,
+        "interrupted": results.interrupted,
+        "molecules": len(system.model.species),
+        "species": {m.name: int((system.model.species == k).sum()) for k, m in enumerate(system.species)},
+        "sites": len(system.sites.molecule),
+        "degrees_of_freedom": system.freedom.total,
+        "degrees_of_freedom_translation": system.freedom.translation,
+        "degrees_of_freedom_rotation": system.freedom.rotation,
+        "box_A": list(system.space) if system.density else None,
+        "density_g_cm3": system.density or None,
+        "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
+        "relief_steps": relief.steps if relief else 0,
+        "preparing_s": preparing,
+        "wall_s": wall,
+        "largest_orthogonality_error": max(sample.orthogonality for sample in results.samples),
+        "momentum_u_A_ps": results.samples[-1].momentum,
+        "momentum_relative": _relative_momentum(system, results),
+        "stages": stages,
+        "notes": system.notes,
+    }
+
+
+def _relative_momentum(system: System, results: "Results") -> float:
+    """|P| over the sum of |m v|."""
+    speed = np.linalg.norm(results.state.velocity, axis=1)
+    total = float(system.model.mass[system.model.species] @ speed)
+    return results.samples[-1].momentum / total if total else 0.0
+
+
+def _stage(system: System, samples: list["Sample"], k: int, computing: float) -> dict:
+    """Figures of one stage. It begins with the last sample before it, from which its drift is counted."""
+    own = [sample for sample in samples if sample.stage == k]
+    before = [sample for sample in samples if sample.stage == k - 1][-1:]
+    stage = system.scene.stages[k]
+    n = len(system.model.species)
+    first = before or own[:1]
+    steps = own[-1].step - first[0].step
+    speed = steps / computing if computing > 0 else None
+    line = slope([s.time for s in first + own[not before :]], [0.0 if s in before else s.drift for s in first + own[not before :]])
+    mean_t, error_t = _mean([s.temperature for s in own])
+    kinetic = np.array([s.kinetic for s in own])
+    spread = float(kinetic.std())
+    per_molecule = line.value * 1000 / KJ_PER_MOL / n
+    thermal = BOLTZMANN * mean_t * system.freedom.total
+    per_kt = line.value * 1000 / thermal if thermal > 0 else None
+    error_kt = line.error * 1000 / thermal if thermal > 0 else None
+    return {
+        "name": stage.label,
+        "ensemble": stage.ensemble,
+        "integrator": stage.integrator,
+        "timestep_fs": stage.timestep_fs,
+        "steps": steps,
+        "duration_ps": steps * stage.timestep_fs * FEMTOSECOND,
+        "computing_s": computing,
+        "steps_per_s": speed,
+        "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
+        "temperature_K": mean_t,
+        "temperature_error_K": error_t,
+        "temperature_translation_K": _mean([s.temperature_translation for s in own])[0],
+        "temperature_rotation_K": _mean([s.temperature_rotation for s in own])[0],
+        "potential_kJ_mol_per_molecule": float(np.mean([s.potential for s in own])) / KJ_PER_MOL / n,
+        "pressure_bar": _mean([s.pressure_bar for s in own])[0],
+        "pressure_error_bar": _mean([s.pressure_bar for s in own])[1],
+        "drift_kJ_mol_ns_per_molecule": _known(per_molecule),
+        "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / KJ_PER_MOL / n),
+        "drift_kT_ns_per_degree_of_freedom": per_kt and _known(per_kt),
+        "drift_error_kT_ns_per_degree_of_freedom": error_kt and _known(error_kt),
+        "drift_over_kinetic_std": _known(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread) if spread else None,
+        "energy_rms_kJ_mol_per_molecule": _known(line.rms / KJ_PER_MOL / n),
+    }
+
+
+def _known(value: float) -> float | None:
+    return None if isnan(value) else float(value)
+
+
+def _mean(values: list[float]) -> tuple[float | None, float | None]:
+    """Mean and its standard error, with neighbouring samples' likeness counted; None where there is no value."""
+    array = np.array(values, dtype=float)
+    if np.isnan(array).any():
+        return None, None
+    centred = array - array.mean()
+    error = sqrt(centred @ centred / max(1, len(array) - 1) * inefficiency(centred) / len(array))
+    return float(array.mean()), error

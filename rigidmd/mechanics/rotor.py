@@ -1,0 +1,73 @@
+"""Free-rotor flows: how a body turns under no torque.
+
+A rotor is a term: `turn(rotor, species, rotation, angular_momentum, m, h)` is chosen by its type when compiled, so a scene of
+points compiles no rotation at all.
+"""
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import overload
+
+from rigidmd.jit import is_a, kernel
+
+
+class SplitRotor(NamedTuple):
+    """Composition of exact rotations about the principal axes (Dullweber, Leimkuhler & McLachlan 1997).
+
+    R1(h/2) R2(h/2) R3(h) R2(h/2) R1(h/2): order 2, symplectic, reversible; |L| and Q^T Q are kept to rounding.
+    A zero moment (linear body) has inverse 0: no turn about that axis, and no momentum gathers on it.
+    """
+
+    inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
+
+
+class NoRotor(NamedTuple):
+    """Points: nothing turns."""
+
+    inverse_inertia: float = 0.0
+
+
+def turn(rotor, species, rotation, angular_momentum_body, m, h):
+    """Let molecule m of the given species turn freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1 L, in place."""
+    raise TypeError(f"{type(rotor).__name__} is no rotor, or this was called outside compiled code")
+
+
+@overload(turn)
+def _turn_points(rotor, species, rotation, angular_momentum_body, m, h):
+    if is_a(rotor, NoRotor):
+        return lambda rotor, species, rotation, angular_momentum_body, m, h: None
+
+
+@overload(turn)
+def _turn_split(rotor, species, rotation, angular_momentum_body, m, h):
+    if not is_a(rotor, SplitRotor):
+        return None
+
+    def turn_split(rotor, species, rotation, angular_momentum_body, m, h):
+        about_axis(rotor, species, rotation, angular_momentum_body, m, 0, 1, 2, 0.5 * h)
+        about_axis(rotor, species, rotation, angular_momentum_body, m, 1, 2, 0, 0.5 * h)
+        about_axis(rotor, species, rotation, angular_momentum_body, m, 2, 0, 1, h)
+        about_axis(rotor, species, rotation, angular_momentum_body, m, 1, 2, 0, 0.5 * h)
+        about_axis(rotor, species, rotation, angular_momentum_body, m, 0, 1, 2, 0.5 * h)
+
+    return turn_split
+
+
+@kernel
+def about_axis(rotor, species, rotation, angular_momentum_body, m, k, i, j, h):
+    """Exact flow of L_k²/(2 I_k): angle a = h L_k/I_k, L <- R_k(a)^T L, Q <- Q R_k(a); (k, i, j) cyclic."""
+    angle = h * angular_momentum_body[m, k] * rotor.inverse_inertia[species, k]
+    if angle != 0.0:
+        c = cos(angle)
+        s = sin(angle)
+        a = angular_momentum_body[m, i]
+        b = angular_momentum_body[m, j]
+        angular_momentum_body[m, i] = c * a + s * b
+        angular_momentum_body[m, j] = c * b - s * a
+        for row in range(3):
+            a = rotation[m, row, i]
+            b = rotation[m, row, j]
+            rotation[m, row, i] = c * a + s * b
+            rotation[m, row, j] = c * b - s * a

@@ -1,0 +1,1 @@
+"""What a run writes, all in its own folder: trajectory (MDAnalysis here), log, state, summary, figure."""

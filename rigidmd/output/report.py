@@ -1,0 +1,117 @@
+"""The end of a run: summary.json, the same in words, and energy.png."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidmd.output.folder import whole_file
+from rigidmd.units import KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.simulation import Results
+
+INK, FAINT, WARM, COOL, THIRD = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e", "#5b8c5a"
+
+
+def write_summary(path: Path, summary: dict) -> None:
+    """summary.json."""
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(summary, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def summary_text(summary: dict) -> str:
+    """The summary as a person reads it."""
+    species = ", ".join(f"{count} {name}" for name, count in summary["species"].items())
+    freedom = summary["degrees_of_freedom"]
+    lines = [
+        f"{summary['scene']}: {species}; {summary['molecules']} bodies, {summary['sites']} sites, {freedom} degrees of "
+        f"freedom ({summary['degrees_of_freedom_translation']} translation, "
+        f"{summary['degrees_of_freedom_rotation']} rotation)"
+    ]
+    for stage in summary["stages"]:
+        lines += ["", _stage_title(stage)]
+        lines += [f"  {name:<16}{value}" for name, value in _stage_rows(stage)]
+    lines += ["", f"  {'orthogonality':<16}|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"]
+    lines.append(
+        f"  {'momentum':<16}|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, "
+        f"{summary['momentum_relative']:.1e} of the sum of |m v|"
+    )
+    if summary["interrupted"]:
+        lines += ["", "  interrupted: the figures are those so far"]
+    return "\n".join(lines)
+
+
+def _stage_title(stage: dict) -> str:
+    title = f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs, {stage['duration_ps']:g} ps"
+    if stage["steps_per_s"]:
+        title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:.3g} ns/day"
+    return title
+
+
+def _stage_rows(stage: dict) -> list[tuple[str, str]]:
+    rows = []
+    if stage["temperature_K"] is not None:
+        parts = [
+            f"{name} {stage[key]:.2f}"
+            for name, key in (("T_trans", "temperature_translation_K"), ("T_rot", "temperature_rotation_K"))
+            if stage[key] is not None
+        ]
+        rows.append(("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({', '.join(parts)})"))
+    rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
+    if stage["pressure_bar"] is not None:
+        rows.append(("pressure", f"{stage['pressure_bar']:.0f} ± {stage['pressure_error_bar']:.0f} bar"))
+    if stage["drift_kJ_mol_ns_per_molecule"] is not None:
+        what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
+        value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
+        rows.append(("drift", f"{value:+.2g} ± {error:.1g} kJ/mol/ns per molecule ({what})"))
+        if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
+            value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
+            rows.append(("", f"{value:+.2g} ± {error:.1g} kT/ns per degree of freedom"))
+        if stage["drift_over_kinetic_std"] is not None:
+            rows.append(("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in all"))
+        rows.append(("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line"))
+    return rows
+
+
+def draw_energy(path: Path, results: "Results") -> None:
+    """energy.png: the conserved energy, large enough to see its drift; potential and kinetic; the temperatures."""
+    from matplotlib.figure import Figure
+
+    n = len(results.system.model.species)
+    scale = KJ_PER_MOL * n
+    time = results["time"]
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    drift, parts, temperature = figure.subplots(3, 1, sharex=True, height_ratios=(1.2, 1, 1))
+    stage = results["stage"]
+    for k in np.unique(stage):
+        own = stage == k
+        drift.plot(time[own], results["drift"][own] / scale, color=(COOL, WARM, THIRD)[k % 3], lw=0.9)
+        label = f"{results.system.scene.stages[k].label}"
+        for axis in (drift, parts, temperature):
+            axis.axvline(time[own][-1], color=FAINT, lw=0.6, ls=":")
+        drift.annotate(
+            label, (time[own][0], 1), xycoords=("data", "axes fraction"), xytext=(4, -12), textcoords="offset points",
+            fontsize=9, color=FAINT,
+        )  # fmt: skip
+    drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
+    parts.plot(time, (results["potential"] - results["potential"][-1]) / scale, color=COOL, lw=0.9, label="potential")
+    parts.plot(time, (results["kinetic"] - results["kinetic"][-1]) / scale, color=WARM, lw=0.9, label="kinetic")
+    parts.set_ylabel("less its last value\n(kJ/mol per molecule)")
+    for column, color, label in (
+        ("temperature_translation", COOL, "translation"),
+        ("temperature_rotation", WARM, "rotation"),
+    ):
+        if np.isfinite(results[column]).all():
+            temperature.plot(time, results[column], color=color, lw=0.9, label=label)
+    temperature.set_ylabel("temperature (K)")
+    temperature.set_xlabel("time (ps)")
+    for axis in (drift, parts, temperature):
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.margins(x=0)
+        if axis is not drift and axis.get_legend_handles_labels()[0]:
+            axis.legend(frameon=False, ncols=2, loc="upper right", fontsize=9)
+    figure.suptitle(f"{results.system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=150)

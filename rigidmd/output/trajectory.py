@@ -1,0 +1,108 @@
+"""Trajectories and topology files through MDAnalysis. The only room that imports it."""
+
+import warnings
+from math import inf
+from pathlib import Path
+
+import MDAnalysis as mda
+import numpy as np
+
+from rigidmd.build.system import System
+from rigidmd.forces.terms import State
+from rigidmd.output.folder import whole_file
+
+
+def universe(system: System, velocities: bool = False) -> mda.Universe:
+    """An MDAnalysis Universe of all sites, one residue a molecule; one frame, at the start."""
+    u = mda.Universe.empty(
+        len(system.sites.molecule),
+        n_residues=len(system.model.species),
+        atom_resindex=system.sites.molecule,
+        trajectory=True,
+        velocities=velocities,
+    )
+    names = np.array([m.residue_names[0] for m in system.species], dtype=object)
+    u.add_TopologyAttr("names", system.sites.name)
+    u.add_TopologyAttr("types", system.sites.element)
+    u.add_TopologyAttr("elements", system.sites.element)
+    u.add_TopologyAttr("masses", system.sites.mass)
+    u.add_TopologyAttr("resnames", names[system.model.species])
+    u.add_TopologyAttr("resids", np.arange(1, len(system.model.species) + 1))
+    set_frame(u, system, system.state, 0.0, 0, velocities, wrapped=True)
+    return u
+
+
+def set_frame(u: mda.Universe, system: System, state: State, time: float, step: int, velocities: bool, wrapped: bool):
+    """Put a state into the universe's present frame."""
+    frame = u.trajectory.ts
+    frame.positions = system.site_positions(state, wrapped)
+    if velocities:
+        frame.velocities = system.site_velocities(state)
+    frame.dimensions = dimensions(system)
+    frame.time = time
+    frame.data["step"] = step
+
+
+def dimensions(system: System) -> list[float] | None:
+    """Box as MDAnalysis wants it; None without one."""
+    return [*system.space, 90.0, 90.0, 90.0] if system.space.volume < inf else None
+
+
+def in_memory(system: System, times: list[float], positions: list[np.ndarray]) -> mda.Universe:
+    """A Universe that holds frames (positions (s, 3) each) in memory; times (ps), evenly spaced."""
+    u = universe(system)
+    step = times[1] - times[0] if len(times) > 1 else 1.0
+    box = np.tile(dimensions(system), (len(times), 1)) if system.space.volume < inf else None
+    u.load_new(np.array(positions), order="fac", dimensions=box, dt=step)
+    return u
+
+
+def from_files(topology: Path, trajectory: Path) -> mda.Universe:
+    """The Universe of a finished run's files."""
+    return mda.Universe(str(topology), str(trajectory))
+
+
+def write_topology(path: Path, system: System) -> None:
+    """Names, molecules and first positions: what viewers open beside a trajectory."""
+    with whole_file(path) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what a format cannot hold (occupancies, ...) is not ours to give
+        universe(system).atoms.write(str(temporary))
+
+
+class TrajectoryFile:
+    """Frames to a file, streamed. The ending chooses the format.
+
+    interval: time between frames (ps); only .dcd needs it, which stores it once for all frames.
+    """
+
+    def __init__(self, path: Path, system: System, interval: float, velocities: bool, wrapped: bool):
+        self._system = system
+        self._velocities = velocities
+        self._wrapped = wrapped
+        self._universe = universe(system, velocities)
+        options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self._writer = mda.Writer(str(path), n_atoms=len(system.sites.name), **options.get(path.suffix, {}))
+        self._format = path.suffix
+
+    def write(self, state: State, time: float, step: int) -> None:
+        """Add a frame with its own time (ps) and the box."""
+        set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if self._format == ".xyz":
+                self._writer.remark = self._extended_xyz(time)
+            elif self._format == ".pdb":
+                self._writer.REMARK(f"TIME {time:.6f} PS")
+            self._writer.write(self._universe.atoms)
+
+    def _extended_xyz(self, time: float) -> str:
+        """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
+        box = dimensions(self._system)
+        cell = f'Lattice="{box[0]:.9g} 0 0 0 {box[1]:.9g} 0 0 0 {box[2]:.9g}" pbc="T T T" ' if box else 'pbc="F F F" '
+        return f"{cell}Properties=species:S:1:pos:R:3 Time={time:.9g}"
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.close()

@@ -1,0 +1,361 @@
+"""The scene: one frozen, validated value from which everything a run does follows."""
+
+import os
+import re
+import tomllib
+from math import inf
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, PrivateAttr, Strict, ValidationError, field_validator, model_validator
+
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.errors import SceneError
+from rigidmd.molecules import Site, available_models
+from rigidmd.validation import Count, Flag, NonNegative, Positive, Section, faults_of
+
+TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
+WITH_VELOCITIES = (".trr", ".nc")
+TOPOLOGY_FORMATS = (".gro", ".pdb")
+
+Permittivity = Annotated[float, Strict(), Field(ge=1)]
+
+
+class Structure(Section):
+    """Where the molecules are at the start, from a file."""
+
+    file: str
+    """File that ASE reads (.gro, .pdb, .xyz, .cif, ...) or `final.npz` of an earlier run; beside or below the scene"""
+    velocities: Flag = False
+    """Use the velocities in the file instead of drawing them"""
+    tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
+    """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
+
+
+class Box(Section):
+    """The periodic box, if any."""
+
+    lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
+    """Edges; one number for a cube"""
+    density_g_cm3: Positive | None = None
+    """Mass density, from which the edge of a cube follows"""
+    periodic: Flag = True
+    """False: no box; molecules in vacuum"""
+
+    @model_validator(mode="after")
+    def _one_size(self):
+        if self.lengths_A is not None and self.density_g_cm3 is not None:
+            raise ValueError("give lengths_A or density_g_cm3, not both")
+        return self
+
+    @property
+    def edges(self) -> tuple[float, float, float] | None:
+        """Edges in Å, or None where the scene does not say."""
+        if self.lengths_A is None or isinstance(self.lengths_A, tuple):
+            return self.lengths_A
+        return (self.lengths_A,) * 3
+
+
+class Molecules(Section):
+    """A species and how many of it."""
+
+    model: str | None = None
+    """A model that comes with rigidmd; `rigidmd models` lists them"""
+    file: str | None = None
+    """A molecule in a .toml file like those models, or the geometry of one in any file ASE reads, with `sites` for it"""
+    name: str | None = None
+    """What to call the species; the model's or file's name when not given"""
+    sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
+    """The sites of a molecule of one's own; with a geometry `file`, their parameters by atom name or element"""
+    residue_names: tuple[str, ...] | None = None
+    """Residue names by which structure files may call this species"""
+    count: Count | None = None
+    """How many; needed unless there is a structure file"""
+
+    @field_validator("model")
+    @classmethod
+    def _is_known(cls, model: str | None):
+        import difflib
+
+        if model is not None and model not in available_models():
+            near = difflib.get_close_matches(model, available_models(), 1, 0.4)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise ValueError(f"there is no model {model!r}{hint} (known: {', '.join(available_models())})")
+        return model
+
+    @model_validator(mode="after")
+    def _one_source(self):
+        if self.model is not None and (self.file is not None or self.sites is not None):
+            raise ValueError("give a model, or a file and sites of your own, not both")
+        if self.model is None and self.file is None and self.sites is None:
+            raise ValueError("needs one of model, file, sites")
+        if self.file is not None and self.file.endswith(".toml") and self.sites is not None:
+            raise ValueError("a .toml file has its own sites: leave out one of them")
+        if self.file is not None and not self.file.endswith(".toml") and self.sites is None:
+            raise ValueError("a geometry file needs sites with the parameters of its atoms")
+        if self.sites is not None and self.file is None and self.name is None:
+            raise ValueError("a molecule of one's own needs a name")
+        return self
+
+
+class Forces(Section):
+    """What acts between sites of different molecules."""
+
+    cutoff_A: Positive | None = None
+    """Cut-off between sites; 9 Å in a periodic box, none without one"""
+    truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch"] = "switch"
+    """How forces end at the cut-off, Lennard-Jones and charges alike"""
+    switch_start_A: Positive | None = None
+    """Where force_switch and switch begin; 1 Å before the cut-off, or at 0.9 of it if that is longer"""
+    mixing: Literal["lorentz-berthelot", "geometric"] = "lorentz-berthelot"
+    """Lennard-Jones parameters between unlike sites"""
+    tail_correction: Flag = False
+    """Add the energy and pressure of Lennard-Jones beyond the cut-off"""
+    electrostatics: Literal["reaction_field", "none"] = "reaction_field"
+    """How charges act; none ignores them"""
+    reaction_field_permittivity: Permittivity = inf
+    """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
+    skin_A: Positive = 1.5
+    """Extra radius of the neighbour list; speed only, never the result"""
+
+
+class Start(Section):
+    """The first moment."""
+
+    temperature_K: NonNegative | None = None
+    """Temperature of the momenta that are drawn; that of the first stage when not given"""
+
+
+class Stage(Section):
+    """A stretch of time under one ensemble and one step."""
+
+    name: str | None = None
+    """What to call it; the ensemble's name when not given"""
+    ensemble: Literal["nve", "nvt"] = "nve"
+    """nve keeps the energy, nvt the temperature"""
+    duration_ps: Positive
+    """How long"""
+    timestep_fs: Positive = 2.0
+    """Time step"""
+    temperature_K: Positive | None = None
+    """Temperature of the thermostat"""
+    thermostat: Literal["velocity_rescaling"] = "velocity_rescaling"
+    """velocity_rescaling is the stochastic one of Bussi et al."""
+    thermostat_time_ps: Positive = 0.1
+    """Time constant of the thermostat"""
+    integrator: Literal[tuple(SCHEMES)] = "velocity_verlet"  # type: ignore[valid-type]
+    """Scheme of kicks and drifts"""
+
+    @model_validator(mode="after")
+    def _makes_sense(self):
+        if self.ensemble == "nvt" and self.temperature_K is None:
+            raise ValueError("an nvt stage needs temperature_K")
+        if self.ensemble == "nve":
+            idle = {"temperature_K", "thermostat", "thermostat_time_ps"} & self.model_fields_set
+            if idle:
+                raise ValueError(f"{', '.join(sorted(idle))} would do nothing in an nve stage")
+        if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
+            raise ValueError(f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs")
+        return self
+
+    @property
+    def steps(self) -> int:
+        """Number of steps: the duration in steps, rounded."""
+        return round(self.duration_ps * 1000 / self.timestep_fs)
+
+    @property
+    def label(self) -> str:
+        """Its name, or its ensemble."""
+        return self.name or self.ensemble
+
+
+class Output(Section):
+    """What is written, all into the run's own folder."""
+
+    log_interval_ps: Positive = 0.05
+    """Time between lines of log.csv"""
+    trajectory: str | Literal[False] = "trajectory.xtc"
+    """Trajectory file; the ending chooses the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
+    trajectory_interval_ps: Positive = 0.5
+    """Time between frames"""
+    topology: str = "topology.gro"
+    """File with names and first positions that viewers need beside the trajectory (.gro or .pdb)"""
+    positions: Literal["wrapped", "unwrapped"] = "wrapped"
+    """wrapped: centres of mass inside the box; unwrapped: as they travelled. Molecules are whole in both"""
+    velocities: Flag | None = None
+    """Write velocities; where the format holds them when not given"""
+    figure: Flag = True
+    """Draw energy.png"""
+
+    @field_validator("trajectory")
+    @classmethod
+    def _trajectory_name(cls, name):
+        return name if name is False else _file_name(name, TRAJECTORY_FORMATS)
+
+    @field_validator("topology")
+    @classmethod
+    def _topology_name(cls, name: str):
+        return _file_name(name, TOPOLOGY_FORMATS)
+
+    @model_validator(mode="after")
+    def _holds_velocities(self):
+        if self.velocities and (self.trajectory is False or not self.trajectory.endswith(WITH_VELOCITIES)):
+            raise ValueError(
+                f"velocities = true, but {self.trajectory or 'no trajectory'} holds none; "
+                f"use one ending in {' or '.join(WITH_VELOCITIES)}"
+            )
+        return self
+
+
+def _file_name(name: str, endings: tuple[str, ...]) -> str:
+    if not re.fullmatch(r"[\w\-][\w.\-]*", name):
+        raise ValueError(f"is {name!r}, must be a plain file name without a folder")
+    if not name.endswith(endings):
+        raise ValueError(f"is {name!r}, must end in one of {' '.join(endings)}")
+    return name
+
+
+class Scene(Section):
+    """Everything a run does follows from this value. Read one with `Scene.read(path)`."""
+
+    name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=100)] = "scene"
+    """What to call the run; the file's name when not given"""
+    seed: Annotated[int, Strict(), Field(ge=0)] = 1
+    """Everything random follows from it"""
+    precision: Literal["double"] = "double"
+    """Arithmetic of the forces"""
+    threads: Count | None = None
+    """Threads; all cores when not given. Results do not depend on it"""
+    structure: Structure | None = None
+    box: Box = Box()
+    molecules: tuple[Molecules, ...] = Field(min_length=1)
+    forces: Forces = Forces()
+    start: Start = Start()
+    stages: tuple[Stage, ...] = Field(min_length=1)
+    output: Output = Output()
+
+    _source: str = PrivateAttr("scene")
+    _folder: Path = PrivateAttr(Path())
+
+    @property
+    def source(self) -> str:
+        """The file it was read from, for messages."""
+        return self._source
+
+    def path(self, file: str) -> Path:
+        """A file named in the scene: relative to the scene's own folder."""
+        return self._folder / file
+
+    @model_validator(mode="after")
+    def _whole(self):
+        faults = []
+        if self.structure is None:
+            faults += [
+                f"molecules.{k}.count is missing (there is no structure file to count in)"
+                for k, species in enumerate(self.molecules)
+                if species.count is None
+            ]
+            if self.box.lengths_A is None and self.box.density_g_cm3 is None:
+                faults.append("box needs lengths_A or density_g_cm3, or there must be a structure file")
+        elif self.box.density_g_cm3 is not None:
+            faults.append("box.density_g_cm3 and a structure file contradict each other: leave one out")
+        if self.start.temperature_K is None and self.stages[0].temperature_K is None:
+            from_file = self.structure is not None and self.structure.velocities
+            if not from_file:
+                faults.append("start.temperature_K is missing: the first stage is nve and no velocities are read")
+        cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
+        if start is not None and cutoff is not None and start >= cutoff:
+            faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    @classmethod
+    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "Scene":
+        """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
+
+        Files named in the scene must lie in its folder or below; files named in `overrides` may be anywhere, and are
+        taken relative to the working directory.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+            data = tomllib.loads(text)
+        except OSError as error:
+            raise SceneError(str(path), [f"cannot be read: {error.strerror}"]) from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SceneError(str(path), [f"is not TOML: {error}"]) from None
+        data.setdefault("name", re.sub(r"[^\w.\-]", "_", path.stem))
+        return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
+
+    @classmethod
+    def from_dict(
+        cls,
+        data: dict[str, Any],
+        folder: str | os.PathLike = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+    ) -> "Scene":
+        """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault."""
+        folder = Path(folder)
+        faults = _strange_paths(data, folder)
+        for key, value in (overrides or {}).items():
+            faults += _override(data, key, value)
+        try:
+            scene = cls.model_validate(data)
+        except ValidationError as error:
+            raise SceneError(source, faults + faults_of(error, cls, text)) from None
+        if faults:
+            raise SceneError(source, faults)
+        scene._source = source
+        scene._folder = folder
+        return scene
+
+
+def _strange_paths(data: dict, folder: Path) -> list[str]:
+    """Files named in a scene that are not in its folder."""
+    named = []
+    if isinstance(structure := data.get("structure"), dict):
+        named.append(("structure.file", structure.get("file")))
+    if isinstance(species := data.get("molecules"), list):
+        named += [(f"molecules.{k}.file", entry.get("file")) for k, entry in enumerate(species) if isinstance(entry, dict)]
+    return [
+        f"{key}: {file!r} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
+        for key, file in named
+        if isinstance(file, str) and not (folder / file).resolve().is_relative_to(folder.resolve())
+    ]
+
+
+def _override(data: dict, key: str, value: Any) -> list[str]:
+    """Set one dotted key in nested tables and lists, in place; a list of faults."""
+    if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.file", key):
+        value = os.path.abspath(value) if isinstance(value, str) else value
+    *parents, last = key.split(".")
+    target: Any = data
+    for depth, part in enumerate([*parents, last]):
+        here = ".".join(key.split(".")[:depth])
+        if isinstance(target, list):
+            if not part.isdigit() or int(part) >= len(target):
+                return [f"--set {key}: {here} has entries 0 to {len(target) - 1}, not {part!r}"]
+            part = int(part)
+        elif not isinstance(target, dict):
+            return [f"--set {key}: {here} is no table"]
+        if depth == len(parents):
+            target[part] = value
+        elif isinstance(target, dict):
+            target = target.setdefault(part, {})
+        else:
+            target = target[part]
+    return []
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """KEY=VALUE of the command line; the value as TOML would read it, or else as text. Raises SceneError."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise SceneError("--set", [f"{text!r} is not KEY=VALUE, for example stages.1.timestep_fs=4"])
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()

@@ -1,0 +1,28 @@
+"""Units: Å, ps, u, e, K inside, energies in u Å²/ps²; everything else only at the edges.
+
+`1 kJ/mol = 100 u Å²/ps²` exactly in the limit where the molar mass constant is 1 g/mol (it is to 3e-10, CODATA 2018).
+Constants: CODATA 2018; N_A, k_B and e are exact since 2019.
+"""
+
+from math import pi
+
+AVOGADRO = 6.02214076e23  # 1/mol
+BOLTZMANN_SI = 1.380649e-23  # J/K
+ELEMENTARY_CHARGE = 1.602176634e-19  # C
+VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
+
+KJ_PER_MOL = 100.0  # u Å²/ps²
+BOLTZMANN = BOLTZMANN_SI * AVOGADRO * 1e-3 * KJ_PER_MOL  # u Å²/ps² per K
+COULOMB = ELEMENTARY_CHARGE**2 * AVOGADRO / (4 * pi * VACUUM_PERMITTIVITY) * 1e10 * 1e-3 * KJ_PER_MOL  # u Å³/ps² per e²
+
+FEMTOSECOND = 1e-3  # ps
+BAR = 1e5 * AVOGADRO * 1e-30 * 1e-3 * KJ_PER_MOL  # u/(Å ps²)
+GRAM_PER_CM3 = AVOGADRO * 1e-24  # u/Å³
+
+#: What `rigidmd energy --unit` offers: name -> size in u Å²/ps².
+ENERGY_UNITS = {
+    "kJ/mol": KJ_PER_MOL,
+    "kcal/mol": 4.184 * KJ_PER_MOL,
+    "eV": ELEMENTARY_CHARGE * AVOGADRO * 1e-3 * KJ_PER_MOL,
+    "K": BOLTZMANN,
+}

@@ -1,0 +1,135 @@
+"""Data from outside: strict value types for pydantic, and its complaints turned into sentences with key and line."""
+
+import difflib
+import re
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic_core import ErrorDetails
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Strict(), Field(gt=0)]
+Flag = Annotated[bool, Strict()]
+Vector = tuple[Number, Number, Number]
+
+
+class Section(BaseModel):
+    """A frozen table of a TOML file; keys it does not know are faults."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+def faults_of(error: ValidationError, model: type[BaseModel], text: str = "") -> list[str]:
+    """One sentence for each complaint of pydantic: line (if the TOML text is given), key, what was expected."""
+    faults = {}
+    for detail in error.errors():
+        keys = [key for key in detail["loc"] if not _is_union_branch(key)]
+        path = ".".join(str(key) for key in keys)
+        line = line_of(keys, text)
+        where = (f"line {line}: " if line else "") + (path or "scene")
+        faults.setdefault((where, path), []).append(_sentence(detail, keys, model))
+    # A value that may be several things gets one complaint from pydantic for each of them: say them as one. What is
+    # wrong inside a value says more than that the whole is wrong.
+    return [
+        f"{where}: {' or '.join(dict.fromkeys(sentences))}"
+        for (where, path), sentences in faults.items()
+        if not any(other.startswith(path + ".") for _, other in faults)
+    ]
+
+
+def _is_union_branch(key: Any) -> bool:
+    """Whether pydantic put this in a location to tell which branch of a union complained."""
+    return isinstance(key, str) and bool(re.search(r"[\[(]|^(constrained-)?(float|int|bool|str)$", key))
+
+
+def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
+    value = detail["input"]
+    shown = repr(value) if not isinstance(value, dict | list) else f"a {'table' if isinstance(value, dict) else 'list'}"
+    context = detail.get("ctx", {})
+    match detail["type"]:
+        case "extra_forbidden":
+            return "unknown key" + _suggestion(str(keys[-1]), _known_keys(model, keys[:-1]))
+        case "missing":
+            return "is missing"
+        case "greater_than":
+            return f"is {shown}, must be greater than {context['gt']:g}"
+        case "greater_than_equal":
+            return f"is {shown}, must not be less than {context['ge']:g}"
+        case "finite_number":
+            return f"is {shown}, must be a finite number"
+        case "float_type":
+            return f"is {shown}, must be a number"
+        case "int_type" | "int_from_float":
+            return f"is {shown}, must be a whole number"
+        case "bool_type":
+            return f"is {shown}, must be true or false"
+        case "string_type":
+            return f"is {shown}, must be a text in quotes"
+        case "literal_error":
+            wanted = context["expected"]
+            return f"is {shown}, must be {wanted}" + _suggestion(str(value), re.findall(r"'([^']*)'", wanted))
+        case "too_short":
+            least = context["min_length"]
+            return f"has {context['actual_length']} entries, needs at least {least}"
+        case "tuple_type" | "list_type":
+            return f"is {shown}, must be a list"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return f"is {shown}, must be a table"
+        case "value_error":
+            return str(context["error"])
+    return f"is {shown}: {detail['msg']}"
+
+
+def _suggestion(name: str, known: list[str]) -> str:
+    """'; did you mean ...?' for the nearest known name (one with a forgotten unit suffix first), or the list of them."""
+    near = [key for key in known if key.startswith(name + "_")] or difflib.get_close_matches(name, known, 1, 0.6)
+    if near:
+        return f"; did you mean {near[0]}?"
+    return f"; known here: {', '.join(known)}" if known else ""
+
+
+def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
+    """Keys of the section that the path of keys leads to."""
+    for key in keys:
+        if isinstance(key, int):
+            continue
+        model = next((m for m in _models_in(model.model_fields[key].annotation)), None)
+        if model is None:
+            return []
+    return list(model.model_fields)
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for part in getattr(annotation, "__args__", ()) for m in _models_in(part)]
+
+
+def line_of(keys: list, text: str) -> int | None:
+    """Line (from 1) where a TOML text sets the given path of keys, or opens the nearest table around it; None if not."""
+    found = None
+    table: list = []
+    counts: dict[str, int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := re.match(r"\s*\[\[\s*([\w.\"-]+)\s*\]\]", line):
+            name = header[1]
+            counts[name] = counts.get(name, -1) + 1
+            for inner in [key for key in counts if key.startswith(name + ".")]:
+                del counts[inner]
+        elif header := re.match(r"\s*\[\s*([\w.\"-]+)\s*\]", line):
+            name = header[1]
+        else:
+            if (entry := re.match(r"\s*([\w.\"-]+)\s*=", line)) and keys[: len(table) + 1] == [*table, *entry[1].split(".")]:
+                return number
+            continue
+        table = []
+        parts = name.split(".")
+        for depth, part in enumerate(parts, 1):
+            table.append(part)
+            if (index := counts.get(".".join(parts[:depth]))) is not None:
+                table.append(index)
+        if keys[: len(table)] == table:
+            found = number
+    return found
