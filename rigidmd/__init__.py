@@ -1,10 +1,10 @@
 """rigidmd: molecular dynamics of rigid molecules.
 
-    import rigidmd
+import rigidmd
 
-    scene = rigidmd.Scene.read("systems/water.toml")
-    results = rigidmd.Simulation(scene).run()
-    print(results["temperature"].mean(), results.universe())
+scene = rigidmd.Scene.read("systems/water.toml")
+results = rigidmd.Simulation(scene).run()
+print(results["temperature"].mean(), results.universe())
 """
 
 from importlib import import_module

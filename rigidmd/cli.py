@@ -53,7 +53,11 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
 
     energy = _command(
-        commands, "energy", _energy, "energies and forces of the start", "rigidmd energy systems/water_dimer.toml --json"
+        commands,
+        "energy",
+        _energy,
+        "energies and forces of the start",
+        "rigidmd energy systems/water_dimer.toml --json",
     )
     _scene_arguments(energy)
     energy.add_argument("--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], default="kJ/mol", help="unit of energy")
@@ -66,7 +70,11 @@ def _parser() -> argparse.ArgumentParser:
 
     _command(commands, "models", _models, "list the molecules that come with rigidmd", "rigidmd models")
     _command(
-        commands, "schema", _schema, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json"
+        commands,
+        "schema",
+        _schema,
+        "print the JSON schema of scenes, for editors",
+        "rigidmd schema > scene.schema.json",
     )
     return parser
 
@@ -156,13 +164,15 @@ def _energy(options: argparse.Namespace) -> int:
     print(f"  {'virial':<22}{found['virial']:>22.10g} {unit}")
     if found["pressure_bar"] is not None:
         print(f"  {'pressure':<22}{found['pressure_bar']:>22.10g} bar")
-    print(f"  {'largest force':<22}{found['largest_force_per_A']:>22.10g} {unit}/Å on molecule {found['largest_force_molecule']}")
+    print(
+        f"  {'largest force':<22}{found['largest_force_per_A']:>22.10g} {unit}/Å on molecule {found['largest_force_molecule']}"
+    )
     return 0
 
 
 def _check(options: argparse.Namespace) -> int:
-    from rigidmd.build.system import build
     from rigidmd.build.describe import describe
+    from rigidmd.build.system import build
 
     print(describe(build(_read_scene(options))))
     return 0
@@ -175,7 +185,9 @@ def _models(options: argparse.Namespace) -> int:
         m = load_model(name)
         moments = " ".join(f"{x:.4f}" for x in m.inertia)
         print(f"{name:<12}{m.title}")
-        print(f"{'':<12}{len(m.masses)} sites ({' '.join(m.site_names)}), {m.kind}, {m.mass:.4f} u, inertia {moments} u Å²")
+        print(
+            f"{'':<12}{len(m.masses)} sites ({' '.join(m.site_names)}), {m.kind}, {m.mass:.4f} u, inertia {moments} u Å²"
+        )
         if m.charges.any():
             charges = " ".join(f"{q:+.4f}" for q in m.charges)
             print(f"{'':<12}charges {charges} e, dipole {m.dipole_debye:.3f} D")

@@ -133,7 +133,9 @@ def molecule(
 
     Raises MoleculeError with every reason why they are none.
     """
-    faults = [f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None]
+    faults = [
+        f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
+    ]
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
     masses = np.array([s.mass_u for s in sites])

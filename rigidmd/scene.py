@@ -319,7 +319,9 @@ def _strange_paths(data: dict, folder: Path) -> list[str]:
     if isinstance(structure := data.get("structure"), dict):
         named.append(("structure.file", structure.get("file")))
     if isinstance(species := data.get("molecules"), list):
-        named += [(f"molecules.{k}.file", entry.get("file")) for k, entry in enumerate(species) if isinstance(entry, dict)]
+        named += [
+            (f"molecules.{k}.file", entry.get("file")) for k, entry in enumerate(species) if isinstance(entry, dict)
+        ]
     return [
         f"{key}: {file!r} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
         for key, file in named

@@ -121,7 +121,10 @@ def line_of(keys: list, text: str) -> int | None:
         elif header := re.match(r"\s*\[\s*([\w.\"-]+)\s*\]", line):
             name = header[1]
         else:
-            if (entry := re.match(r"\s*([\w.\"-]+)\s*=", line)) and keys[: len(table) + 1] == [*table, *entry[1].split(".")]:
+            if (entry := re.match(r"\s*([\w.\"-]+)\s*=", line)) and keys[: len(table) + 1] == [
+                *table,
+                *entry[1].split("."),
+            ]:
                 return number
             continue
         table = []

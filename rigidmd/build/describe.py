@@ -20,7 +20,9 @@ def describe(system: System) -> str:
             f"  {count} {m.name}: {m.kind}, {len(m.masses)} sites, {m.mass:.4f} u, {m.degrees_of_freedom} degrees of "
             f"freedom each{charge}"
         )
-    lines.append(f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation")
+    lines.append(
+        f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
+    )
     if system.space.volume < inf:
         edges = " x ".join(f"{edge:.4f}" for edge in system.space)
         lines.append(f"  box: {edges} Å, {system.density:.4f} g/cm³")
@@ -30,7 +32,9 @@ def describe(system: System) -> str:
     lines.append("\ncompiled in:")
     for name, term in system.terms.items():
         reach = f"cut-off {system.cutoff:g} Å, {scene.forces.truncation}" if system.cutoff < inf else "no cut-off"
-        lines.append(f"  {name.replace('_', ' ')}: {len(term.position)} sites, {reach}, neighbour list with a skin of {scene.forces.skin_A:g} Å")
+        lines.append(
+            f"  {name.replace('_', ' ')}: {len(term.position)} sites, {reach}, neighbour list with a skin of {scene.forces.skin_A:g} Å"
+        )
     if len(system.model.inertia) and system.model.inertia.any():
         lines.append("  rotation: split rotor")
     if not scene.forces.tail_correction:
@@ -60,4 +64,8 @@ def _size(value) -> int:
         return 4 * _size(value.state) + _size(value.terms) + _size(value.model)
     if isinstance(value, dict):
         value = value.values()
-    return sum(_size(part) for part in value) if isinstance(value, tuple) or hasattr(value, "__iter__") and not isinstance(value, str) else 0
+    return (
+        sum(_size(part) for part in value)
+        if isinstance(value, tuple) or (hasattr(value, "__iter__") and not isinstance(value, str))
+        else 0
+    )

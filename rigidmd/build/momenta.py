@@ -48,7 +48,9 @@ def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.
     state.velocity[:] = rng.standard_normal(state.velocity.shape) * np.sqrt(thermal / mass)[:, None]
     remove_momentum(model, state.velocity)
     kinetic = 0.5 * mass @ (state.velocity**2).sum(axis=1)
-    state.velocity[:] *= np.sqrt(0.5 * freedom.translation * thermal / kinetic) if kinetic > 0 and freedom.translation else 0.0
+    state.velocity[:] *= (
+        np.sqrt(0.5 * freedom.translation * thermal / kinetic) if kinetic > 0 and freedom.translation else 0.0
+    )
     if len(state.angular_momentum_body):
         spread = np.sqrt(thermal * model.inertia[model.species])
         state.angular_momentum_body[:] = rng.standard_normal(spread.shape) * spread

@@ -105,7 +105,10 @@ def _read_atoms(path: Path) -> _Atoms:
         if not np.allclose(atoms.cell.angles(), 90, atol=1e-3) or not atoms.pbc.all():
             angles = ", ".join(f"{a:g}" for a in atoms.cell.angles())
             raise StructureError(
-                str(path), [f"its cell has angles {angles}° and periodicity {atoms.pbc}; only boxes with right angles, periodic in all directions, are handled"]
+                str(path),
+                [
+                    f"its cell has angles {angles}° and periodicity {atoms.pbc}; only boxes with right angles, periodic in all directions, are handled"
+                ],
             )
         edges = atoms.cell.lengths()
     return _Atoms(elements, names, residue, atoms.get_positions(), velocity, edges)
@@ -145,7 +148,9 @@ def _match(atoms: _Atoms, runs: list[list[int]], species: list[Molecule]) -> tup
     groups, faults = [], []
     for number, run in enumerate(runs, 1):
         residue = atoms.residue[run[0]]
-        label = f"molecule {number} (atoms {run[0] + 1} to {run[-1] + 1}" + (f", residue {residue[1]!r})" if residue else ")")
+        label = f"molecule {number} (atoms {run[0] + 1} to {run[-1] + 1}" + (
+            f", residue {residue[1]!r})" if residue else ")"
+        )
         named = [k for k, s in enumerate(species) if residue and residue[1] in s.residue_names]
         fitting = [(k, order) for k in named or range(len(species)) if (order := _assign(atoms, run, species[k]))]
         if len(fitting) == 1:
@@ -271,7 +276,9 @@ def _permutations(elements: list[str]) -> list[tuple[int, ...]]:
     return orders
 
 
-def _fit_all(path: Path, atoms: _Atoms, groups: list[_Group], species: list[Molecule], edges, tolerance: float) -> Arrangement:
+def _fit_all(
+    path: Path, atoms: _Atoms, groups: list[_Group], species: list[Molecule], edges, tolerance: float
+) -> Arrangement:
     n = len(groups)
     index = np.array([group.species for group in groups])
     position, rotation = np.zeros((n, 3)), np.zeros((n, 3, 3))
@@ -312,7 +319,10 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
     try:
         with np.load(path, allow_pickle=False) as data:
             names = [str(name) for name in data["species_names"]]
-            arrays = {key: data[key] for key in ("species", "position", "velocity", "rotation", "angular_momentum_body", "edges")}
+            arrays = {
+                key: data[key]
+                for key in ("species", "position", "velocity", "rotation", "angular_momentum_body", "edges")
+            }
     except FileNotFoundError:
         raise StructureError(str(path), ["there is no such file"]) from None
     except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user

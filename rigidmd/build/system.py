@@ -147,7 +147,9 @@ def _species(scene: Scene) -> list[Molecule]:
         except Faults as error:
             faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.faults]
     names = [m.name for m in found]
-    faults += [f"molecules: {name} stands there twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1]
+    faults += [
+        f"molecules: {name} stands there twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1
+    ]
     if faults:
         raise SceneError(scene.source, faults)
     return found
@@ -182,7 +184,12 @@ def _sites_from_file(scene: Scene, entry: Molecules) -> tuple[Site, ...]:
         given = match.mass_u if match.mass_u is not None else float(mass)
         sites.append(
             match.model_copy(
-                update={"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
+                update={
+                    "name": name[:5],
+                    "element": element,
+                    "mass_u": given,
+                    "position_A": tuple(map(float, position)),
+                }
             )
         )
     faults += [f"sites: {s.name} is no atom of it" for s in entry.sites if s.name not in used]
@@ -236,7 +243,9 @@ def _cutoff(scene: Scene, space: Space, species: list[Molecule]) -> float:
     for m in species:
         extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
         if extent > half:
-            faults.append(f"a molecule of {m.name} is {extent:.2f} Å long, more than half the shortest edge, {half:.3f} Å")
+            faults.append(
+                f"a molecule of {m.name} is {extent:.2f} Å long, more than half the shortest edge, {half:.3f} Å"
+            )
     start = forces.switch_start_A
     if start is not None and start >= cutoff:
         faults.append(f"forces.switch_start_A = {start:g} is not below the cut-off of {cutoff:g} Å")
@@ -317,7 +326,9 @@ def _left_out(scene: Scene, terms: dict, model: Model, space: Space) -> list[str
     if "lennard_jones" not in terms:
         out.append("Lennard-Jones: no site has it")
     if "coulomb" not in terms:
-        out.append("charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one"))
+        out.append(
+            "charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one")
+        )
     if isinstance(model.rotor, NoRotor):
         out.append("rotation and torques: every molecule is a point")
     if space.volume == inf:

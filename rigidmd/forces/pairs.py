@@ -35,7 +35,9 @@ def pair_forces(law: NamedTuple, space: Space, sites: BodySites | CentralSites, 
     s = len(sites.molecule)
     pairs = empty_list(space, sites.molecule, law.cutoff, skin)
     blocks = len(pairs.needed)
-    return PairForces(law, space, sites, pairs, np.zeros((s, 3)), np.zeros((blocks, s, 3)), np.zeros((blocks, TALLY_SIZE)))
+    return PairForces(
+        law, space, sites, pairs, np.zeros((s, 3)), np.zeros((blocks, s, 3)), np.zeros((blocks, TALLY_SIZE))
+    )
 
 
 def with_room(term: NamedTuple) -> NamedTuple:

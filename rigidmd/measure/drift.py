@@ -29,7 +29,9 @@ def slope(time: np.ndarray, value: np.ndarray) -> Slope:
     gradient = centred @ (value - value.mean()) / spread
     left = value - value.mean() - gradient * centred
     variance = left @ left / (len(time) - 2)
-    return Slope(float(gradient), float(np.sqrt(variance * inefficiency(left) / spread)), float(np.sqrt(np.mean(left**2))))
+    return Slope(
+        float(gradient), float(np.sqrt(variance * inefficiency(left) / spread)), float(np.sqrt(np.mean(left**2)))
+    )
 
 
 def inefficiency(value: np.ndarray) -> float:

@@ -77,7 +77,10 @@ def _stage(system: System, samples: list["Sample"], k: int, computing: float) ->
     first = before or own[:1]
     steps = own[-1].step - first[0].step
     speed = steps / computing if computing > 0 else None
-    line = slope([s.time for s in first + own[not before :]], [0.0 if s in before else s.drift for s in first + own[not before :]])
+    line = slope(
+        [s.time for s in first + own[not before :]],
+        [0.0 if s in before else s.drift for s in first + own[not before :]],
+    )
     mean_t, error_t = _mean([s.temperature for s in own])
     kinetic = np.array([s.kinetic for s in own])
     spread = float(kinetic.std())
@@ -106,7 +109,9 @@ def _stage(system: System, samples: list["Sample"], k: int, computing: float) ->
         "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / KJ_PER_MOL / n),
         "drift_kT_ns_per_degree_of_freedom": per_kt and _known(per_kt),
         "drift_error_kT_ns_per_degree_of_freedom": error_kt and _known(error_kt),
-        "drift_over_kinetic_std": _known(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread) if spread else None,
+        "drift_over_kinetic_std": _known(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread)
+        if spread
+        else None,
         "energy_rms_kJ_mol_per_molecule": _known(line.rms / KJ_PER_MOL / n),
     }
 

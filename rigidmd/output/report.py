@@ -58,7 +58,9 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
             for name, key in (("T_trans", "temperature_translation_K"), ("T_rot", "temperature_rotation_K"))
             if stage[key] is not None
         ]
-        rows.append(("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({', '.join(parts)})"))
+        rows.append(
+            ("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({', '.join(parts)})")
+        )
     rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
     if stage["pressure_bar"] is not None:
         rows.append(("pressure", f"{stage['pressure_bar']:.0f} ± {stage['pressure_error_bar']:.0f} bar"))
@@ -70,8 +72,12 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{value:+.2g} ± {error:.1g} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
-            rows.append(("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in all"))
-        rows.append(("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line"))
+            rows.append(
+                ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in all")
+            )
+        rows.append(
+            ("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line")
+        )
     return rows
 
 
