@@ -164,9 +164,8 @@ def _energy(options: argparse.Namespace) -> int:
     print(f"  {'virial':<22}{found['virial']:>22.10g} {unit}")
     if found["pressure_bar"] is not None:
         print(f"  {'pressure':<22}{found['pressure_bar']:>22.10g} bar")
-    print(
-        f"  {'largest force':<22}{found['largest_force_per_A']:>22.10g} {unit}/Å on molecule {found['largest_force_molecule']}"
-    )
+    force, molecule = found["largest_force_per_A"], found["largest_force_molecule"]
+    print(f"  {'largest force':<22}{force:>22.10g} {unit}/Å on molecule {molecule}")
     return 0
 
 
@@ -185,9 +184,8 @@ def _models(options: argparse.Namespace) -> int:
         m = load_model(name)
         moments = " ".join(f"{x:.4f}" for x in m.inertia)
         print(f"{name:<12}{m.title}")
-        print(
-            f"{'':<12}{len(m.masses)} sites ({' '.join(m.site_names)}), {m.kind}, {m.mass:.4f} u, inertia {moments} u Å²"
-        )
+        sites = f"{len(m.masses)} sites ({' '.join(m.site_names)})"
+        print(f"{'':<12}{sites}, {m.kind}, {m.mass:.4f} u, inertia {moments} u Å²")
         if m.charges.any():
             charges = " ".join(f"{q:+.4f}" for q in m.charges)
             print(f"{'':<12}charges {charges} e, dipole {m.dipole_debye:.3f} D")

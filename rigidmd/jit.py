@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numba
 from numba import types
+from numba.extending import overload
 
 PACKAGE = Path(__file__).parent
 UNUSED_AFTER_DAYS = 30.0
@@ -59,16 +60,30 @@ def _cache_folder() -> str:
 CACHE_FOLDER = _cache_folder()
 
 
-def kernel(function=None, *, parallel=False, fastmath=False):
-    """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder."""
+def kernel(function=None, *, parallel=False, fastmath=False, inline=False):
+    """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder.
+
+    inline: make LLVM inline it wherever it is called, for what runs in an inner loop. Terms are passed as their fields,
+    forty arguments and more, and a call costs more than a pair of sites.
+    """
     if function is None:
-        return lambda f: kernel(f, parallel=parallel, fastmath=fastmath)
+        return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline)
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = CACHE_FOLDER
+    options = _options(fastmath, inline) | ({"parallel": True} if parallel else {})
     try:
-        return numba.njit(cache=True, parallel=parallel, fastmath=fastmath, error_model="numpy")(function)
+        return numba.njit(cache=True, **options)(function)
     finally:
         numba.config.CACHE_DIR = before
+
+
+def implements(stub, fastmath=False, inline=False):
+    """`numba.extending.overload` with the options of `kernel`, which an overload does not inherit from its caller."""
+    return overload(stub, jit_options=_options(fastmath, inline))
+
+
+def _options(fastmath, inline: bool) -> dict:
+    return {"error_model": "numpy", "fastmath": fastmath} | ({"forceinline": True} if inline else {})
 
 
 def is_a(numba_type, named_tuple) -> bool:

@@ -148,7 +148,7 @@ def molecule(
     for i in range(len(sites)):
         for j in range(i):
             if np.linalg.norm(body[i] - body[j]) <= SAME_PLACE * size:
-                faults.append(f"sites {sites[j].name} and {sites[i].name} are on one place")
+                faults.append(f"sites {sites[j].name} and {sites[i].name} are on one place")  # noqa: PERF401
     if frame.kind == "point" and not faults:
         off = np.linalg.norm(body, axis=1)
         faults += [

@@ -62,7 +62,7 @@ class Molecules(Section):
     model: str | None = None
     """A model that comes with rigidmd; `rigidmd models` lists them"""
     file: str | None = None
-    """A molecule in a .toml file like those models, or the geometry of one in any file ASE reads, with `sites` for it"""
+    """A molecule in a .toml file like those models, or a geometry in any file ASE reads, with `sites` for its atoms"""
     name: str | None = None
     """What to call the species; the model's or file's name when not given"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)

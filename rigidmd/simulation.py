@@ -153,7 +153,7 @@ class Simulation:
         _check_frames(scene)
 
     def run(self, progress: bool = False) -> Results:
-        """Run all stages. Raises OutputError before anything is computed, SimulationError when numbers lose meaning."""
+        """Run all stages. Raises OutputError before anything is computed, SimulationError when numbers go bad."""
         if self._folder is not None:
             make_folder(self._folder, self._force)
         numba.set_num_threads(self.threads)
@@ -351,8 +351,8 @@ class Simulation:
             write_state(self._folder / LAST_GOOD_STATE, self.system, state)
             where = f" Last good state: {self._folder / LAST_GOOD_STATE}"
         return SimulationError(
-            f"after step {step} ({time:g} ps): {error}. Molecules overlap or timestep_fs is too long; try a shorter one, "
-            f"or an nvt stage first.{where}"
+            f"after step {step} ({time:g} ps): {error}. Molecules overlap or timestep_fs is too long; "
+            f"try a shorter one, or an nvt stage first.{where}"
         )
 
     @contextlib.contextmanager

@@ -83,7 +83,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
 
 
 def _suggestion(name: str, known: list[str]) -> str:
-    """'; did you mean ...?' for the nearest known name (one with a forgotten unit suffix first), or the list of them."""
+    """'; did you mean ...?' for the nearest known name (one with a forgotten unit suffix first), or all of them."""
     near = [key for key in known if key.startswith(name + "_")] or difflib.get_close_matches(name, known, 1, 0.6)
     if near:
         return f"; did you mean {near[0]}?"
@@ -108,7 +108,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def line_of(keys: list, text: str) -> int | None:
-    """Line (from 1) where a TOML text sets the given path of keys, or opens the nearest table around it; None if not."""
+    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; None if nowhere."""
     found = None
     table: list = []
     counts: dict[str, int] = {}

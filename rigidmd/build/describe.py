@@ -5,6 +5,7 @@ from math import inf
 import numpy as np
 
 from rigidmd.build.system import System
+from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import Stage
 from rigidmd.units import FEMTOSECOND
 
@@ -32,13 +33,12 @@ def describe(system: System) -> str:
     lines.append("\ncompiled in:")
     for name, term in system.terms.items():
         reach = f"cut-off {system.cutoff:g} Å, {scene.forces.truncation}" if system.cutoff < inf else "no cut-off"
-        lines.append(
-            f"  {name.replace('_', ' ')}: {len(term.position)} sites, {reach}, neighbour list with a skin of {scene.forces.skin_A:g} Å"
-        )
-    if len(system.model.inertia) and system.model.inertia.any():
-        lines.append("  rotation: split rotor")
-    if not scene.forces.tail_correction:
-        pass
+        skin = f"neighbour list with a skin of {scene.forces.skin_A:g} Å"
+        lines.append(f"  {name.replace('_', ' ')}: {len(term.position)} sites, {reach}, {skin}")
+    if not isinstance(system.model.rotor, NoRotor):
+        lines.append(f"  rotation: {type(system.model.rotor).__name__}")
+    if any(stage.ensemble == "nvt" for stage in scene.stages):
+        lines.append("  thermostat: velocity rescaling, in the nvt stages only")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")
@@ -56,16 +56,10 @@ def _stage(stage: Stage) -> str:
 
 
 def _size(value) -> int:
-    """Bytes of all arrays in nested tuples and dictionaries."""
+    """Bytes of all arrays in nested tuples."""
+    if isinstance(value, System):
+        # The state four times: the start, the one that moves, the last good one, forces and torques.
+        return 4 * _size(value.state) + _size(tuple(value.terms.values())) + _size(value.model)
     if isinstance(value, np.ndarray):
         return value.nbytes
-    if isinstance(value, System):
-        # the start and the state that moves; forces and torques on the bodies, twice while energies are evaluated
-        return 4 * _size(value.state) + _size(value.terms) + _size(value.model)
-    if isinstance(value, dict):
-        value = value.values()
-    return (
-        sum(_size(part) for part in value)
-        if isinstance(value, tuple) or (hasattr(value, "__iter__") and not isinstance(value, str))
-        else 0
-    )
+    return sum(_size(part) for part in value) if isinstance(value, tuple) else 0

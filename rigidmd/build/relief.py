@@ -48,7 +48,7 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
     length = LONGEST_MOVE * scale
     arm = np.where(radius > 0, radius, 1.0)[engine.model.species][: len(state.rotation), None]
     mobile = (engine.model.inertia > 0)[engine.model.species][: len(state.rotation)]
-    for step in range(1, MOST_STEPS + 1):
+    for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
         # Each molecule along its own force, none further than `length`: overlaps do not slow down everybody else.
         push = load.force / np.abs(load.force).max()
         turn = load.torque_body * mobile / arm / np.abs(load.force).max()

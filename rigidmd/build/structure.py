@@ -107,7 +107,8 @@ def _read_atoms(path: Path) -> _Atoms:
             raise StructureError(
                 str(path),
                 [
-                    f"its cell has angles {angles}° and periodicity {atoms.pbc}; only boxes with right angles, periodic in all directions, are handled"
+                    f"its cell has angles {angles}° and periodicity {atoms.pbc}; "
+                    "only boxes with right angles, periodic in all directions, are handled"
                 ],
             )
         edges = atoms.cell.lengths()
@@ -174,7 +175,7 @@ def _formula(elements) -> str:
 
 
 def _assign(atoms: _Atoms, run: list[int], molecule: Molecule) -> list[int] | None:
-    """The run's atoms in the order of the template's massive sites, by name or else by element; None if it is not it."""
+    """The run's atoms in the order of the template's massive sites, by name or else by element; or None."""
     sites = _massive(molecule)
     massless = {molecule.site_names[i] for i in range(len(molecule.masses)) if molecule.masses[i] == 0}
     left = [i for i in run if atoms.names[i] not in massless]
@@ -297,8 +298,8 @@ def _fit_all(
         for m, deviation, order in zip(members, fit.deviation.max(axis=1), fit.order, strict=True):
             if deviation > limit:
                 faults.append(
-                    f"molecule {m + 1} (atoms {order.min() + 1} to {order.max() + 1}) is no {molecule.name}: an atom is "
-                    f"{deviation:.3f} Å from the rigid template, more than {limit:.3f} Å (structure.tolerance)"
+                    f"molecule {m + 1} (atoms {order.min() + 1} to {order.max() + 1}) is no {molecule.name}: an atom "
+                    f"is {deviation:.3f} Å from the rigid template, more than {limit:.3f} Å (structure.tolerance)"
                 )
         if velocity is not None:
             masses = molecule.masses[_massive(molecule)]

@@ -280,7 +280,7 @@ def _sites(species: list[Molecule], index: np.ndarray) -> Sites:
 
 
 def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
-    """Sites of a law: chosen[k] lists the sites of species k that take part. (sites, species-wise positions in them)."""
+    """Sites of a law: chosen[k] lists the sites of species k that take part."""
     counts = np.array([len(c) for c in chosen])[index]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     member = np.repeat(np.arange(len(index)), counts)

@@ -92,7 +92,7 @@ def _drift_threaded(rotor, species, state, h):
         _drift_molecule(rotor, species[m], state, m, h)
 
 
-@kernel
+@kernel(inline=True)
 def _kick_molecule(species, mass, inverse_inertia, state, load, m, h):
     share = h / mass[species]
     for k in range(3):
@@ -103,7 +103,7 @@ def _kick_molecule(species, mass, inverse_inertia, state, load, m, h):
                 state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
 
 
-@kernel
+@kernel(inline=True)
 def _drift_molecule(rotor, species, state, m, h):
     for k in range(3):
         state.position[m, k] += h * state.velocity[m, k]

@@ -7,9 +7,8 @@ from math import exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
-from rigidmd.jit import is_a, kernel
+from rigidmd.jit import implements, is_a, kernel
 
 
 class NoThermostat(NamedTuple):
@@ -38,13 +37,13 @@ def apply(thermostat, model, state, h):
     raise TypeError("compiled code only")
 
 
-@overload(apply)
+@implements(apply)
 def _apply_none(thermostat, model, state, h):
     if is_a(thermostat, NoThermostat):
         return lambda thermostat, model, state, h: None
 
 
-@overload(apply)
+@implements(apply)
 def _apply_rescaling(thermostat, model, state, h):
     if not is_a(thermostat, VelocityRescaling):
         return None

@@ -4,11 +4,10 @@ from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
 from rigidmd.forces import pairs
 from rigidmd.forces.truncation import Name, added, ending, shape_of, switching
-from rigidmd.jit import is_a, kernel
+from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
 
 
@@ -44,14 +43,14 @@ def reaction_field(
     return ReactionField(*shape, end, field, charge_e * sqrt(COULOMB))
 
 
-@kernel
+@kernel(fastmath=PAIR_FLAGS, inline=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2."""
     r = sqrt(r2)
     inverse = 1 / r
     u = inverse + law.field * r2 + law.end[0]
     w = inverse * inverse * inverse - 2 * law.field
-    if r > law.start:
+    if r2 > law.start * law.start:
         if law.switched:
             s, slope = switching(law.cutoff, law.start, r)
             w = s * w - slope * u * inverse
@@ -63,7 +62,7 @@ def radial(law, r2):
     return u, w
 
 
-@overload(pairs.pair)
+@implements(pairs.pair, PAIR_FLAGS, inline=True)
 def _pair(law, i, j, r2):
     if not is_a(law, ReactionField):
         return None

@@ -4,12 +4,11 @@ from math import pi, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba.extending import overload
 from scipy.integrate import quad
 
 from rigidmd.forces import pairs
 from rigidmd.forces.truncation import Name, added, ending, shape_of, switching
-from rigidmd.jit import is_a
+from rigidmd.jit import PAIR_FLAGS, implements, is_a
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
 
@@ -55,7 +54,7 @@ def _inverse_power(p: int):
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
 
 
-@overload(pairs.pair)
+@implements(pairs.pair, PAIR_FLAGS, inline=True)
 def _pair(law, i, j, r2):
     if not is_a(law, LennardJones):
         return None

@@ -105,7 +105,7 @@ def _grid(space, position, radius):
     size = np.zeros(3)
     shape = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
-    most = 2 * int(ceil(len(position) ** (1 / 3)))
+    most = 2 * ceil(len(position) ** (1 / 3))
     lengths = (space.x, space.y, space.z)
     for k in range(3):
         length = lengths[k]
@@ -120,7 +120,7 @@ def _grid(space, position, radius):
 
 @kernel
 def _sort_into_cells(space, position, origin, size, shape):
-    """Counting sort of the sites: cell (s, 3) of each, and the sites of cell c as order[cell_start[c]:cell_start[c + 1]]."""
+    """Counting sort: cell (s, 3) of each site; the sites of cell c are order[cell_start[c]:cell_start[c + 1]]."""
     cell = np.empty((len(position), 3), np.int64)
     flat = np.empty(len(position), np.int64)
     cell_start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)

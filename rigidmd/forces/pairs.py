@@ -1,6 +1,6 @@
 """Forces between pairs of sites: the one loop for every such law.
 
-A law says only what two sites at a distance do: an `@overload(pair)` for its NamedTuple. This loop finds the pairs,
+A law says only what two sites at a distance do: an `@implements(pair)` for its NamedTuple. This loop finds the pairs,
 takes the nearest image, sums energies, virial and forces, and hands the forces to the bodies.
 """
 
@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import prange
-from numba.extending import overload
 
 from rigidmd.forces import terms
 from rigidmd.forces.neighbors import PairList, empty_list, enlarged, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space, nearest_image
 from rigidmd.forces.terms import OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, is_a, kernel
+from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 
 
 class PairForces(NamedTuple):
@@ -52,7 +51,7 @@ def pair(law, i, j, r2):
     raise TypeError(f"{type(law).__name__} is no pair law, or this was called outside compiled code")
 
 
-@overload(terms.add_forces)
+@implements(terms.add_forces)
 def _add_pair_forces(term, state, load, tally):
     if not is_a(term, PairForces):
         return None

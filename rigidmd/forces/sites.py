@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import prange
-from numba.extending import overload
 
-from rigidmd.jit import is_a, kernel
+from rigidmd.jit import implements, is_a, kernel
 
 # Below this many molecules one thread is faster than starting two (about 5 µs against 10 ns a molecule).
 SERIAL = 512
@@ -35,7 +34,7 @@ def place_molecule(sites, state, m, site_position):
     raise TypeError("compiled code only")
 
 
-@overload(place_molecule)
+@implements(place_molecule, inline=True)
 def _place_molecule(sites, state, m, site_position):
     if is_a(sites, CentralSites):
 
@@ -64,7 +63,7 @@ def load_molecule(sites, state, load, m, site_force):
     raise TypeError("compiled code only")
 
 
-@overload(load_molecule)
+@implements(load_molecule, inline=True)
 def _load_molecule(sites, state, load, m, site_force):
     if is_a(sites, CentralSites):
 
@@ -98,7 +97,7 @@ def _load_molecule(sites, state, load, m, site_force):
     return load_body
 
 
-@kernel
+@kernel(inline=True)
 def sum_blocks(site_force, i):
     """Force on site i: the blocks' shares (blocks, s, 3), always added in the same order."""
     fx = site_force[0, i, 0]

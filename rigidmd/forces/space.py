@@ -4,9 +4,8 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
-from rigidmd.jit import is_a
+from rigidmd.jit import PAIR_FLAGS, implements, is_a
 
 
 class Orthorhombic(NamedTuple):
@@ -43,16 +42,17 @@ def nearest_image(space, dx, dy, dz):
     raise TypeError("compiled code only")
 
 
-@overload(nearest_image)
+@implements(nearest_image, PAIR_FLAGS, inline=True)
 def _nearest_image(space, dx, dy, dz):
     if is_a(space, Unbounded):
         return lambda space, dx, dy, dz: (dx, dy, dz)
 
     def nearest(space, dx, dy, dz):
+        # 1/x is the same all along a loop and leaves it; dx / x would be a division for every pair.
         return (
-            dx - space.x * np.rint(dx / space.x),
-            dy - space.y * np.rint(dy / space.y),
-            dz - space.z * np.rint(dz / space.z),
+            dx - space.x * np.rint(dx * (1 / space.x)),
+            dy - space.y * np.rint(dy * (1 / space.y)),
+            dz - space.z * np.rint(dz * (1 / space.z)),
         )
 
     return nearest
@@ -63,7 +63,7 @@ def wrap_index(space, index, count):
     raise TypeError("compiled code only")
 
 
-@overload(wrap_index)
+@implements(wrap_index, inline=True)
 def _wrap_index(space, index, count):
     if is_a(space, Unbounded):
         return lambda space, index, count: index if 0 <= index < count else -1

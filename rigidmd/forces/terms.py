@@ -2,16 +2,15 @@
 
 A term is a NamedTuple of numbers and arrays. `add_forces(term, state, load, tally)` is chosen by the term's type at
 compile time; a term that a scene does not have is never compiled. To add a law, write one file with such a NamedTuple
-and an `@overload(add_forces)` (or, for a law between pairs of sites, an `@overload(pairs.pair)`).
+and an `@implements(add_forces)` (or, for a law between pairs of sites, an `@implements(pairs.pair)`).
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numba import literal_unroll
-from numba.extending import overload
 
-from rigidmd.jit import is_a, kernel
+from rigidmd.jit import implements, is_a, kernel
 
 # What a kernel reports; the worst one wins, Python acts on it (dynamics.run and simulation).
 OK = 0
@@ -48,7 +47,7 @@ TALLY_SIZE = 10
 
 
 def add_forces(term, state, load, tally):
-    """Add a term's forces and torques to `load`, its energy and virial to `tally` unless that is None; a status code."""
+    """Add a term's forces and torques to `load`, its energy and virial to `tally` unless None; a status code."""
     raise TypeError(f"{type(term).__name__} is no term, or this was called outside compiled code")
 
 
@@ -58,7 +57,7 @@ class NoForce(NamedTuple):
     force: float = 0.0
 
 
-@overload(add_forces)
+@implements(add_forces)
 def _add_no_force(term, state, load, tally):
     if is_a(term, NoForce):
         return lambda term, state, load, tally: OK

@@ -11,8 +11,8 @@ so p is what is added to the force -v'; or, for `switch`, v(r) S(r) with S falli
 | plain | nothing | nothing |
 | shift | adds a constant (GROMACS potential-shift) | energy |
 | force_shift | subtracts a linear term from the start | energy, force |
-| force_switch | adds a cubic to the force beyond `start` (GROMACS force-switch) | energy, force, its derivative |
-| switch | multiplies the energy by a quintic beyond `start` (OpenMM switching function) | energy, force, its derivative |
+| force_switch | adds a cubic to the force beyond `start` (GROMACS) | energy, force, its derivative |
+| switch | multiplies the energy by a quintic beyond `start` (OpenMM) | energy, force, its derivative |
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from rigidmd.jit import kernel
+from rigidmd.jit import PAIR_FLAGS, kernel
 
 Name = Literal["plain", "shift", "force_shift", "force_switch", "switch"]
 NAMES: tuple[str, ...] = get_args(Name)
@@ -61,7 +61,7 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
     return np.array([quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic])
 
 
-@kernel
+@kernel(fastmath=PAIR_FLAGS, inline=True)
 def added(end, x):
     """(energy, force) that an ending adds at x = r - start > 0, its constant not counted."""
     linear = end[1]
@@ -71,7 +71,7 @@ def added(end, x):
     return -x * (linear + x2 * (quadratic / 3 + x * cubic / 4)), linear + x2 * (quadratic + x * cubic)
 
 
-@kernel
+@kernel(fastmath=PAIR_FLAGS, inline=True)
 def switching(cutoff, start, r):
     """(S, dS/dr) of the quintic 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start)."""
     width = cutoff - start

@@ -1,16 +1,14 @@
 """Free-rotor flows: how a body turns under no torque.
 
-A rotor is a term: `turn(rotor, species, rotation, angular_momentum, m, h)` is chosen by its type when compiled, so a scene of
-points compiles no rotation at all.
+A rotor is a term: `turn(rotor, ...)` is chosen by its type when compiled, so a scene of points compiles no rotation.
 """
 
 from math import cos, sin
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
-from rigidmd.jit import is_a, kernel
+from rigidmd.jit import implements, is_a, kernel
 
 
 class SplitRotor(NamedTuple):
@@ -34,13 +32,13 @@ def turn(rotor, species, rotation, angular_momentum_body, m, h):
     raise TypeError(f"{type(rotor).__name__} is no rotor, or this was called outside compiled code")
 
 
-@overload(turn)
+@implements(turn, inline=True)
 def _turn_points(rotor, species, rotation, angular_momentum_body, m, h):
     if is_a(rotor, NoRotor):
         return lambda rotor, species, rotation, angular_momentum_body, m, h: None
 
 
-@overload(turn)
+@implements(turn, inline=True)
 def _turn_split(rotor, species, rotation, angular_momentum_body, m, h):
     if not is_a(rotor, SplitRotor):
         return None
@@ -55,7 +53,7 @@ def _turn_split(rotor, species, rotation, angular_momentum_body, m, h):
     return turn_split
 
 
-@kernel
+@kernel(inline=True)
 def about_axis(rotor, species, rotation, angular_momentum_body, m, k, i, j, h):
     """Exact flow of L_k²/(2 I_k): angle a = h L_k/I_k, L <- R_k(a)^T L, Q <- Q R_k(a); (k, i, j) cyclic."""
     angle = h * angular_momentum_body[m, k] * rotor.inverse_inertia[species, k]

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.measure.drift import slope
 from rigidmd.output.folder import whole_file
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.simulation import Results
 
-INK, FAINT, WARM, COOL, THIRD = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e", "#5b8c5a"
+INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
 
 def write_summary(path: Path, summary: dict) -> None:
@@ -82,24 +83,24 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
 
 
 def draw_energy(path: Path, results: "Results") -> None:
-    """energy.png: the conserved energy, large enough to see its drift; potential and kinetic; the temperatures."""
+    """energy.png: the drift of the last stage, large enough to be seen; energies and temperatures of the whole run."""
     from matplotlib.figure import Figure
 
+    stages = results.system.scene.stages
     n = len(results.system.model.species)
     scale = KJ_PER_MOL * n
-    time = results["time"]
+    time, stage = results["time"], results["stage"]
     figure = Figure(figsize=(8, 7), layout="constrained")
-    drift, parts, temperature = figure.subplots(3, 1, sharex=True, height_ratios=(1.2, 1, 1))
-    stage = results["stage"]
-    for k in np.unique(stage):
-        own = stage == k
-        drift.plot(time[own], results["drift"][own] / scale, color=(COOL, WARM, THIRD)[k % 3], lw=0.9)
-        label = f"{results.system.scene.stages[k].label}"
-        for axis in (drift, parts, temperature):
-            axis.axvline(time[own][-1], color=FAINT, lw=0.6, ls=":")
-        drift.annotate(
-            label, (time[own][0], 1), xycoords=("data", "axes fraction"), xytext=(4, -12), textcoords="offset points",
-            fontsize=9, color=FAINT,
+    drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
+    own = stage == stage[-1]
+    drift.plot(time[own], results["drift"][own] / scale, color=COOL, lw=0.9)
+    if own.sum() > 2:
+        line = slope(time[own], results["drift"][own] / scale)
+        fitted = (results["drift"][own] / scale).mean() + line.value * (time[own] - time[own].mean())
+        drift.plot(time[own], fitted, color=WARM, lw=1.4)
+        drift.set_title(
+            f"{stages[stage[-1]].label}: drift {line.value * 1000:+.2g} ± {line.error * 1000:.1g} kJ/mol/ns per molecule",
+            loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
     parts.plot(time, (results["potential"] - results["potential"][-1]) / scale, color=COOL, lw=0.9, label="potential")
@@ -116,7 +117,15 @@ def draw_energy(path: Path, results: "Results") -> None:
     for axis in (drift, parts, temperature):
         axis.spines[["top", "right"]].set_visible(False)
         axis.margins(x=0)
-        if axis is not drift and axis.get_legend_handles_labels()[0]:
+    for axis in (parts, temperature):
+        for k in np.unique(stage):
+            start = time[stage == k][0]
+            axis.axvline(start, color=FAINT, lw=0.6, ls=":")
+            axis.annotate(
+                stages[k].label, (start, 1), xycoords=("data", "axes fraction"), xytext=(4, -4),
+                textcoords="offset points", fontsize=9, color=FAINT, va="top",
+            )  # fmt: skip
+        if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, ncols=2, loc="upper right", fontsize=9)
     figure.suptitle(f"{results.system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
     with whole_file(path) as temporary:
