@@ -18,7 +18,7 @@ from rigidmd.forces.sites import BodySites, CentralSites
 from rigidmd.forces.space import Orthorhombic, Space, Unbounded
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.mechanics.rotor import NoRotor, SplitRotor
+from rigidmd.mechanics.rotor import NoRotor, split_rotor
 from rigidmd.molecules import Molecule, Site, load_model, molecule, read_molecule
 from rigidmd.scene import Molecules, Scene
 from rigidmd.units import COULOMB, GRAM_PER_CM3
@@ -258,10 +258,9 @@ def _cutoff(scene: Scene, space: Space, species: list[Molecule]) -> float:
 
 def _model(species: list[Molecule], index: np.ndarray) -> Model:
     inertia = np.array([m.inertia for m in species])
-    with np.errstate(divide="ignore"):
-        inverse = np.where(inertia > 0, 1 / inertia, 0.0)
-    rotor = SplitRotor(inverse) if inertia.any() else NoRotor()
-    return Model(index.astype(np.int64), np.array([m.mass for m in species]), inertia, inverse, rotor)
+    rotor = split_rotor(inertia)
+    mass = np.array([m.mass for m in species])
+    return Model(index.astype(np.int64), mass, inertia, rotor.inverse_inertia, rotor if inertia.any() else NoRotor())
 
 
 def _sites(species: list[Molecule], index: np.ndarray) -> Sites:

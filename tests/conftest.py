@@ -1,0 +1,51 @@
+"""Shared by all tests: small scenes, the folder of outside data, the shipped systems."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigidmd.build.system import System, build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.forces.terms import State
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.scene import Scene
+
+ROOT = Path(__file__).parent.parent
+SYSTEMS = sorted((ROOT / "systems").glob("*.toml"))
+
+
+@pytest.fixture(scope="session")
+def reference() -> Path:
+    """Outside data: RIGIDMD_REFERENCE, or ../shared/reference beside the project."""
+    folder = Path(os.environ.get("RIGIDMD_REFERENCE", ROOT.parent / "shared" / "reference"))
+    if not folder.is_dir():
+        pytest.skip(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")
+    return folder
+
+
+def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sections) -> Scene:
+    """A scene of shipped models in a cube (no periodic box if edge is None), two NVE steps."""
+    data = {
+        "box": {"lengths_A": edge} if edge else {"lengths_A": 15.0, "periodic": False},
+        "molecules": [{"model": name, "count": count} for name, count in counts.items()],
+        "start": {"temperature_K": 300.0},
+        "stages": [{"duration_ps": 0.004}],
+    }
+    return Scene.from_dict(data | sections, folder)
+
+
+def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engine, State]:
+    """A system's engine, and its start with molecules shaken off the lattice and turned anew."""
+    rng = np.random.default_rng(seed)
+    state = system.state.copy()
+    state.position[:] += spread * rng.standard_normal(state.position.shape)
+    if len(state.rotation):
+        state.rotation[:] = random_rotations(rng, len(state.rotation))
+    return system, Engine(system.model, system.terms), state
+
+
+def built(counts, edge, seed=0, **sections):
+    """`shaken` of `small_scene`."""
+    return shaken(build(small_scene(counts, edge, **sections)), seed)

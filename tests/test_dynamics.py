@@ -1,0 +1,216 @@
+"""The step: its order, what it keeps, that it can be run backwards, and that it does the same thing every time."""
+
+import numba
+import numpy as np
+import pytest
+from conftest import built, small_scene
+
+from rigidmd.build.momenta import draw_momenta
+from rigidmd.build.system import build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling, kinetic_energy
+from rigidmd.forces.terms import State
+from rigidmd.measure.drift import slope
+from rigidmd.measure.observables import observe
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.scene import Scene
+from rigidmd.simulation import Simulation
+from rigidmd.units import BOLTZMANN
+
+VERLET = SCHEMES["velocity_verlet"]
+
+
+@pytest.fixture(scope="module")
+def liquid():
+    """64 waters (13.4 Å, cut-off 6 Å, smooth), equilibrated: system, engine, state."""
+    scene = small_scene(
+        {"spce": 64}, 12.42, forces={"cutoff_A": 6.0, "switch_start_A": 4.5},
+        stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 2.0}], output={"trajectory": False},
+    )  # fmt: skip
+    simulation = Simulation(scene)
+    state = simulation.run().state
+    return simulation.system, simulation.engine, state
+
+
+def run(engine, state, dt, steps, thermostat=None):
+    moved = state.copy()
+    engine.forget()
+    engine.advance(moved, VERLET, dt, steps, thermostat or NoThermostat())
+    return moved
+
+
+def test_the_energy_error_is_of_order_two(liquid):
+    system, engine, state = liquid
+    start = observe(system, engine, state).energy
+    errors = []
+    for dt in (0.002, 0.001, 0.0005):
+        moved, worst = state.copy(), []
+        engine.forget()
+        for _ in range(40):
+            engine.advance(moved, VERLET, dt, round(0.004 / dt), NoThermostat())
+            worst.append(observe(system, engine, moved).energy - start)
+        errors.append(np.sqrt(np.mean(np.square(worst))))
+    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.1)
+
+
+def test_trajectories_converge_with_order_two():
+    system, engine, state = built({"spce": 2}, None, 8, start={"temperature_K": 50.0})
+    state.position[1] = state.position[0] + [3.0, 0.4, 0.1]
+    ends = [run(engine, state, 0.064 / steps, steps) for steps in (32, 64, 128, 256)]
+    gaps = [
+        max(np.abs(a.position - b.position).max(), np.abs(a.rotation - b.rotation).max())
+        for a, b in zip(ends[:-1], ends[1:], strict=True)
+    ]
+    assert np.log2(np.array(gaps[:-1]) / gaps[1:]) == pytest.approx([2, 2], abs=0.1)
+
+
+def test_time_can_be_reversed(liquid):
+    _, engine, state = liquid
+    there = run(engine, state, 0.001, 200)
+    there.velocity[:] *= -1
+    there.angular_momentum_body[:] *= -1
+    back = run(engine, there, 0.001, 200)
+    # rounding, amplified by the liquid's chaos over 0.4 ps
+    assert back.position == pytest.approx(state.position, abs=1e-9)
+    assert back.rotation == pytest.approx(state.rotation, abs=1e-9)
+    assert -back.velocity == pytest.approx(state.velocity, abs=1e-7)
+
+
+def test_momentum_is_kept_to_rounding(liquid):
+    system, engine, state = liquid
+    moved = run(engine, state, 0.002, 1000)
+    mass = system.model.mass[system.model.species]
+    assert np.abs(mass @ moved.velocity).max() < 1e-12 * (mass[:, None] * np.abs(moved.velocity)).sum()
+
+
+def test_angular_momentum_is_kept_in_free_space():
+    system, engine, state = built({"spce": 4, "nitrogen": 3}, None, 9)
+    draw_momenta(system.model, state, 50.0, np.random.default_rng(0))
+    mass = system.model.mass[system.model.species]
+
+    def total(s):
+        own = np.einsum("nij,nj->ni", s.rotation, s.angular_momentum_body)
+        return (own + np.cross(s.position, mass[:, None] * s.velocity)).sum(axis=0)
+
+    moved = run(engine, state, 0.0005, 1000)
+    assert total(moved) == pytest.approx(total(state), abs=1e-10 * np.abs(state.angular_momentum_body).sum())
+
+
+def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(liquid):
+    system, engine, state = liquid
+    moved, times, energies = state.copy(), [], []
+    engine.forget()
+    for k in range(400):
+        engine.advance(moved, VERLET, 0.001, 50, NoThermostat())
+        times.append(0.05 * (k + 1))
+        energies.append(observe(system, engine, moved).energy / 100 / 64)
+    line = slope(times, energies)
+    assert abs(line.value) < 3 * line.error
+    assert line.error * 1000 < 0.06  # kJ/mol/ns per molecule: small enough to mean something
+
+
+def test_splitting_a_run_changes_no_bit(liquid):
+    _, engine, state = liquid
+    whole = run(engine, state, 0.002, 60)
+    parts = state.copy()
+    engine.forget()
+    for steps in (1, 19, 40):
+        engine.advance(parts, VERLET, 0.002, steps, NoThermostat())
+    for a, b in zip(whole, parts, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("counts", [{"spce": 70, "nitrogen": 20}, {"argon": 700}])
+def test_same_bits_for_one_and_two_threads_and_again(counts):
+    scene = small_scene(counts, 30.0, stages=[{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.05}])
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("this machine has one core")
+    ends = []
+    for threads in (1, 2, 2):
+        simulation = Simulation(Scene.from_dict(scene.model_dump() | {"threads": threads}))
+        ends.append(simulation.run().state)
+    for other in ends[1:]:
+        for a, b in zip(ends[0], other, strict=True):
+            assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("model", "rotation"), [("argon", 0), ("nitrogen", 2), ("spce", 3)]
+)  # fmt: skip
+def test_drawn_momenta_have_the_temperature_exactly_and_no_momentum(model, rotation):
+    system = build(small_scene({model: 50}, 40.0))
+    seen = observe(system, Engine(system.model, system.terms), system.state)
+    assert system.freedom == (147, 50 * rotation)
+    assert seen.temperature == pytest.approx(300, rel=1e-12)
+    assert seen.temperature_translation == pytest.approx(300, rel=1e-12)
+    if rotation:
+        assert seen.temperature_rotation == pytest.approx(300, rel=1e-12)
+    assert np.abs(seen.momentum).max() < 1e-10
+
+
+def test_maxwell_boltzmann_on_every_axis():
+    system = build(small_scene({"spce": 4000}, 60.0))
+    omega2 = system.state.angular_momentum_body**2 * system.model.inverse_inertia[0]
+    assert omega2.mean(axis=0) == pytest.approx(np.full(3, 300 * BOLTZMANN), rel=0.08)
+    assert (18.0154 * system.state.velocity**2).mean(axis=0) == pytest.approx(np.full(3, 300 * BOLTZMANN), rel=0.08)
+
+
+def test_the_thermostat_samples_the_canonical_kinetic_energy():
+    # free flight, so the kinetic energy has nothing but the thermostat: mean and variance of a Gamma distribution
+    system = build(small_scene({"nitrogen": 6}, 40.0))  # linear: its free rotation is exact
+    freedom, thermal = system.freedom.total, 300 * BOLTZMANN
+    thermostat = VelocityRescaling(thermal, 0.01, freedom, np.random.Generator(np.random.Philox(1)), np.zeros(1))
+    state = system.state.copy()
+    engine = Engine(system.model, {})
+    samples, heat = [], []
+    for _ in range(6000):
+        engine.advance(state, VERLET, 0.01, 4, thermostat)
+        samples.append(kinetic_energy(system.model, state))
+        heat.append(samples[-1] - thermostat.heat[0])
+    samples = np.array(samples) / thermal
+    assert samples.mean() == pytest.approx(freedom / 2, rel=0.01)
+    assert samples.var() == pytest.approx(freedom / 2, rel=0.08)
+    assert np.ptp(heat) < 1e-9 * thermal * freedom  # energy less heat is conserved
+
+
+def test_a_free_body_is_carried_by_nothing_else():
+    system = build(small_scene({"argon": 3}, 40.0))
+    state = system.state.copy()
+    Engine(system.model, {}).advance(state, VERLET, 0.01, 100, NoThermostat())
+    assert state.position == pytest.approx(system.state.position + system.state.velocity, abs=1e-12)
+    assert isinstance(state, State)
+    assert state.rotation.shape == (0, 3, 3)  # points store no rotation
+
+
+def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
+    """A dimer far from symmetric against a general ODE solver on the same forces."""
+    from scipy.integrate import solve_ivp
+
+    system, engine, state = built({"spce": 1, "nitrogen": 1}, None, 11)
+    state.position[1] = state.position[0] + [3.2, 0.5, -0.3]
+    state.rotation[:] = random_rotations(np.random.default_rng(3), 2)
+    draw_momenta(system.model, state, 100.0, np.random.default_rng(1))
+    inverse = system.model.inverse_inertia[system.model.species]
+    mass = system.model.mass[system.model.species][:, None]
+
+    def pack(s):
+        return np.concatenate([a.ravel() for a in s])
+
+    def unpack(y):
+        return State(*(part.reshape(a.shape) for part, a in zip(np.split(y, [6, 12, 30]), state, strict=True)))
+
+    def slopes(_, y):
+        s = unpack(y)
+        load, _ = engine.evaluate(State(*(np.ascontiguousarray(a) for a in s)))
+        w = s.angular_momentum_body * inverse
+        hat = np.zeros((2, 3, 3))
+        hat[:, 0, 1], hat[:, 0, 2], hat[:, 1, 2] = -w[:, 2], w[:, 1], -w[:, 0]
+        hat -= np.swapaxes(hat, 1, 2).copy()
+        turning = (np.cross(s.angular_momentum_body, w) + load.torque_body) * (inverse > 0)
+        return pack(State(s.velocity, load.force / mass, s.rotation @ hat, turning))
+
+    exact = unpack(solve_ivp(slopes, (0, 0.05), pack(state), method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1])
+    moved = run(engine, state, 0.05 / 4000, 4000)
+    for a, b in zip(moved, exact, strict=True):
+        assert a == pytest.approx(b, abs=2e-5 * max(1, np.abs(b).max()))

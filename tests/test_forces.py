@@ -1,0 +1,148 @@
+"""Forces: against the slow oracle, against finite differences, and against Newton."""
+
+import numpy as np
+import pytest
+from conftest import built, small_scene
+from reference import Oracle
+
+from rigidmd.build.system import build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.forces.pairs import PairForces
+from rigidmd.mechanics.rotation import from_vector
+
+ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch"]
+MIXTURES = [
+    ({"spce": 12}, 13.0),
+    ({"tip4p2005": 8, "nitrogen": 5, "argon": 4}, 14.0),
+    ({"argon": 20}, 12.5),
+    ({"spce": 5, "nitrogen": 6}, None),
+]
+
+
+def energies(engine, state):
+    return {name: tally.energy for name, tally in engine.evaluate(state)[1].items()}
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize(("counts", "edge"), MIXTURES)
+def test_energies_are_those_of_the_oracle(counts, edge, ending):
+    forces = {"cutoff_A": 6.0, "truncation": ending, "switch_start_A": 4.5, "reaction_field_permittivity": 78.5}
+    for seed, mixing in enumerate(["lorentz-berthelot", "geometric"]):
+        system, engine, state = built(counts, edge, seed, forces=forces | {"mixing": mixing})
+        lj, coulomb = Oracle(system).energy(state.position, state.rotation)
+        found = energies(engine, state)
+        assert found["lennard_jones"] == pytest.approx(lj, rel=1e-11)
+        assert found.get("coulomb", 0.0) == pytest.approx(coulomb, rel=1e-10)
+
+
+def test_energies_without_box_and_cut_off():
+    system, engine, state = built({"tip4p2005": 3, "argon": 2}, None)
+    lj, coulomb = Oracle(system).energy(state.position, state.rotation)
+    assert energies(engine, state) == pytest.approx({"lennard_jones": lj, "coulomb": coulomb}, rel=1e-11)
+    assert not system.constants
+
+
+def test_a_box_with_unequal_edges_and_many_cells():
+    # 30 Å against a cut-off of 4: cells whose neighbourhood does not meet itself; far outside the box as well
+    scene = small_scene({"nitrogen": 60, "argon": 40}, None, box={"lengths_A": [30.0, 10.0, 17.0]}, forces={"cutoff_A": 4.0})
+    system = build(scene)
+    engine, state = Engine(system.model, system.terms), system.state.copy()
+    rng = np.random.default_rng(5)
+    state.position[:] += rng.normal(size=state.position.shape)
+    expected = Oracle(system).energy(state.position, state.rotation)[0]
+    assert energies(engine, state)["lennard_jones"] == pytest.approx(expected, rel=1e-11)
+    state.position[:] += rng.integers(-3, 4, state.position.shape) * np.array(system.space)
+    assert energies(engine, state)["lennard_jones"] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_forces_and_torques_are_the_slope_of_the_energy(ending):
+    forces = {"cutoff_A": 6.0, "truncation": ending, "switch_start_A": 4.5}
+    system, engine, state = built({"tip4p2005": 6, "nitrogen": 4, "argon": 3}, 13.0, 1, forces=forces)
+    load, _ = engine.evaluate(state)
+
+    def energy(moved):
+        return sum(energies(engine, moved).values())
+
+    def slope(move, h):
+        up, down = state.copy(), state.copy()
+        move(up, h)
+        move(down, -h)
+        return -(energy(up) - energy(down)) / (2 * h)
+
+    def extrapolated(move, h=2e-4):  # Richardson: the error of the difference falls as h^4
+        return (4 * slope(move, h / 2) - slope(move, h)) / 3
+
+    scale = np.abs(load.force).max()
+    for m in range(len(state.position)):
+        for k in range(3):
+
+            def shift(moved, h, m=m, k=k):
+                moved.position[m, k] += h
+
+            def turn(moved, h, m=m, k=k):
+                moved.rotation[m] = moved.rotation[m] @ from_vector(h * np.eye(3)[k])
+
+            # `plain` jumps where a pair crosses the cut-off; these starts have none within h of it
+            assert load.force[m, k] == pytest.approx(extrapolated(shift), abs=1e-6 * scale)
+            assert load.torque_body[m, k] == pytest.approx(extrapolated(turn), abs=1e-6 * scale)
+
+
+def test_virial_is_the_slope_of_the_energy_with_the_box():
+    forces = {"cutoff_A": 6.0, "truncation": "force_switch", "switch_start_A": 4.0}
+    system, engine, state = built({"spce": 14}, 13.0, 2, forces=forces)
+    virial = sum(tally.virial for tally in engine.evaluate(state)[1].values())
+
+    def energy(stretch):
+        terms = {
+            name: term._replace(space=type(term.space)(*(x * stretch for x in term.space)))
+            for name, term in system.terms.items()
+        }
+        moved = state.copy()
+        moved.position[:] *= stretch  # centres of mass only: the molecular virial
+        return sum(energies(Engine(system.model, terms), moved).values())
+
+    h = 1e-5
+    assert virial.trace() == pytest.approx(-(energy(1 + h) - energy(1 - h)) / (2 * h), rel=1e-6)
+
+
+def test_newton_and_no_net_torque_in_free_space():
+    _, engine, state = built({"spce": 10, "nitrogen": 5, "argon": 5}, None, 3)
+    load, _ = engine.evaluate(state)
+    scale = np.abs(load.force).sum()
+    assert np.abs(load.force.sum(axis=0)).max() < 1e-14 * scale
+    torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body).sum(axis=0)
+    torque += np.cross(state.position, load.force).sum(axis=0)
+    assert np.abs(torque).max() < 1e-14 * scale * np.abs(state.position).max()
+
+
+def test_a_list_with_little_room_grows_and_misses_nothing():
+    _, engine, state = built({"spce": 40}, 18.0, 4, forces={"cutoff_A": 8.0})
+    expected = energies(engine, state)
+    terms = engine.terms
+    for name, term in terms.items():
+        cramped = term.pairs._replace(partner=np.empty((len(term.pairs.partner), 3), np.int32), counters=np.zeros(2, np.int64))
+        terms[name] = term._replace(pairs=cramped)
+    assert energies(Engine(engine.model, terms), state) == expected
+
+
+def test_the_list_is_rebuilt_for_moves_and_for_turns():
+    system, engine, state = built({"spce": 30}, 16.0, 6, forces={"cutoff_A": 7.0, "skin_A": 0.8})
+    oracle = Oracle(system)
+    rng = np.random.default_rng(0)
+    for step in range(12):
+        if step % 2:
+            state.rotation[:] = state.rotation @ from_vector(0.25 * rng.standard_normal((30, 3)))
+        else:
+            state.position[:] += 0.2 * rng.standard_normal(state.position.shape)
+        expected = sum(oracle.energy(state.position, state.rotation))
+        assert sum(energies(engine, state).values()) == pytest.approx(expected, rel=1e-10)
+    builds = [term.pairs.counters[1] for term in engine.terms.values() if isinstance(term, PairForces)]
+    assert min(builds) > 3
+
+
+def test_the_self_energy_of_the_reaction_field():
+    system = build(small_scene({"spce": 4}, 20.0, forces={"truncation": "switch"}))
+    field = 0.5 / 9.0**3
+    dipole2 = (system.species[0].dipole_debye / 4.80320471) ** 2
+    assert system.constants["reaction_field_self"] == pytest.approx(-4 * field * dipole2 * 138935.457644, rel=1e-9)

@@ -1,0 +1,127 @@
+"""Rotations, inertia, the rotor."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from rigidmd.jit import kernel
+from rigidmd.mechanics.inertia import kind_of_body, principal_frame
+from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations
+from rigidmd.mechanics.rotor import split_rotor, turn
+
+
+@kernel
+def spin(rotor, rotation, angular_momentum, h, steps):
+    for _ in range(steps):
+        turn(rotor, 0, rotation, angular_momentum, 0, h)
+
+
+def test_rotations_agree_with_scipy():
+    rng = np.random.default_rng(0)
+    quaternions, vectors = rng.standard_normal((20, 4)), rng.standard_normal((20, 3))
+    vectors[0] = 0.0
+    assert from_quaternion(quaternions) == pytest.approx(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
+    assert from_vector(vectors) == pytest.approx(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def test_random_rotations_are_uniform():
+    q = random_rotations(np.random.default_rng(1), 20000)
+    assert orthogonality_error(q) < 1e-14
+    assert np.abs(q.mean(axis=0)).max() < 0.02  # no direction preferred
+    assert (q**2).mean(axis=0) == pytest.approx(np.full((3, 3), 1 / 3), abs=0.01)
+
+
+@pytest.mark.parametrize("shape", ["bent", "linear", "chiral"])
+def test_align_finds_the_rotation(shape):
+    rng = np.random.default_rng(2)
+    points = {
+        "bent": np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
+        "linear": np.array([[0.0, 0, -1], [0, 0, 0], [0, 0, 1.5]]),
+        "chiral": rng.standard_normal((5, 3)),
+    }[shape]
+    masses = np.arange(1.0, len(points) + 1)
+    points = points - masses @ points / masses.sum()
+    turned = np.einsum("nij,sj->nsi", random_rotations(rng, 30), points)
+    found = align(points, turned, masses)
+    assert np.einsum("nij,sj->nsi", found, points) == pytest.approx(turned, abs=1e-12)
+    assert np.linalg.det(found) == pytest.approx(np.ones(30))
+
+
+def test_principal_frame_diagonalises_and_sees_the_kind():
+    rng = np.random.default_rng(3)
+    q = random_rotations(rng, 1)[0]
+    bodies = {
+        "point": ([2.0], [[0, 0, 0]]),
+        "linear": ([1, 2, 3], [[0, 0, -1], [0, 0, 0], [0, 0, 2]]),
+        "spherical": ([1, 1, 1, 1], [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
+        "symmetric": ([1, 1, 1], [[1, 0, 0], [-0.5, 0.75**0.5, 0], [-0.5, -(0.75**0.5), 0]]),
+        "asymmetric": ([16, 1, 1], [[0, 0, 0], [0.8, 0.6, 0], [-0.8, 0.6, 0]]),
+    }
+    for kind, (masses, positions) in bodies.items():
+        masses, positions = np.array(masses, float), np.array(positions, float)
+        frame = principal_frame(masses, positions @ q.T + 5.0)
+        assert frame.kind == kind
+        x = (positions @ q.T + 5.0 - frame.centre) @ frame.axes
+        tensor = (masses[:, None, None] * ((x**2).sum(1)[:, None, None] * np.eye(3) - x[:, :, None] * x[:, None])).sum(0)
+        assert tensor == pytest.approx(np.diag(frame.inertia), abs=1e-12 * max(1, frame.inertia.max()))
+        assert np.linalg.det(frame.axes) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("scale", [1e-15, 1.0, 1e15])
+def test_the_kind_does_not_depend_on_units(scale):
+    assert kind_of_body(scale * np.array([1.0, 2.0, 3.0])) == "asymmetric"
+    assert kind_of_body(scale * np.array([3.0, 1e-9, 3.0])) == "linear"
+
+
+def euler_equations(inertia, rotation, angular_momentum, t):
+    def slope(_, y):
+        q, l = y[:9].reshape(3, 3), y[9:]  # noqa: E741
+        w = l / inertia
+        hat = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        return np.concatenate([(q @ hat).ravel(), np.cross(l, w)])
+
+    y = np.concatenate([rotation.ravel(), angular_momentum])
+    y = solve_ivp(slope, (0, t), y, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    return y[:9].reshape(3, 3), y[9:]
+
+
+def test_the_split_rotor_is_of_order_two_and_reversible():
+    inertia = np.array([1.0, 2.0, 3.5])
+    rotor = split_rotor(inertia[None])
+    q0, l0 = random_rotations(np.random.default_rng(4), 1), np.array([[0.8, -1.5, 2.0]])
+    q_exact, l_exact = euler_equations(inertia, q0[0], l0[0], 2.0)
+    errors = []
+    for steps in (40, 80, 160):
+        q, l = q0.copy(), l0.copy()  # noqa: E741
+        spin(rotor, q, l, 2.0 / steps, steps)
+        errors.append(max(np.abs(q[0] - q_exact).max(), np.abs(l[0] - l_exact).max()))
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert orders == pytest.approx([2, 2], abs=0.1)
+    spin(rotor, q, l, -2.0 / steps, steps)
+    assert q == pytest.approx(q0, abs=1e-13)
+    assert l == pytest.approx(l0, abs=1e-13)
+
+
+def test_a_free_top_keeps_its_angular_momentum_for_a_million_steps():
+    inertia = np.array([[0.6, 1.1, 1.7]])
+    q, l = np.eye(3)[None].copy(), np.array([[3.0, -2.0, 5.0]])  # noqa: E741
+    lab, size = q[0] @ l[0], np.linalg.norm(l)
+    spin(split_rotor(inertia), q, l, 0.01, 1_000_000)
+    # five plane rotations a step, each good to 1e-16: a random walk of 5e6 steps ends near 2e-13
+    assert abs(np.linalg.norm(l) / size - 1) < 2e-12
+    assert np.abs(q[0] @ l[0] - lab).max() < 2e-12 * size
+    assert orthogonality_error(q) < 2e-12
+
+
+@pytest.mark.parametrize("inertia", [[0.0, 2.0, 2.0], [2.0, 2.0, 0.0], [3.0, 3.0, 3.0]])
+def test_linear_and_spherical_bodies_turn_exactly(inertia):
+    inertia = np.array([inertia])
+    momentum = np.array([[0.5, 0.3, -0.4]]) * (inertia > 0)
+    q, l = random_rotations(np.random.default_rng(7), 1), momentum.copy()  # noqa: E741
+    start = q.copy()
+    spin(split_rotor(inertia), q, l, 0.02, 5000)
+    assert (l == momentum).all()  # nothing reaches an axis without inertia
+    expected = start[0] @ from_vector(100 * momentum[0] / inertia.max())
+    assert q[0] == pytest.approx(expected, abs=1e-11)
+    assert orthogonality_error(q) < 1e-12
