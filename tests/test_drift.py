@@ -6,7 +6,9 @@ import pytest
 from rigidmd.measure.drift import inefficiency, slope
 
 
-@pytest.mark.parametrize(("white", "walk", "low", "high"), [(1.0, 0.0, 0.6, 1.2), (0.0, 1.0, 0.8, 1.5), (1.0, 0.3, 0.8, 1.6)])
+@pytest.mark.parametrize(
+    ("white", "walk", "low", "high"), [(1.0, 0.0, 0.6, 1.2), (0.0, 1.0, 0.8, 1.5), (1.0, 0.3, 0.8, 1.6)]
+)
 def test_the_error_of_a_slope_is_as_large_as_its_scatter(white, walk, low, high):
     rng = np.random.default_rng(0)
     time = 0.05 * np.arange(400)

@@ -1,5 +1,7 @@
 """The step: its order, what it keeps, that it can be run backwards, and that it does the same thing every time."""
 
+from itertools import pairwise
+
 import numba
 import numpy as np
 import pytest
@@ -55,12 +57,11 @@ def test_the_energy_error_is_of_order_two(liquid):
 
 
 def test_trajectories_converge_with_order_two():
-    system, engine, state = built({"spce": 2}, None, 8, start={"temperature_K": 50.0})
+    _, engine, state = built({"spce": 2}, None, 8, start={"temperature_K": 50.0})
     state.position[1] = state.position[0] + [3.0, 0.4, 0.1]
     ends = [run(engine, state, 0.064 / steps, steps) for steps in (32, 64, 128, 256)]
     gaps = [
-        max(np.abs(a.position - b.position).max(), np.abs(a.rotation - b.rotation).max())
-        for a, b in zip(ends[:-1], ends[1:], strict=True)
+        max(np.abs(a.position - b.position).max(), np.abs(a.rotation - b.rotation).max()) for a, b in pairwise(ends)
     ]
     assert np.log2(np.array(gaps[:-1]) / gaps[1:]) == pytest.approx([2, 2], abs=0.1)
 

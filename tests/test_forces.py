@@ -44,7 +44,9 @@ def test_energies_without_box_and_cut_off():
 
 def test_a_box_with_unequal_edges_and_many_cells():
     # 30 Å against a cut-off of 4: cells whose neighbourhood does not meet itself; far outside the box as well
-    scene = small_scene({"nitrogen": 60, "argon": 40}, None, box={"lengths_A": [30.0, 10.0, 17.0]}, forces={"cutoff_A": 4.0})
+    scene = small_scene(
+        {"nitrogen": 60, "argon": 40}, None, box={"lengths_A": [30.0, 10.0, 17.0]}, forces={"cutoff_A": 4.0}
+    )
     system = build(scene)
     engine, state = Engine(system.model, system.terms), system.state.copy()
     rng = np.random.default_rng(5)
@@ -58,7 +60,7 @@ def test_a_box_with_unequal_edges_and_many_cells():
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_forces_and_torques_are_the_slope_of_the_energy(ending):
     forces = {"cutoff_A": 6.0, "truncation": ending, "switch_start_A": 4.5}
-    system, engine, state = built({"tip4p2005": 6, "nitrogen": 4, "argon": 3}, 13.0, 1, forces=forces)
+    _, engine, state = built({"tip4p2005": 6, "nitrogen": 4, "argon": 3}, 13.0, 1, forces=forces)
     load, _ = engine.evaluate(state)
 
     def energy(moved):
@@ -121,7 +123,9 @@ def test_a_list_with_little_room_grows_and_misses_nothing():
     expected = energies(engine, state)
     terms = engine.terms
     for name, term in terms.items():
-        cramped = term.pairs._replace(partner=np.empty((len(term.pairs.partner), 3), np.int32), counters=np.zeros(2, np.int64))
+        cramped = term.pairs._replace(
+            partner=np.empty((len(term.pairs.partner), 3), np.int32), counters=np.zeros(2, np.int64)
+        )
         terms[name] = term._replace(pairs=cramped)
     assert energies(Engine(engine.model, terms), state) == expected
 

@@ -63,7 +63,9 @@ def test_principal_frame_diagonalises_and_sees_the_kind():
         frame = principal_frame(masses, positions @ q.T + 5.0)
         assert frame.kind == kind
         x = (positions @ q.T + 5.0 - frame.centre) @ frame.axes
-        tensor = (masses[:, None, None] * ((x**2).sum(1)[:, None, None] * np.eye(3) - x[:, :, None] * x[:, None])).sum(0)
+        tensor = (masses[:, None, None] * ((x**2).sum(1)[:, None, None] * np.eye(3) - x[:, :, None] * x[:, None])).sum(
+            0
+        )
         assert tensor == pytest.approx(np.diag(frame.inertia), abs=1e-12 * max(1, frame.inertia.max()))
         assert np.linalg.det(frame.axes) == pytest.approx(1)
 

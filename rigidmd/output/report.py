@@ -1,6 +1,7 @@
 """The end of a run: summary.json, the same in words, and energy.png."""
 
 import json
+from math import floor, log10
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,10 +69,10 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
     if stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
         value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
-        rows.append(("drift", f"{value:+.2g} ± {error:.1g} kJ/mol/ns per molecule ({what})"))
+        rows.append(("drift", f"{_signed(value, error)} kJ/mol/ns per molecule ({what})"))
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
-            rows.append(("", f"{value:+.2g} ± {error:.1g} kT/ns per degree of freedom"))
+            rows.append(("", f"{_signed(value, error)} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
             rows.append(
                 ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in all")
@@ -80,6 +81,12 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
             ("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line")
         )
     return rows
+
+
+def _signed(value: float, error: float) -> str:
+    """value ± error, both to two digits of the error."""
+    digits = max(0, 1 - floor(log10(error))) if error > 0 else 3
+    return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
 def draw_energy(path: Path, results: "Results") -> None:
@@ -99,7 +106,7 @@ def draw_energy(path: Path, results: "Results") -> None:
         fitted = (results["drift"][own] / scale).mean() + line.value * (time[own] - time[own].mean())
         drift.plot(time[own], fitted, color=WARM, lw=1.4)
         drift.set_title(
-            f"{stages[stage[-1]].label}: drift {line.value * 1000:+.2g} ± {line.error * 1000:.1g} kJ/mol/ns per molecule",
+            f"{stages[stage[-1]].label}: drift {_signed(line.value * 1000, line.error * 1000)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")

@@ -96,6 +96,8 @@ class TrajectoryFile:
             elif self._format == ".pdb":
                 self._writer.REMARK(f"TIME {time:.6f} PS")
             self._writer.write(self._universe.atoms)
+            if self._format == ".pdb" and (box := dimensions(self._system)):
+                self._writer.CRYST1(box)  # MDAnalysis reads what stands between a model and the next as the model's own
 
     def _extended_xyz(self, time: float) -> str:
         """Comment line of extended XYZ, which OVITO and ASE read: box and time."""

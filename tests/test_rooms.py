@@ -1,0 +1,99 @@
+"""The rooms of the house: imports point one way, and each heavy library has one room."""
+
+import ast
+
+import pytest
+from conftest import ROOT
+
+PACKAGE = ROOT / "rigidmd"
+
+# In this order: a room may import from those above it and from itself.
+ROOMS = [
+    ("errors", "units", "jit", "validation"),
+    ("mechanics",),
+    ("forces",),
+    ("dynamics",),
+    ("molecules",),
+    ("scene",),
+    ("build",),
+    ("measure",),
+    ("output",),
+    ("simulation",),
+    ("cli", "__main__"),
+]
+RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
+
+# schemes is a table of numbers that scenes name; it holds no code that knows of forces
+LIBRARIES = {
+    "ase": {"build/structure.py"},
+    "MDAnalysis": {"output/trajectory.py"},
+    "tomli_w": {"output/scene_file.py"},
+    "matplotlib": {"output/report.py"},
+    "pydantic": {"validation.py", "molecules.py", "scene.py"},
+    "numba": {
+        "jit.py", "forces/terms.py", "forces/sites.py", "forces/pairs.py", "forces/neighbors.py", "dynamics/advance.py",
+        "simulation.py", "measure/summary.py",  # these two only set the number of threads and name the version
+    },
+}  # fmt: skip
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def imports(path):
+    """(module, line, only for type checkers) of every import in a file."""
+    tree = ast.parse(path.read_text())
+    typing_only = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_imports_point_up_the_list_of_rooms(path):
+    room = path.relative_to(PACKAGE).with_suffix("").parts[0]
+    if room == "__init__":
+        return
+    for module in imports(path):
+        parts = module.split(".")
+        if parts[0] == "rigidmd" and len(parts) > 1:
+            assert RANK[parts[1]] <= RANK[room], f"{path.name} imports {module}, which is further down"
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_each_library_has_its_room(library):
+    users = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in FILES
+        for module in imports(path)
+        if module.split(".")[0] == library
+    }
+    assert users <= LIBRARIES[library]
+
+
+def test_no_room_is_unknown():
+    found = {
+        p.stem if p.is_file() else p.name
+        for p in PACKAGE.iterdir()
+        if p.suffix == ".py" or (p / "__init__.py").exists()
+    }
+    assert found - {"__init__"} == set(RANK)
+
+
+def test_the_top_level_holds_what_it_should():
+    allowed = {"pyproject.toml", "rigidmd", "tests", "systems", "README.md", "LICENSE"}
+    import subprocess
+
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    found = {line.split("/")[0] for line in listed.stdout.splitlines()}
+    assert {name for name in found if not name.startswith(".")} <= allowed

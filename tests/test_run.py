@@ -1,0 +1,308 @@
+"""Runs from end to end: every shipped system, every file written and read back, interruption, the commands."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import MDAnalysis as mda
+import numpy as np
+import pytest
+from conftest import ROOT, SYSTEMS, small_scene
+
+import rigidmd
+from rigidmd.build.system import build
+from rigidmd.cli import main
+from rigidmd.output.log import COLUMNS
+from rigidmd.scene import Scene
+from rigidmd.simulation import Every, Simulation
+
+
+@pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.stem)
+def test_every_system_runs_a_few_steps(path, tmp_path):
+    assert path.read_text().startswith("# ")
+    scene = Scene.read(path)
+    short = {f"stages.{k}.duration_ps": 8 * stage.timestep_fs / 1000 for k, stage in enumerate(scene.stages)} | {
+        "output.log_interval_ps": 0.004,
+        "output.trajectory_interval_ps": 0.008,
+    }
+    results = Simulation(Scene.read(path, short), tmp_path / "out").run()
+    assert results.state.position.shape == (len(results.system.model.species), 3)
+    for stage in results.summary["stages"]:
+        assert stage["steps"] == 8
+        assert np.isfinite(stage["potential_kJ_mol_per_molecule"])
+    assert (
+        np.ptp(results["conserved"][results["stage"] == len(scene.stages) - 1])
+        < 1e-3 * np.abs(results["kinetic"]).max()
+    )
+    names = {file.name for file in (tmp_path / "out").iterdir()} - {
+        f"input_{p.name}" for p in (ROOT / "systems" / "structures").iterdir()
+    }
+    assert names == {
+        "scene.toml",
+        "summary.json",
+        "log.csv",
+        "trajectory.xtc",
+        "topology.gro",
+        "final.npz",
+        "energy.png",
+    }
+    universe = results.universe()
+    assert universe.atoms.n_atoms == len(results.system.sites.name)
+
+
+def test_the_resolved_scene_runs_again_to_the_same_bits(tmp_path):
+    short = {"stages.0.duration_ps": 0.02}
+    first = Simulation(Scene.read(ROOT / "systems" / "water_from_structure.toml", short), tmp_path / "a").run()
+    scene = Scene.read(tmp_path / "a" / "scene.toml")
+    assert scene.forces.cutoff_A == 9.0
+    again = Simulation(scene, tmp_path / "b").run()
+    for a, b in zip(first.state, again.state, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_the_final_state_starts_another_run(tmp_path):
+    stages = [{"duration_ps": 0.02}]
+    first = Simulation(small_scene({"spce": 20, "argon": 3}, 18.5, stages=stages), tmp_path / "a").run()
+    scene = small_scene(
+        {"spce": 20, "argon": 3}, None, tmp_path / "a", stages=stages, box={},
+        structure={"file": "final.npz", "velocities": True},
+    )  # fmt: skip
+    system = build(scene)
+    for a, b in zip(first.state, system.state, strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert system.space == first.system.space
+
+
+@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
+@pytest.mark.parametrize("topology", ["topology.gro", "topology.pdb"])
+def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp_path):
+    scene = small_scene(
+        {"tip4p2005": 6, "nitrogen": 4}, 18.5, stages=[{"duration_ps": 0.04}],
+        output={"trajectory": name, "trajectory_interval_ps": 0.01, "topology": topology, "positions": "unwrapped"},
+    )  # fmt: skip
+    seen = []
+
+    def look(moment):
+        system = simulation.system
+        seen.append((moment.time, moment.site_positions, system.site_velocities(moment.state)))
+
+    simulation = Simulation(scene, tmp_path / "out", observers=[Every(0.01, look)])
+    universe = simulation.run().universe()
+    assert len(universe.trajectory) == len(seen) == 5
+    exact = {".xtc": 6e-3, ".pdb": 6e-4, ".xyz": 6e-5}.get(name[1:], 1e-4)
+    for frame, (moment, positions, velocities) in zip(universe.trajectory, seen, strict=True):
+        assert frame.positions == pytest.approx(positions, abs=exact)
+        if name[1:] not in (".xyz", ".pdb"):  # those say the time in their own words, tested below
+            assert frame.time == pytest.approx(moment, abs=1e-5)
+        if name != "t.xyz":
+            assert frame.dimensions == pytest.approx([18.5, 18.5, 18.5, 90, 90, 90], abs=1e-3)
+        assert frame.has_velocities == (name in ("t.trr", "t.nc"))
+        if frame.has_velocities:
+            assert frame.velocities == pytest.approx(velocities, abs=1e-3)
+    text = (tmp_path / "out" / name).read_bytes()
+    if name == "t.xyz":
+        import ase.io
+
+        frames = ase.io.read(tmp_path / "out" / name, index=":", format="extxyz")
+        assert frames[2].cell.lengths() == pytest.approx([18.5] * 3)
+        assert frames[2].info["Time"] == pytest.approx(0.02)
+    if name == "t.pdb":
+        assert b"TIME 0.020000 PS" in text
+    assert list(universe.atoms.names[:4]) == ["OW", "HW1", "HW2", "MW"]
+    assert universe.residues.n_residues == 10
+
+
+def test_wrapped_molecules_are_whole_and_inside(tmp_path):
+    scene = small_scene({"spce": 30}, 18.5, output={"trajectory": "t.trr"})
+    simulation = Simulation(scene)
+    simulation.state.position[:] += 300.0
+    system = simulation.system
+    x = system.site_positions(simulation.state, wrapped=True).reshape(30, 3, 3)
+    centre = np.einsum("s,nsk->nk", system.species[0].masses, x) / system.species[0].mass
+    assert (centre >= -1e-9).all()
+    assert (centre < 18.5 + 1e-9).all()
+    assert np.linalg.norm(x[:, 1] - x[:, 0], axis=1) == pytest.approx(np.ones(30))
+
+
+def test_log_and_summary(tmp_path):
+    scene = small_scene({"spce": 20}, 18.5, stages=[{"duration_ps": 0.05}], output={"log_interval_ps": 0.01})
+    results = Simulation(scene, tmp_path / "out").run()
+    with (tmp_path / "out" / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert [float(row["Time (ps)"]) for row in rows] == pytest.approx([0, 0.01, 0.02, 0.03, 0.04, 0.05])
+    for row, sample in zip(rows, results.samples, strict=True):
+        total = float(row["Potential Energy (kJ/mole)"]) + float(row["Kinetic Energy (kJ/mole)"])
+        assert float(row["Total Energy (kJ/mole)"]) == pytest.approx(total)
+        assert float(row["Temperature (K)"]) == pytest.approx(sample.temperature)
+        assert float(row["Box Volume (nm^3)"]) == pytest.approx(1.85**3)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["degrees_of_freedom"] == 57 + 60
+    assert summary["stages"][0]["steps"] == 25
+    energy, n, time = results["energy"], 20, results["time"]
+    gradient = np.polyfit(time, energy, 1)[0]
+    stage = summary["stages"][0]
+    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / 100 / n, rel=1e-6, abs=1e-9)
+    thermal = 0.83144626 * stage["temperature_K"] * 117
+    assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(gradient * 1000 / thermal, rel=1e-6, abs=1e-9)
+
+
+def test_from_python_in_five_lines():
+    scene = rigidmd.Scene.read(
+        ROOT / "systems" / "nitrogen.toml",
+        {"stages.0.duration_ps": 0.02, "stages.1.duration_ps": 0.02, "output.trajectory_interval_ps": 0.01},
+    )
+    temperatures = []
+    watch = rigidmd.Every(0.02, lambda moment: temperatures.append(moment.observation.temperature))
+    results = rigidmd.Simulation(scene, observers=[watch]).run()
+    assert results["temperature"][0] == pytest.approx(temperatures[0])
+    assert len(results.universe().trajectory) == 5
+    with pytest.raises(KeyError, match="temperature_rotation"):
+        results["T"]
+
+
+def test_observers_cannot_write_to_the_state():
+    def meddle(moment):
+        moment.state.position[:] = 0
+
+    with pytest.raises(ValueError, match="read-only"):
+        Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)]).run()
+
+
+def command(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "rigidmd", *map(str, arguments)], capture_output=True, text=True, **options
+    )
+
+
+def test_ctrl_c_stops_with_a_summary_and_130(tmp_path):
+    arguments = [
+        "run",
+        str(ROOT / "systems" / "argon.toml"),
+        "-o",
+        str(tmp_path / "out"),
+        "--set",
+        "stages.0.duration_ps=1000",
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rigidmd", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    log = tmp_path / "out" / "log.csv"
+    deadline = time.monotonic() + 120
+    while not (log.exists() and log.read_text().count("\n") > 3):
+        assert time.monotonic() < deadline, "the run did not get going"
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in out
+    assert "Traceback" not in err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["interrupted"]
+    assert (tmp_path / "out" / "final.npz").exists()
+    assert (
+        mda.Universe(
+            str(tmp_path / "out" / "topology.gro"), str(tmp_path / "out" / "trajectory.xtc")
+        ).trajectory.n_frames
+        >= 1
+    )
+
+
+def test_a_killed_run_leaves_a_readable_log(tmp_path):
+    arguments = [
+        "run",
+        str(ROOT / "systems" / "argon.toml"),
+        "-o",
+        str(tmp_path / "out"),
+        "--set",
+        "stages.0.duration_ps=1000",
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rigidmd", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    log = tmp_path / "out" / "log.csv"
+    deadline = time.monotonic() + 120
+    while not (log.exists() and log.read_text().count("\n") > 100):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    with log.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= 99
+    trajectory = tmp_path / "out" / "trajectory.xtc"
+    assert mda.Universe(str(tmp_path / "out" / "topology.gro"), str(trajectory)).trajectory.n_frames >= 1
+
+
+def test_the_commands(capsys, tmp_path):
+    water = str(ROOT / "systems" / "water.toml")
+    assert main(["check", water]) == 0
+    assert "1293 = 645 translation + 648 rotation" in capsys.readouterr().out
+    assert main(["check", str(ROOT / "systems" / "argon.toml")]) == 0
+    out = capsys.readouterr().out
+    assert "charges: no site has one" in out
+    assert "rotation and torques: every molecule is a point" in out
+    assert main(["models"]) == 0
+    assert "dipole 2.351 D" in capsys.readouterr().out  # SPC/E
+    assert main(["schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert "timestep_fs" in schema["$defs"]["Stage"]["properties"]
+    assert main(["check", water, "--set", "stages.1.timestep_fs=4", "--set", "molecules.0.model=tip3p"]) == 0
+    out = capsys.readouterr().out
+    assert "5000 steps of 4 fs" in out
+    assert "216 tip3p" in out
+
+
+def test_energy_of_the_dimer_in_every_unit(capsys):
+    dimer = str(ROOT / "systems" / "water_dimer.toml")
+    found = {}
+    for unit in ("kJ/mol", "kcal/mol", "eV", "K"):
+        assert main(["energy", dimer, "--json", "--unit", unit]) == 0
+        found[unit] = json.loads(capsys.readouterr().out)
+    assert found["kJ/mol"]["potential"] == pytest.approx(-30.124, abs=2e-3)
+    assert found["kcal/mol"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 4.184)
+    assert found["eV"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 96.48533212)
+    assert found["K"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 0.00831446261815324)
+    assert found["kJ/mol"]["largest_force_per_A"] < 0.02  # a minimum, to the file's six digits
+    assert main(["energy", dimer]) == 0
+    assert "lennard jones" in capsys.readouterr().out
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    code = "import sys; from rigidmd.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\nprint(sorted({'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "example" in done.stdout
+
+
+def test_version():
+    assert command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
+
+
+def test_output_goes_to_runs_by_default(tmp_path):
+    short = ["--set", "stages.0.duration_ps=0.01", "--set", "stages.1.duration_ps=0.01"]
+    done = command(
+        "run", ROOT / "systems" / "argon.toml", *short, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "runs" / "argon" / "summary.json").exists()
+    assert "kT/ns per degree of freedom" in done.stdout or "drift" not in done.stdout
+    again = command(
+        "run", ROOT / "systems" / "argon.toml", *short, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert again.returncode == 2
+    assert "--force" in again.stderr
+    forced = command(
+        "run",
+        ROOT / "systems" / "argon.toml",
+        *short,
+        "--force",
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert forced.returncode == 0
