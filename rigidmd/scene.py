@@ -151,9 +151,10 @@ class Stage(Section):
         if self.ensemble == "nvt" and self.temperature_K is None:
             raise ValueError("an nvt stage needs temperature_K")
         if self.ensemble == "nve":
-            idle = {"temperature_K", "thermostat", "thermostat_time_ps"} & self.model_fields_set
-            if idle:
-                raise ValueError(f"{', '.join(sorted(idle))} would do nothing in an nve stage")
+            fields = type(self).model_fields
+            thermal = ("temperature_K", "thermostat", "thermostat_time_ps")
+            if idle := [key for key in thermal if getattr(self, key) != fields[key].default]:
+                raise ValueError(f"{', '.join(idle)} would do nothing in an nve stage")
         if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
             raise ValueError(f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs")
         return self

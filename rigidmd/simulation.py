@@ -22,7 +22,7 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.terms import State
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.summary import summarise
-from rigidmd.output.folder import SCENE_FILE, make_folder
+from rigidmd.output.folder import SCENE_FILE, check_folder, make_folder
 from rigidmd.scene import WITH_VELOCITIES, Scene
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
@@ -155,12 +155,14 @@ class Simulation:
     def run(self, progress: bool = False) -> Results:
         """Run all stages. Raises OutputError before anything is computed, SimulationError when numbers go bad."""
         if self._folder is not None:
-            make_folder(self._folder, self._force)
+            check_folder(self._folder, self._force)
         numba.set_num_threads(self.threads)
         results = Results(self.system, self.state, [])
         began = clock.perf_counter()
         relief = self._prepare()
         prepared = clock.perf_counter() - began
+        if self._folder is not None:
+            make_folder(self._folder, self._force)
         with contextlib.ExitStack() as stack:
             log, writers = self._writers(stack, results)
             sampler = Every(self.scene.output.log_interval_ps, self._sampler(results.samples, log))
@@ -237,8 +239,7 @@ class Simulation:
                     self.engine.advance(self.state, scheme, dt, to - done, thermostat)
                     seconds += clock.perf_counter() - began
                     if not all(np.isfinite(array).all() for array in self.state):
-                        bad = np.argmin(np.isfinite(self.state.velocity).all(axis=1))
-                        raise NotFiniteError(step + to, int(bad))
+                        raise NotFiniteError(to - done, self.state)
                     done = to
                     heat = float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
                     moment = Moment(self, step + done, time + done * dt, k, heat)

@@ -71,14 +71,15 @@ class Engine:
         if status == LIST_FULL:
             self._terms = tuple(with_room(term) for term in self._terms)
         elif status == NOT_FINITE:
-            worst = int(np.argmin(np.isfinite(state.position).all(axis=1) & np.isfinite(state.velocity).all(axis=1)))
-            raise NotFiniteError(step, worst)
+            raise NotFiniteError(step, state)
 
 
 class NotFiniteError(SimulationError):
-    """A position that is no number, `step` steps after the last look at the state."""
+    """Positions or momenta that are no numbers any more, `step` steps after the last look at the state."""
 
-    def __init__(self, step: int, molecule: int):
+    def __init__(self, step: int, state: State):
         self.step = step
-        self.molecule = molecule
-        super().__init__(f"molecule {molecule} is nowhere: its position is not a finite number")
+        rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in state if len(array)]
+        size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
+        self.molecule = int(size.argmax())
+        super().__init__(f"molecule {self.molecule + 1} is nowhere: its position or momentum is no finite number")

@@ -21,6 +21,8 @@ from rigidmd.jit import kernel
 BLOCKS = 16  # enough for 16 threads; every block adds one array of site forces
 SITES_PER_BLOCK = 32  # fewer are not worth a thread
 
+LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its cell a site is
+
 
 class PairList(NamedTuple):
     """Pairs of sites of different molecules closer than `radius` when the list was built."""
@@ -85,8 +87,9 @@ def update_list(pairs, space, position):
     if is_usable(pairs, position):
         return OK
     pairs.counters[0] = 0
-    if not np.all(np.isfinite(position)):
-        return NOT_FINITE
+    for x in position.flat:
+        if not abs(x) < LOST * pairs.radius:
+            return NOT_FINITE
     origin, size, shape, reach = _grid(space, position, pairs.radius)
     cell, cell_start, order = _sort_into_cells(space, position, origin, size, shape)
     _fill(pairs, space, position, cell, cell_start, order, shape, reach)

@@ -16,10 +16,6 @@ def write_scene(folder: Path, scene: Scene, system: System) -> None:
     data = scene.model_dump(exclude_none=True)
     if system.cutoff < inf:
         data["forces"]["cutoff_A"] = system.cutoff
-    for stage in data["stages"]:
-        if stage["ensemble"] == "nve":
-            for key in ("thermostat", "thermostat_time_ps"):
-                stage.pop(key)
     for section in [data.get("structure", {}), *data["molecules"]]:
         if "file" in section:
             source = scene.path(section["file"])

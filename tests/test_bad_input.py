@@ -1,0 +1,355 @@
+"""Bad input: each gets one message that says what, where and what to do; no traceback, nothing half-written."""
+
+import numpy as np
+import pytest
+from conftest import ROOT, small_scene
+
+from rigidmd.cli import main
+from rigidmd.errors import MoleculeError, SceneError, SimulationError
+from rigidmd.molecules import Site, available_models, load_model, molecule
+from rigidmd.scene import Scene, parse_override
+from rigidmd.simulation import Simulation
+
+GOOD = """\
+[box]
+lengths_A = 20.0
+
+[[molecules]]
+model = "spce"
+count = 20
+
+[[stages]]
+duration_ps = 0.01
+timestep_fs = 1
+
+[start]
+temperature_K = 300
+"""
+
+
+def refused(capsys, tmp_path, text, *arguments, code=2):
+    """The message for a scene text; checks that nothing was written and that there is no traceback."""
+    scene = tmp_path / "bad.toml"
+    scene.write_text(text)
+    before = sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*"))
+    assert main(["run", str(scene), "-o", str(tmp_path / "out"), *arguments]) == code
+    assert sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*")) == before
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("count = 20", "count = 20\ncuont = 3", ["line 7", "molecules.0.cuont", "unknown key", "did you mean count?"]),
+        ("timestep_fs = 1", "timestep = 1", ["line 10", "stages.0.timestep", "did you mean timestep_fs?"]),
+        ("[start]", "[strat]", ["strat", "did you mean start?"]),
+        ("lengths_A = 20.0", 'lengths_A = "wide"', ["line 2", "box.lengths_A", "'wide'", "must be a number"]),
+        ("lengths_A = 20.0", "lengths_A = -1", ["box.lengths_A", "-1", "greater than 0"]),
+        ("lengths_A = 20.0", "lengths_A = nan", ["box.lengths_A", "finite"]),
+        ("lengths_A = 20.0", "lengths_A = inf", ["box.lengths_A", "finite"]),
+        ("lengths_A = 20.0", "density_g_cm3 = 0", ["box.density_g_cm3", "greater than 0"]),
+        ("lengths_A = 20.0", "", ["box needs lengths_A or density_g_cm3"]),
+        ("lengths_A = 20.0", "lengths_A = 17.0", ["cutoff_A = 9 (the default)", "half the shortest edge", "8.500 Å"]),
+        ("lengths_A = 20.0", "lengths_A = 20.0\nperiodic = 1", ["box.periodic", "true or false"]),
+        ("count = 20", "count = 0", ["molecules.0.count", "greater than 0"]),
+        ("count = 20", "count = 2.5", ["molecules.0.count", "whole number"]),
+        ("count = 20", "", ["molecules.0.count is missing"]),
+        ('model = "spce"', 'model = "spc/e"', ["no model 'spc/e'", "did you mean spce?"]),
+        ('model = "spce"', "", ["molecules.0", "one of model, file, sites"]),
+        ("timestep_fs = 1", "timestep_fs = 0", ["line 10", "stages.0.timestep_fs", "greater than 0"]),
+        ("timestep_fs = 1", "timestep_fs = -2", ["stages.0.timestep_fs", "is -2", "greater than 0"]),
+        ("timestep_fs = 1", "timestep_fs = 100", ["less than one step"]),
+        ("duration_ps = 0.01", "", ["stages.0.duration_ps", "missing"]),
+        ("timestep_fs = 1", 'ensemble = "npt"', ["stages.0.ensemble", "'npt'", "nvt"]),
+        ("timestep_fs = 1", 'ensemble = "nvt"', ["needs temperature_K"]),
+        ("timestep_fs = 1", "temperature_K = 300", ["temperature_K would do nothing in an nve stage"]),
+        ("temperature_K = 300", "temperature_K = -1", ["start.temperature_K", "-1"]),
+        ("[start]\ntemperature_K = 300", "", ["start.temperature_K is missing"]),
+        ("[start]", "[forces]\nskin_A = 0\n[start]", ["forces.skin_A"]),
+        ("[start]", '[forces]\ntruncation = "swich"\n[start]', ["forces.truncation", "did you mean switch?"]),
+        ("[start]", "[forces]\ncutoff_A = 6\nswitch_start_A = 7\n[start]", ["switch_start_A = 7", "below"]),
+        ("[start]", '[output]\ntrajectory = "../t.xtc"\n[start]', ["output.trajectory", "plain file name"]),
+        ("[start]", '[output]\ntrajectory = "t.mp4"\n[start]', ["output.trajectory", ".xtc"]),
+        ("[start]", "[output]\nvelocities = true\n[start]", ["trajectory.xtc holds none", ".trr or .nc"]),
+        ("[start]", "precision = ", ["not TOML"]),
+        ("[start]", '[structure]\nfile = "../../etc/passwd"\n[start]', ["outside the scene's folder", "--set"]),
+        ("[start]", '[structure]\nfile = "/etc/passwd"\n[start]', ["outside the scene's folder"]),
+        ("[start]", '[structure]\nfile = "none.gro"\n[start]', ["none.gro", "no such file"]),
+        ("lengths_A = 20.0", "density_g_cm3 = 3000", ["half the shortest edge"]),
+        ("[[stages]]", '[[molecules]]\nname = "x"\nsites = []\n[[stages]]', ["molecules.1.sites", "needs at least 1"]),
+        ("[[stages]]", '[[molecules]]\nname = "x"\ncount = 1\nsites = [{name = "A", mass_u = -1.0, position_A = [0,0,0]}]\n[[stages]]',
+         ["molecules.1.sites.0.mass_u", "-1.0", "not be less than 0"]),
+        ("[[stages]]", '[[molecules]]\nmodel = "spce"\ncount = 1\n[[stages]]', ["spce stands there twice"]),
+    ],
+)  # fmt: skip
+def test_a_bad_scene(old, new, expected, capsys, tmp_path):
+    assert old in GOOD
+    message = refused(capsys, tmp_path, GOOD.replace(old, new))
+    for part in ["bad.toml", *expected] if "passwd" not in new else expected:
+        assert part in message or (part == "bad.toml" and "none.gro" in message)
+
+
+def test_the_good_scene_is_good(tmp_path, capsys):
+    (tmp_path / "good.toml").write_text(GOOD)
+    assert main(["run", str(tmp_path / "good.toml"), "-o", str(tmp_path / "out")]) == 0
+
+
+def test_all_faults_at_once(capsys, tmp_path):
+    text = (
+        GOOD.replace("20.0", '"a"')
+        .replace("count = 20", "count = -1")
+        .replace("timestep_fs = 1", "timestep_fs = 0\nfoo = 1")
+    )
+    message = refused(capsys, tmp_path, text)
+    assert "4 faults" in message
+    for key in ("box.lengths_A", "molecules.0.count", "stages.0.timestep_fs", "stages.0.foo"):
+        assert key in message
+
+
+def test_a_missing_scene(capsys):
+    assert main(["run", "nowhere.toml"]) == 2
+    assert "nowhere.toml: cannot be read: No such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("stages.1.timestep_fs=4", "stages has entries 0 to 0"),
+        ("stages.x.timestep_fs=4", "stages has entries 0 to 0"),
+        ("stages.0.timestep_fs.y=4", "stages.0.timestep_fs is no table"),
+        ("stages.0.timestep_fs=fast", "'fast', must be a number"),
+        ("timestep_fs", "is not KEY=VALUE"),
+        ("nonsense=1", "unknown key"),
+    ],
+)
+def test_a_bad_override(override, expected, capsys, tmp_path):
+    assert expected in refused(capsys, tmp_path, GOOD, "--set", override)
+
+
+def test_overrides_are_read_as_toml():
+    assert parse_override("forces.cutoff_A=8.5") == ("forces.cutoff_A", 8.5)
+    assert parse_override("molecules.0.model=tip3p") == ("molecules.0.model", "tip3p")
+    assert parse_override("box.lengths_A=[1, 2.0, 3]") == ("box.lengths_A", [1, 2.0, 3])
+    assert parse_override("output.trajectory=false") == ("output.trajectory", False)
+
+
+def test_too_dense_to_pack(capsys, tmp_path):
+    text = (
+        GOOD.replace("lengths_A = 20.0", "lengths_A = 8.0")
+        .replace("count = 20", "count = 120")
+        .replace("[start]", "[forces]\ncutoff_A = 3.9\n[start]")
+    )
+    scene = tmp_path / "dense.toml"
+    scene.write_text(text)
+    assert main(["run", str(scene), "-o", str(tmp_path / "out")]) == 2
+    message = capsys.readouterr().err
+    assert "cannot be packed" in message
+    assert "Lower the density" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_output_folders(capsys, tmp_path):
+    full = tmp_path / "mine"
+    full.mkdir()
+    (full / "thesis.txt").write_text("years of work")
+    scene = tmp_path / "good.toml"
+    scene.write_text(GOOD)
+    for force in ([], ["--force"]):
+        assert main(["run", str(scene), "-o", str(full), *force]) == 2
+        assert "holds no earlier run" in capsys.readouterr().err
+        assert (full / "thesis.txt").read_text() == "years of work"
+    assert main(["run", str(scene), "-o", str(scene)]) == 2
+    assert "is a file" in capsys.readouterr().err
+    assert main(["run", str(scene), "-o", "/proc/here/there"]) == 2
+    assert "cannot be" in capsys.readouterr().err
+
+
+def test_an_earlier_run_is_kept_when_the_new_scene_is_bad(capsys, tmp_path):
+    scene = tmp_path / "good.toml"
+    scene.write_text(GOOD)
+    assert main(["run", str(scene), "-o", str(tmp_path / "out")]) == 0
+    kept = (tmp_path / "out" / "summary.json").read_text()
+    assert main(["run", str(scene), "-o", str(tmp_path / "out"), "--force", "--set", "forces.cutoff_A=19"]) == 2
+    assert (tmp_path / "out" / "summary.json").read_text() == kept
+
+
+@pytest.mark.parametrize(
+    ("sites", "expected"),
+    [
+        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 0)), (1.0, (1, 0, 0))], "on one place"),
+        ([(0.0, (0, 0, 0)), (0.0, (1, 0, 0))], "massless"),
+        ([(1.0, (0, 0, 0)), (0.0, (1, 0, 0))], "nothing resists its torque"),
+        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 1)), (0.0, (0.3, 0, 0.5))], "off the axis of a linear body"),
+    ],
+)
+def test_sites_that_make_no_body(sites, expected):
+    with pytest.raises(MoleculeError, match=expected):
+        molecule(
+            "x", tuple(Site(name=f"A{k}", mass_u=m, position_A=tuple(map(float, x))) for k, (m, x) in enumerate(sites))
+        )
+
+
+def test_every_model_is_what_it_says():
+    assert available_models() == ["argon", "nitrogen", "spce", "tip3p", "tip4p2005"]
+    kinds = {name: load_model(name).kind for name in available_models()}
+    assert kinds == {
+        "argon": "point",
+        "nitrogen": "linear",
+        "spce": "asymmetric",
+        "tip3p": "asymmetric",
+        "tip4p2005": "asymmetric",
+    }
+    dipoles = {"spce": 2.351, "tip3p": 2.347, "tip4p2005": 2.305}  # debye, as published
+    for name, dipole in dipoles.items():
+        found = load_model(name)
+        assert found.dipole_debye == pytest.approx(dipole, abs=2e-3)
+        assert found.charge == 0
+        assert found.mass == pytest.approx(18.0154)
+        o, h1, h2 = found.positions_body[:3]
+        angle = np.degrees(np.arccos((h1 - o) @ (h2 - o) / np.linalg.norm(h1 - o) / np.linalg.norm(h2 - o)))
+        assert angle == pytest.approx(109.47 if name == "spce" else 104.52)
+
+
+# structure files
+
+
+def structure_scene(tmp_path, text, name="start.gro", extra="", models=("spce",)):
+    (tmp_path / name).write_text(text)
+    species = "".join(f'[[molecules]]\nmodel = "{model}"\n' for model in models)
+    return f'{species}{extra}[structure]\nfile = "{name}"\n[forces]\ncutoff_A = 5.0\n[start]\ntemperature_K = 300\n[[stages]]\nduration_ps = 0.01\n'
+
+
+WATER216 = (ROOT / "systems" / "structures" / "water216.gro").read_text()
+
+
+def lines_changed(change):
+    lines = WATER216.splitlines()
+    change(lines)
+    return "\n".join(lines) + "\n"
+
+
+def truncate(lines):
+    del lines[400:]
+
+
+def rename(lines):
+    lines[2:5] = [line.replace("SOL", "ETH").replace("OW", "C1").replace("HW1", "C2") for line in lines[2:5]]
+
+
+def overlap(lines):
+    shift = lines[2][20:44]
+    lines[5] = lines[5][:20] + shift + lines[5][44:]
+    for k in (1, 2):
+        lines[5 + k] = lines[5 + k][:20] + lines[2 + k][20:44] + lines[5 + k][44:]
+
+
+def bend(lines):
+    lines[3] = lines[3][:20] + "   5.000   5.000   5.000" + lines[3][44:]
+
+
+def lose_velocity(lines):
+    lines[10] = lines[10][:44]
+
+
+def nonsense(lines):
+    lines[10] = lines[10][:20] + "     nan   0.000   0.000" + lines[10][44:]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (truncate, ["promises 648 atoms", "truncated"]),
+        (rename, ["molecule 1", "'ETH'", "C2 H", "expected spce (O H2)"]),
+        (overlap, ["molecules 1 and 2 overlap"]),
+        (bend, ["molecule 1", "is no spce", "from the rigid template"]),
+        (lose_velocity, ["ASE cannot read it", "velocities were not specified"]),
+        (nonsense, ["atom 9", "not a finite number"]),
+    ],
+)
+def test_a_bad_structure_file(change, expected, capsys, tmp_path):
+    message = refused(capsys, tmp_path, structure_scene(tmp_path, lines_changed(change)))
+    for part in ["start.gro", *expected]:
+        assert part in message
+
+
+def test_structure_files_with_other_faults(capsys, tmp_path):
+    assert "count is 200" in refused(capsys, tmp_path, structure_scene(tmp_path, WATER216, extra="count = 200\n"))
+    assert "may be spce or tip3p" in refused(
+        capsys, tmp_path, structure_scene(tmp_path, WATER216, models=("spce", "tip3p"))
+    )
+    xyz = "3\n\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n"
+    assert "has no box" in refused(capsys, tmp_path, structure_scene(tmp_path, xyz, "a.xyz"))
+    text = (
+        structure_scene(tmp_path, WATER216)
+        .replace("[structure]", "[structure]\nvelocities = true")
+        .replace("start.gro", "b.xyz")
+    )
+    (tmp_path / "b.xyz").write_text(
+        '3\nLattice="20 0 0 0 20 0 0 0 20"\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n'
+    )
+    assert "holds no velocities" in refused(capsys, tmp_path, text)
+    (tmp_path / "c.npz").write_bytes(b"not a zip file")
+    assert "not a state that rigidmd wrote" in refused(capsys, tmp_path, text.replace("b.xyz", "c.npz"))
+    pdb = "CRYST1   20.000   20.000   20.000  90.00  80.00  90.00 P 1           1\nATOM      1  O   HOH A   1       0.000   0.000   0.000  1.00  0.00           O\n"
+    assert "only boxes with right angles" in refused(capsys, tmp_path, structure_scene(tmp_path, pdb, "d.pdb"))
+
+
+def test_molecules_by_order_and_by_geometry(tmp_path):
+    """An .xyz has no residues: waters atom by atom, and one with all oxygens first, split across the boundary."""
+    from rigidmd.build.structure import read_structure
+
+    water, nitrogen = load_model("spce"), load_model("nitrogen")
+    rng = np.random.default_rng(0)
+    from rigidmd.mechanics.rotation import random_rotations
+
+    centres = np.array([[0.1, 0.2, 9.9], [5.0, 5.0, 0.1], [9.95, 5.0, 5.0]])
+    q = random_rotations(rng, 3)
+    kinds = [water, nitrogen, water]
+    atoms = [
+        (m.elements[s], (c + r @ m.positions_body[s]) % 10)
+        for m, c, r in zip(kinds, centres, q, strict=True)
+        for s in range(len(m.masses))
+    ]
+    orders = {"file": atoms, "sorted": sorted(atoms, key=lambda atom: -ord(atom[0][0]))}
+    for name, listed in orders.items():
+        lines = [f"{e} {x[0]:.8f} {x[1]:.8f} {x[2]:.8f}" for e, x in listed]
+        path = tmp_path / f"{name}.xyz"
+        path.write_text(f'{len(lines)}\nLattice="10 0 0 0 10 0 0 0 10"\n' + "\n".join(lines) + "\n")
+        found = read_structure(path, [water, nitrogen], None, True, 0.15)
+        assert sorted(found.species.tolist()) == [0, 0, 1]
+        assert found.residual_max < 1e-6
+        for c in centres:
+            step = found.position - c
+            assert np.abs(step - 10 * np.round(step / 10)).max(axis=1).min() < 1e-6
+
+
+def test_a_molecule_from_a_geometry_file(tmp_path):
+    (tmp_path / "co2.xyz").write_text("3\n\nO 0 0 1.16\nC 0 0 0\nO 0 0 -1.16\n")
+    sites = [
+        {"name": "C", "charge_e": 0.7, "sigma_A": 2.8, "epsilon_K": 27.0},
+        {"name": "O", "charge_e": -0.35, "sigma_A": 3.05, "epsilon_K": 79.0},
+    ]
+    data = small_scene({"argon": 5}, 25.0).model_dump()
+    data["molecules"] = [{"file": "co2.xyz", "sites": sites, "count": 20}]
+    from rigidmd.build.system import build
+
+    system = build(Scene.from_dict(data, tmp_path))
+    co2 = system.species[0]
+    assert (co2.name, co2.kind, co2.charge) == ("co2", "linear", 0)
+    assert co2.mass == pytest.approx(44.009, abs=1e-3)
+    data["molecules"][0]["sites"] = sites[:1]
+    with pytest.raises(SceneError, match="atom O: no entry of sites"):
+        build(Scene.from_dict(data, tmp_path))
+
+
+def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
+    simulation = Simulation(small_scene({"spce": 20}, 20.0), tmp_path / "out")
+    good = simulation.state.position.copy()
+    simulation.state.velocity[7] = 1e150  # gone within a step
+    with pytest.raises(SimulationError, match=r"after step 0 .* molecule 8 is nowhere.*timestep_fs.*last_good_state"):
+        simulation.run()
+    with np.load(tmp_path / "out" / "last_good_state.npz") as saved:
+        assert saved["position"] == pytest.approx(good, abs=1.0)
+        assert np.isfinite(saved["position"]).all()
