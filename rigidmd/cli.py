@@ -148,7 +148,7 @@ def _say(sentence: str) -> None:
 
 
 def _energy(options: argparse.Namespace) -> int:
-    from rigidmd.simulation import start_energy
+    from rigidmd.measure.observables import start_energy
     from rigidmd.units import ENERGY_UNITS
 
     scene = _read_scene(options)

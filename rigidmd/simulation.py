@@ -21,6 +21,7 @@ from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.terms import State
 from rigidmd.measure.observables import Observation, observe
+from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.summary import summarise
 from rigidmd.output.folder import SCENE_FILE, check_folder, make_folder
 from rigidmd.scene import WITH_VELOCITIES, Scene
@@ -69,33 +70,13 @@ class Every:
     function: Callable[[Moment], None]
 
 
-class Sample(NamedTuple):
-    """One line of the log, in internal units."""
-
-    step: int
-    time: float  # ps
-    stage: int
-    stage_name: str
-    potential: float  # u Å²/ps²
-    kinetic: float
-    energy: float
-    temperature: float  # K
-    temperature_translation: float
-    temperature_rotation: float
-    pressure_bar: float
-    conserved: float  # energy less the heat of the thermostat, u Å²/ps²
-    drift: float  # of the conserved energy since the stage began, u Å²/ps²
-    momentum: float  # |P|, u Å/ps
-    orthogonality: float
-
-
 @dataclass
 class Results:
     """What a run leaves: samples as arrays, a summary, the final state, the files."""
 
     system: System
     state: State
-    samples: list[Sample]
+    samples: Samples
     summary: dict = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     interrupted: bool = False
@@ -103,9 +84,7 @@ class Results:
 
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of the samples as an array, by the name of a field of `Sample`: results["energy"]."""
-        if column not in Sample._fields:
-            raise KeyError(f"no column {column!r}; there are {', '.join(Sample._fields)}")
-        return np.array([getattr(sample, column) for sample in self.samples])
+        return self.samples[column]
 
     def universe(self):
         """The trajectory as an MDAnalysis Universe: from the files if there are any, else from memory."""
@@ -157,7 +136,7 @@ class Simulation:
         if self._folder is not None:
             check_folder(self._folder, self._force)
         numba.set_num_threads(self.threads)
-        results = Results(self.system, self.state, [])
+        results = Results(self.system, self.state, Samples())
         began = clock.perf_counter()
         relief = self._prepare()
         prepared = clock.perf_counter() - began
@@ -175,7 +154,9 @@ class Simulation:
                 raise self._explain(error, results) from None
             wall = clock.perf_counter() - began
         results.interrupted = self._interrupted
-        results.summary = summarise(self.system, results, relief, self.threads, prepared, wall, computing)
+        results.summary = summarise(
+            self.system, results.samples, self.state, relief, self.threads, prepared, wall, computing, self._interrupted
+        )
         if self._folder is not None:
             self._finish(results)
         return results
@@ -262,7 +243,7 @@ class Simulation:
             if now:
                 observer.function(moment)
 
-    def _sampler(self, samples: list[Sample], log: Callable[[Sample], None]) -> Callable[[Moment], None]:
+    def _sampler(self, samples: Samples, log: Callable[[Sample], None]) -> Callable[[Moment], None]:
         """An observer that turns moments into samples, logs them, and keeps the last good state."""
         origin = {}
 
@@ -270,8 +251,8 @@ class Simulation:
             seen = moment.observation
             conserved = seen.energy - moment.heat
             if moment.stage not in origin:  # the stage began where the last sample was taken
-                origin[moment.stage] = samples[-1].energy if samples else conserved
-            samples.append(
+                origin[moment.stage] = samples.rows[-1].energy if samples.rows else conserved
+            samples.rows.append(
                 Sample(
                     moment.step,
                     moment.time,
@@ -290,7 +271,7 @@ class Simulation:
                     seen.orthogonality,
                 )
             )
-            log(samples[-1])
+            log(samples.rows[-1])
             self._last_good = (moment.step, moment.time, self.state.copy())
 
         return sample
@@ -335,8 +316,8 @@ class Simulation:
 
         write_state(self._folder / "final.npz", self.system, self.state)
         results.files.append(self._folder / "final.npz")
-        if self.scene.output.figure and len(results.samples) > 1:
-            draw_energy(self._folder / "energy.png", results)
+        if self.scene.output.figure and len(results.samples.rows) > 1:
+            draw_energy(self._folder / "energy.png", self.system, results.samples)
             results.files.append(self._folder / "energy.png")
         results.files.append(self._folder / "summary.json")
         results.summary["files"] = [str(path) for path in results.files]
@@ -404,23 +385,3 @@ def _bar(scene: Scene, progress: bool):
     with tqdm(total=total, disable=None if progress else True, bar_format=form, leave=False, mininterval=0.2) as bar:
         bar.done_in_stage = 0
         yield bar
-
-
-def start_energy(scene: Scene, size: float, unit: str) -> dict:
-    """Energies, virial, pressure and largest force of a scene's start; energies in a unit of `size` u Å²/ps²."""
-    system = build(scene)
-    engine = Engine(system.model, system.terms)
-    seen = observe(system, engine, system.state)
-    force, molecule = seen.largest_force
-    return {
-        "unit": unit,
-        "molecules": len(system.model.species),
-        "components": {name: energy / size for name, energy in seen.components.items()},
-        "potential": seen.potential / size,
-        "kinetic": seen.kinetic / size,
-        "virial": float(seen.virial.trace()) / size,
-        "virial_tensor": (seen.virial / size).tolist(),
-        "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
-        "largest_force_per_A": force / size,
-        "largest_force_molecule": molecule + 1,
-    }

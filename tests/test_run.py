@@ -135,7 +135,7 @@ def test_log_and_summary(tmp_path):
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == COLUMNS
     assert [float(row["Time (ps)"]) for row in rows] == pytest.approx([0, 0.01, 0.02, 0.03, 0.04, 0.05])
-    for row, sample in zip(rows, results.samples, strict=True):
+    for row, sample in zip(rows, results.samples.rows, strict=True):
         total = float(row["Potential Energy (kJ/mole)"]) + float(row["Kinetic Energy (kJ/mole)"])
         assert float(row["Total Energy (kJ/mole)"]) == pytest.approx(total)
         assert float(row["Temperature (K)"]) == pytest.approx(sample.temperature)

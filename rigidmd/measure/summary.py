@@ -3,35 +3,35 @@
 import platform
 from importlib.metadata import version
 from math import isnan, sqrt
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
 from rigidmd.build.relief import Relief
 from rigidmd.build.system import System
+from rigidmd.forces.terms import State
 from rigidmd.measure.drift import inefficiency, slope
+from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
-
-if TYPE_CHECKING:
-    from rigidmd.simulation import Results, Sample
 
 
 def summarise(
     system: System,
-    results: "Results",
+    samples: Samples,
+    state: State,
     relief: Relief | None,
     threads: int,
     preparing: float,
     wall: float,
     computing: list[float],
+    interrupted: bool,
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps)."""
     scene = system.scene
     stages = [
-        _stage(system, results.samples, k, computing[k])
+        _stage(system, samples.rows, k, computing[k])
         for k in range(len(computing))
-        if any(sample.stage == k for sample in results.samples)
+        if any(sample.stage == k for sample in samples.rows)
     ]
     return {
         "scene": scene.name,
@@ -40,7 +40,7 @@ def summarise(
         "machine": platform.processor() or platform.machine(),
         "threads": threads,
         "seed": scene.seed,
-        "interrupted": results.interrupted,
+        "interrupted": interrupted,
         "molecules": len(system.model.species),
         "species": {m.name: int((system.model.species == k).sum()) for k, m in enumerate(system.species)},
         "sites": len(system.sites.molecule),
@@ -53,34 +53,30 @@ def summarise(
         "relief_steps": relief.steps if relief else 0,
         "preparing_s": preparing,
         "wall_s": wall,
-        "largest_orthogonality_error": max(sample.orthogonality for sample in results.samples),
-        "momentum_u_A_ps": results.samples[-1].momentum,
-        "momentum_relative": _relative_momentum(system, results),
+        "largest_orthogonality_error": max(sample.orthogonality for sample in samples.rows),
+        "momentum_u_A_ps": samples.rows[-1].momentum,
+        "momentum_relative": _relative_momentum(system, state, samples.rows[-1].momentum),
         "stages": stages,
         "notes": system.notes,
     }
 
 
-def _relative_momentum(system: System, results: "Results") -> float:
+def _relative_momentum(system: System, state: State, momentum: float) -> float:
     """|P| over the sum of |m v|."""
-    speed = np.linalg.norm(results.state.velocity, axis=1)
+    speed = np.linalg.norm(state.velocity, axis=1)
     total = float(system.model.mass[system.model.species] @ speed)
-    return results.samples[-1].momentum / total if total else 0.0
+    return momentum / total if total else 0.0
 
 
-def _stage(system: System, samples: list["Sample"], k: int, computing: float) -> dict:
+def _stage(system: System, samples: list[Sample], k: int, computing: float) -> dict:
     """Figures of one stage. It begins with the last sample before it, from which its drift is counted."""
     own = [sample for sample in samples if sample.stage == k]
     before = [sample for sample in samples if sample.stage == k - 1][-1:]
     stage = system.scene.stages[k]
     n = len(system.model.species)
-    first = before or own[:1]
-    steps = own[-1].step - first[0].step
+    steps = own[-1].step - (before or own)[0].step
     speed = steps / computing if computing > 0 else None
-    line = slope(
-        [s.time for s in first + own[not before :]],
-        [0.0 if s in before else s.drift for s in first + own[not before :]],
-    )
+    line = slope([s.time for s in before + own], [0.0] * len(before) + [s.drift for s in own])
     mean_t, error_t = _mean([s.temperature for s in own])
     kinetic = np.array([s.kinetic for s in own])
     spread = float(kinetic.std())

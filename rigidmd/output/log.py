@@ -6,12 +6,9 @@ Columns as OpenMM's StateDataReporter, then ours.
 import csv
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from rigidmd.measure.samples import Sample
 from rigidmd.units import KJ_PER_MOL
-
-if TYPE_CHECKING:
-    from rigidmd.simulation import Sample
 
 COLUMNS = (
     "Step",
@@ -41,7 +38,7 @@ class Log:
         self._writer.writerow(COLUMNS)
         self._constant = (volume * 1e-3, density) if density > 0 else (None, None)
 
-    def write(self, sample: "Sample") -> None:
+    def write(self, sample: Sample) -> None:
         """Add a line."""
         row = [
             sample.step,

@@ -3,16 +3,14 @@
 import json
 from math import floor, log10
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.build.system import System
 from rigidmd.measure.drift import slope
+from rigidmd.measure.samples import Samples
 from rigidmd.output.folder import whole_file
 from rigidmd.units import KJ_PER_MOL
-
-if TYPE_CHECKING:
-    from rigidmd.simulation import Results
 
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
@@ -89,36 +87,36 @@ def _signed(value: float, error: float) -> str:
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
-def draw_energy(path: Path, results: "Results") -> None:
+def draw_energy(path: Path, system: System, samples: Samples) -> None:
     """energy.png: the drift of the last stage, large enough to be seen; energies and temperatures of the whole run."""
     from matplotlib.figure import Figure
 
-    stages = results.system.scene.stages
-    n = len(results.system.model.species)
+    stages = system.scene.stages
+    n = len(system.model.species)
     scale = KJ_PER_MOL * n
-    time, stage = results["time"], results["stage"]
+    time, stage = samples["time"], samples["stage"]
     figure = Figure(figsize=(8, 7), layout="constrained")
     drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
     own = stage == stage[-1]
-    drift.plot(time[own], results["drift"][own] / scale, color=COOL, lw=0.9)
+    drift.plot(time[own], samples["drift"][own] / scale, color=COOL, lw=0.9)
     if own.sum() > 2:
-        line = slope(time[own], results["drift"][own] / scale)
-        fitted = (results["drift"][own] / scale).mean() + line.value * (time[own] - time[own].mean())
+        line = slope(time[own], samples["drift"][own] / scale)
+        fitted = (samples["drift"][own] / scale).mean() + line.value * (time[own] - time[own].mean())
         drift.plot(time[own], fitted, color=WARM, lw=1.4)
         drift.set_title(
             f"{stages[stage[-1]].label}: drift {_signed(line.value * 1000, line.error * 1000)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
-    parts.plot(time, (results["potential"] - results["potential"][-1]) / scale, color=COOL, lw=0.9, label="potential")
-    parts.plot(time, (results["kinetic"] - results["kinetic"][-1]) / scale, color=WARM, lw=0.9, label="kinetic")
+    parts.plot(time, (samples["potential"] - samples["potential"][-1]) / scale, color=COOL, lw=0.9, label="potential")
+    parts.plot(time, (samples["kinetic"] - samples["kinetic"][-1]) / scale, color=WARM, lw=0.9, label="kinetic")
     parts.set_ylabel("less its last value\n(kJ/mol per molecule)")
     for column, color, label in (
         ("temperature_translation", COOL, "translation"),
         ("temperature_rotation", WARM, "rotation"),
     ):
-        if np.isfinite(results[column]).all():
-            temperature.plot(time, results[column], color=color, lw=0.9, label=label)
+        if np.isfinite(samples[column]).all():
+            temperature.plot(time, samples[column], color=color, lw=0.9, label=label)
     temperature.set_ylabel("temperature (K)")
     temperature.set_xlabel("time (ps)")
     for axis in (drift, parts, temperature):
@@ -134,6 +132,6 @@ def draw_energy(path: Path, results: "Results") -> None:
             )  # fmt: skip
         if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, ncols=2, loc="upper right", fontsize=9)
-    figure.suptitle(f"{results.system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
+    figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=150)
