@@ -267,9 +267,26 @@ class Scene(Section):
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")
+        faults += self._uneven_frames()
         if faults:
             raise ValueError("; ".join(faults))
         return self
+
+    def _uneven_frames(self) -> list[str]:
+        """DCD stores one interval for all frames: stages that would make them uneven."""
+        if not self.output.trajectory or not self.output.trajectory.endswith(".dcd"):
+            return []
+        wanted = self.output.trajectory_interval_ps
+        faults = []
+        for k, stage in enumerate(self.stages):
+            every = max(1, round(wanted * 1000 / stage.timestep_fs))
+            uneven = stage.steps % every and k < len(self.stages) - 1
+            if abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
+                faults.append(
+                    f"output.trajectory: a .dcd file stores one time between frames, and stages.{k} cannot keep "
+                    f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or use .xtc"
+                )
+        return faults
 
     @classmethod
     def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "Scene":

@@ -129,7 +129,6 @@ class Simulation:
         self._observers = list(observers)
         self._say = say
         self._interrupted = False
-        _check_frames(scene)
 
     def run(self, progress: bool = False) -> Results:
         """Run all stages. Raises OutputError before anything is computed, SimulationError when numbers go bad."""
@@ -354,25 +353,6 @@ class Simulation:
             yield
         finally:
             signal.signal(signal.SIGINT, before)
-
-
-def _check_frames(scene: Scene) -> None:
-    """DCD stores one interval for all frames: refuse it where stages would make them uneven."""
-    if scene.output.trajectory is False or not scene.output.trajectory.endswith(".dcd"):
-        return
-    wanted = scene.output.trajectory_interval_ps
-    faults = []
-    for k, stage in enumerate(scene.stages):
-        dt = stage.timestep_fs * FEMTOSECOND
-        every = max(1, round(wanted / dt))
-        uneven = stage.steps % every and k < len(scene.stages) - 1
-        if abs(every * dt - wanted) > 1e-9 * wanted or uneven:
-            faults.append(
-                f"output.trajectory: a .dcd file stores one time between frames, and stage {k} cannot keep "
-                f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or use .xtc"
-            )
-    if faults:
-        raise SceneError(scene.source, faults)
 
 
 @contextlib.contextmanager

@@ -73,6 +73,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", '[output]\ntrajectory = "../t.xtc"\n[start]', ["output.trajectory", "plain file name"]),
         ("[start]", '[output]\ntrajectory = "t.mp4"\n[start]', ["output.trajectory", ".xtc"]),
         ("[start]", "[output]\nvelocities = true\n[start]", ["trajectory.xtc holds none", ".trr or .nc"]),
+        ("[start]", '[output]\ntrajectory = "t.dcd"\ntrajectory_interval_ps = 0.0035\n[start]', [".dcd", "one time between frames"]),
         ("[start]", "precision = ", ["not TOML"]),
         ("[start]", '[structure]\nfile = "../../etc/passwd"\n[start]', ["outside the scene's folder", "--set"]),
         ("[start]", '[structure]\nfile = "/etc/passwd"\n[start]', ["outside the scene's folder"]),
