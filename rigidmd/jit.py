@@ -5,6 +5,7 @@ callers running old code. So the cache lives in a folder named by a digest of al
 any file starts a new one. `RIGIDMD_CACHE` names another place for it.
 """
 
+import atexit
 import contextlib
 import hashlib
 import os
@@ -49,7 +50,9 @@ def _cache_folder() -> str:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError:
-        return tempfile.mkdtemp(prefix="rigidmd-cache-")  # a read-only home: compile, keep it for this process only
+        own = tempfile.mkdtemp(prefix="rigidmd-cache-")  # a read-only home: compile, keep it for this process only
+        atexit.register(shutil.rmtree, own, ignore_errors=True)
+        return own
     for old in base.iterdir():
         with contextlib.suppress(OSError):
             if old.is_dir() and time.time() - old.stat().st_mtime > UNUSED_AFTER_DAYS * 86400:

@@ -115,7 +115,7 @@ class Forces(Section):
     """How charges act; none ignores them"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
-    skin_A: Positive = 1.5
+    skin_A: Positive = 1.0
     """Extra radius of the neighbour list; speed only, never the result"""
 
 

@@ -17,6 +17,7 @@ import rigidmd
 from rigidmd.build.system import build
 from rigidmd.cli import main
 from rigidmd.output.log import COLUMNS
+from rigidmd.output.report import summary_text
 from rigidmd.scene import Scene
 from rigidmd.simulation import Every, Simulation
 
@@ -149,6 +150,21 @@ def test_log_and_summary(tmp_path):
     assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / 100 / n, rel=1e-6, abs=1e-9)
     thermal = 0.83144626 * stage["temperature_K"] * 117
     assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(gradient * 1000 / thermal, rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("counts", "edge"), [({"argon": 1}, 20.0), ({"argon": 1}, None), ({"nitrogen": 1}, 20.0), ({"spce": 2}, 18.1)]
+)
+@pytest.mark.parametrize("ensemble", ["nve", "nvt"])
+def test_the_smallest_systems(counts, edge, ensemble, tmp_path):
+    stage = {"ensemble": ensemble, "duration_ps": 0.02} | ({"temperature_K": 300.0} if ensemble == "nvt" else {})
+    results = Simulation(small_scene(counts, edge, stages=[stage]), tmp_path / "out").run()
+    text = summary_text(results.summary)
+    assert "20 steps" in text or "10 steps" in text
+    assert np.isfinite(results["energy"]).all()
+    if counts == {"argon": 1}:  # no total momentum: nothing is left to be warm
+        assert results.summary["degrees_of_freedom"] == 0
+        assert results.summary["stages"][0]["temperature_K"] is None
 
 
 def test_from_python_in_five_lines():

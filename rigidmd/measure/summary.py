@@ -81,7 +81,7 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
     kinetic = np.array([s.kinetic for s in own])
     spread = float(kinetic.std())
     per_molecule = line.value * 1000 / KJ_PER_MOL / n
-    thermal = BOLTZMANN * mean_t * system.freedom.total
+    thermal = BOLTZMANN * (mean_t or 0.0) * system.freedom.total
     per_kt = line.value * 1000 / thermal if thermal > 0 else None
     error_kt = line.error * 1000 / thermal if thermal > 0 else None
     return {
