@@ -31,6 +31,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except MemoryError:
+        print(f"rigidmd: {options.scene}: not enough memory; take fewer molecules", file=sys.stderr)
+        return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         sys.stderr.close()
         return 0
@@ -132,6 +135,10 @@ def _run(options: argparse.Namespace) -> int:
     print(
         f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites, "
         f"{system.freedom.total} degrees of freedom; {simulation.threads} threads"
+        + (
+            f" (the scene asks for {scene.threads}; this machine has no more)"
+            * ((scene.threads or 0) > simulation.threads)
+        )
     )
     for note in system.notes:
         print(f"  {note}")
@@ -148,7 +155,7 @@ def _say(sentence: str) -> None:
 
 
 def _energy(options: argparse.Namespace) -> int:
-    from rigidmd.measure.observables import start_energy
+    from rigidmd.simulation import start_energy
     from rigidmd.units import ENERGY_UNITS
 
     scene = _read_scene(options)
@@ -157,7 +164,8 @@ def _energy(options: argparse.Namespace) -> int:
         print(json.dumps(found, indent=2))
         return 0
     unit = options.unit
-    print(f"{scene.name}: energies of the start, {found['molecules']} molecules")
+    relieved = f", after {found['relief_steps']} steps of overlap relief" if found["relief_steps"] else ""
+    print(f"{scene.name}: energies of the start, {found['molecules']} molecules{relieved}")
     for name, value in [*found["components"].items(), ("potential", found["potential"])]:
         print(f"  {name.replace('_', ' '):<22}{value:>22.10g} {unit}")
     print(f"  {'kinetic':<22}{found['kinetic']:>22.10g} {unit}")
@@ -196,5 +204,12 @@ def _models(options: argparse.Namespace) -> int:
 def _schema(options: argparse.Namespace) -> int:
     from rigidmd.scene import Scene
 
-    print(json.dumps(Scene.model_json_schema(), indent=2, default=str))
+    print(json.dumps(_strict(Scene.model_json_schema()), indent=2, allow_nan=False))
     return 0
+
+
+def _strict(value):
+    """JSON has no infinity: a default that is infinite is left out."""
+    if isinstance(value, dict):
+        return {k: _strict(v) for k, v in value.items() if v != float("inf")}
+    return [_strict(v) for v in value] if isinstance(value, list) else value

@@ -9,6 +9,7 @@ import atexit
 import contextlib
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -43,7 +44,7 @@ def _cache_folder() -> str:
         import platformdirs
 
         base = Path(platformdirs.user_cache_path("rigidmd"))
-    folder = base / source_digest()
+    folder = base / f"kernels-{source_digest()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
@@ -55,7 +56,8 @@ def _cache_folder() -> str:
         return own
     for old in base.iterdir():
         with contextlib.suppress(OSError):
-            if old.is_dir() and time.time() - old.stat().st_mtime > UNUSED_AFTER_DAYS * 86400:
+            ours = re.fullmatch(r"kernels-[0-9a-f]{16}", old.name) and old.is_dir()
+            if ours and time.time() - old.stat().st_mtime > UNUSED_AFTER_DAYS * 86400:
                 shutil.rmtree(old)
     return str(folder)
 

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -20,10 +21,14 @@ SAME_PLACE = 1e-6
 OFF_AXIS = 1e-4
 
 
+#: Names of sites and residues as every structure format can hold them: one to five visible ASCII characters.
+SiteName = Annotated[str, Field(pattern=r"^[!-~]{1,5}$")]
+
+
 class Site(Section):
     """A point of a rigid molecule: mass, charge and Lennard-Jones parameters, each only where it has them."""
 
-    name: str = Field(min_length=1, max_length=5)
+    name: SiteName
     """Name in trajectories and topology files, at most five characters"""
     element: str = "X"
     """Chemical symbol; X for a site without mass"""
@@ -61,7 +66,7 @@ class MoleculeFile(Section):
     name: str = Field(min_length=1)
     title: str = ""
     source: str = ""
-    residue_names: tuple[str, ...] = ()
+    residue_names: tuple[SiteName, ...] = ()
     sites: tuple[Site, ...] = Field(min_length=1)
 
 

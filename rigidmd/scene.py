@@ -11,13 +11,16 @@ from pydantic import Field, PrivateAttr, Strict, ValidationError, field_validato
 
 from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.errors import SceneError
-from rigidmd.molecules import Site, available_models
+from rigidmd.molecules import Site, SiteName, available_models
 from rigidmd.validation import Count, Flag, NonNegative, Positive, Section, faults_of
 
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
+MOST_STEPS = 1e12
+
+Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 
 
@@ -67,7 +70,7 @@ class Molecules(Section):
     """What to call the species; the model's or file's name when not given"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
     """The sites of a molecule of one's own; with a geometry `file`, their parameters by atom name or element"""
-    residue_names: tuple[str, ...] | None = None
+    residue_names: tuple[SiteName, ...] | None = None
     """Residue names by which structure files may call this species"""
     count: Count | None = None
     """How many; needed unless there is a structure file"""
@@ -115,8 +118,16 @@ class Forces(Section):
     """How charges act; none ignores them"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
-    skin_A: Positive = 1.0
+    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.0
     """Extra radius of the neighbour list; speed only, never the result"""
+
+    @model_validator(mode="after")
+    def _nothing_idle(self):
+        if self.switch_start_A is not None and self.truncation not in ("force_switch", "switch"):
+            raise ValueError(f"switch_start_A would do nothing with truncation = {self.truncation!r}")
+        if self.electrostatics == "none" and self.reaction_field_permittivity != inf:
+            raise ValueError("reaction_field_permittivity would do nothing with electrostatics = 'none'")
+        return self
 
 
 class Start(Section):
@@ -155,6 +166,8 @@ class Stage(Section):
             thermal = ("temperature_K", "thermostat", "thermostat_time_ps")
             if idle := [key for key in thermal if getattr(self, key) != fields[key].default]:
                 raise ValueError(f"{', '.join(idle)} would do nothing in an nve stage")
+        if not self.duration_ps * 1000 / self.timestep_fs < MOST_STEPS:
+            raise ValueError(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
         if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
             raise ValueError(f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs")
         return self
@@ -173,11 +186,11 @@ class Stage(Section):
 class Output(Section):
     """What is written, all into the run's own folder."""
 
-    log_interval_ps: Positive = 0.05
+    log_interval_ps: Interval = 0.05
     """Time between lines of log.csv"""
     trajectory: str | Literal[False] = "trajectory.xtc"
     """Trajectory file; the ending chooses the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
-    trajectory_interval_ps: Positive = 0.5
+    trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: str = "topology.gro"
     """File with names and first positions that viewers need beside the trajectory (.gro or .pdb)"""
@@ -205,12 +218,16 @@ class Output(Section):
                 f"velocities = true, but {self.trajectory or 'no trajectory'} holds none; "
                 f"use one ending in {' or '.join(WITH_VELOCITIES)}"
             )
+        if self.topology == self.trajectory:
+            raise ValueError(f"topology and trajectory are both {self.topology}; name them apart")
         return self
 
 
 def _file_name(name: str, endings: tuple[str, ...]) -> str:
     if not re.fullmatch(r"[\w\-][\w.\-]*", name):
         raise ValueError(f"is {name!r}, must be a plain file name without a folder")
+    if name.startswith("input_"):
+        raise ValueError(f"is {name!r}; names beginning with input_ are kept for copies of input files")
     if not name.endswith(endings):
         raise ValueError(f"is {name!r}, must end in one of {' '.join(endings)}")
     return name
@@ -247,6 +264,15 @@ class Scene(Section):
         """A file named in the scene: relative to the scene's own folder."""
         return self._folder / file
 
+    @property
+    def inputs(self) -> dict[str, Path]:
+        """Every file it reads besides itself: dotted key -> path."""
+        found = {} if self.structure is None else {"structure.file": self.path(self.structure.file)}
+        for k, species in enumerate(self.molecules):
+            if species.file is not None:
+                found[f"molecules.{k}.file"] = self.path(species.file)
+        return found
+
     @model_validator(mode="after")
     def _whole(self):
         faults = []
@@ -264,6 +290,10 @@ class Scene(Section):
             from_file = self.structure is not None and self.structure.velocities
             if not from_file:
                 faults.append("start.temperature_K is missing: the first stage is nve and no velocities are read")
+        if self.start.temperature_K is not None and self.structure is not None and self.structure.velocities:
+            faults.append("start.temperature_K would do nothing: the velocities are read from the structure file")
+        if self.start.temperature_K == 0 and self.stages[0].ensemble == "nvt":
+            faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot warm what is at rest")
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")

@@ -121,26 +121,26 @@ class Simulation:
     ):
         self.scene = scene
         self.system = build(scene)
-        self.engine = Engine(self.system.model, self.system.terms)
-        self.state = self.system.state.copy()
         self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
         self._folder = None if folder is None else Path(folder)
         self._force = force
         self._observers = list(observers)
         self._say = say
-        self._interrupted = False
+        self._reset()
 
     def run(self, progress: bool = False) -> Results:
         """Run all stages. Raises OutputError before anything is computed, SimulationError when numbers go bad."""
+        scene_file = Path(self.scene.source)
+        inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
         if self._folder is not None:
-            check_folder(self._folder, self._force)
-        numba.set_num_threads(self.threads)
+            check_folder(self._folder, self._force, inputs)
+        self._reset()
         results = Results(self.system, self.state, Samples())
         began = clock.perf_counter()
         relief = self._prepare()
         prepared = clock.perf_counter() - began
         if self._folder is not None:
-            make_folder(self._folder, self._force)
+            make_folder(self._folder, self._force, self._file_names(), inputs)
         with contextlib.ExitStack() as stack:
             log, writers = self._writers(stack, results)
             sampler = Every(self.scene.output.log_interval_ps, self._sampler(results.samples, log))
@@ -150,7 +150,7 @@ class Simulation:
             try:
                 computing = self._run_stages(observers, results, progress)
             except NotFiniteError as error:
-                raise self._explain(error, results) from None
+                raise self._explain(error) from None
             wall = clock.perf_counter() - began
         results.interrupted = self._interrupted
         results.summary = summarise(
@@ -160,10 +160,35 @@ class Simulation:
             self._finish(results)
         return results
 
+    def _reset(self) -> None:
+        """Back to the start: every run of a simulation is the same run."""
+        self.engine = Engine(self.system.model, self.system.terms)
+        self.state = self.system.state.copy()
+        self._interrupted = False
+        numba.set_num_threads(self.threads)
+
+    def _file_names(self) -> list[str]:
+        """Every file that `run` may write."""
+        from rigidmd.output.scene_file import input_names
+
+        output = self.scene.output
+        names = [SCENE_FILE, output.topology, "log.csv", "final.npz", "energy.png", "summary.json", LAST_GOOD_STATE]
+        return [*names, *input_names(self.scene).values(), *([output.trajectory] if output.trajectory else [])]
+
+    def start(self) -> tuple[Observation, Relief | None]:
+        """The moment before the first step: what `run` starts from, measured, and the relief it took to get there."""
+        self._reset()
+        relief = self._prepare()
+        return observe(self.system, self.engine, self.state), relief
+
     def _prepare(self) -> Relief | None:
         """Compile, and move apart what a lattice put too close."""
         self._say("compiling (kept on disk: the next run starts at once)")
-        self.engine.evaluate(self.state)
+        _, tallies = self.engine.evaluate(self.state)
+        if not all(np.isfinite(tally.energy) for tally in tallies.values()):
+            raise SceneError(
+                self.scene.source, ["the start has no finite energy: sites of different molecules coincide"]
+            )
         first = self.scene.stages[0]
         relief = None
         if self.system.from_lattice:
@@ -219,7 +244,7 @@ class Simulation:
                     self.engine.advance(self.state, scheme, dt, to - done, thermostat)
                     seconds += clock.perf_counter() - began
                     if not all(np.isfinite(array).all() for array in self.state):
-                        raise NotFiniteError(to - done, self.state)
+                        raise NotFiniteError(self.state)
                     done = to
                     heat = float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
                     moment = Moment(self, step + done, time + done * dt, k, heat)
@@ -293,7 +318,7 @@ class Simulation:
         from rigidmd.output.trajectory import TrajectoryFile, write_topology
 
         write_scene(self._folder, self.scene, self.system)
-        write_topology(self._folder / output.topology, self.system)
+        write_topology(self._folder / output.topology, self.system, self.state, wrapped)
         log = Log(self._folder / "log.csv", self.system.space.volume, self.system.density)
         stack.callback(log.close)
         results.files += [self._folder / name for name in (SCENE_FILE, output.topology, "log.csv")]
@@ -322,7 +347,7 @@ class Simulation:
         results.summary["files"] = [str(path) for path in results.files]
         write_summary(self._folder / "summary.json", results.summary)
 
-    def _explain(self, error: NotFiniteError, results: Results) -> SimulationError:
+    def _explain(self, error: NotFiniteError) -> SimulationError:
         """When, where and what to do; the last good state is saved."""
         step, time, state = self._last_good
         where = ""
@@ -365,3 +390,23 @@ def _bar(scene: Scene, progress: bool):
     with tqdm(total=total, disable=None if progress else True, bar_format=form, leave=False, mininterval=0.2) as bar:
         bar.done_in_stage = 0
         yield bar
+
+
+def start_energy(scene: Scene, size: float, unit: str) -> dict:
+    """Energies, virial, pressure and largest force of a scene's start; energies in a unit of `size` u Å²/ps²."""
+    simulation = Simulation(scene)
+    seen, relief = simulation.start()
+    force, molecule = seen.largest_force
+    return {
+        "unit": unit,
+        "molecules": len(simulation.system.model.species),
+        "relief_steps": relief.steps if relief else 0,
+        "components": {name: energy / size for name, energy in seen.components.items()},
+        "potential": seen.potential / size,
+        "kinetic": seen.kinetic / size,
+        "virial": float(seen.virial.trace()) / size,
+        "virial_tensor": (seen.virial / size).tolist(),
+        "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
+        "largest_force_per_A": force / size,
+        "largest_force_molecule": molecule + 1,
+    }

@@ -77,6 +77,10 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
             return f"is {shown}, must be a list"
         case "model_type" | "model_attributes_type" | "dict_type":
             return f"is {shown}, must be a table"
+        case "less_than_equal":
+            return f"is {shown}, must not be more than {context['le']:g}"
+        case "string_pattern_mismatch" if "!-~" in context["pattern"]:
+            return f"is {shown}, must be one to five visible ASCII characters without spaces"
         case "value_error":
             return str(context["error"])
     return f"is {shown}: {detail['msg']}"

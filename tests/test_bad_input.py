@@ -1,11 +1,16 @@
 """Bad input: each gets one message that says what, where and what to do; no traceback, nothing half-written."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from conftest import ROOT, small_scene
 
+from rigidmd.build.system import build
 from rigidmd.cli import main
-from rigidmd.errors import MoleculeError, SceneError, SimulationError
+from rigidmd.errors import MoleculeError, SceneError, SimulationError, StructureError
 from rigidmd.molecules import Site, available_models, load_model, molecule
 from rigidmd.scene import Scene, parse_override
 from rigidmd.simulation import Simulation
@@ -74,6 +79,13 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", '[output]\ntrajectory = "t.mp4"\n[start]', ["output.trajectory", ".xtc"]),
         ("[start]", "[output]\nvelocities = true\n[start]", ["trajectory.xtc holds none", ".trr or .nc"]),
         ("[start]", '[output]\ntrajectory = "t.dcd"\ntrajectory_interval_ps = 0.0035\n[start]', [".dcd", "one time between frames"]),
+        ("[start]", '[output]\ntrajectory = "x.pdb"\ntopology = "x.pdb"\n[start]', ["both x.pdb"]),
+        ("[start]", '[output]\ntrajectory = "input_a.pdb"\n[start]', ["input_"]),
+        ("[start]", '[forces]\ntruncation = "shift"\nswitch_start_A = 5\n[start]', ["would do nothing with truncation = 'shift'"]),
+        ("[start]", '[forces]\nskin_A = 1e300\n[start]', ["forces.skin_A", "not be more than 100"]),
+        ("count = 20", "count = 10000000000000", ["not enough memory"]),
+        ("timestep_fs = 1", "timestep_fs = 1e-300", ["more than 1e+12 steps"]),
+        ("count = 20", 'count = 20\nresidue_names = ["ETHYLENE GLYCOL"]', ["residue_names.0", "one to five visible"]),
         ("[start]", "precision = ", ["not TOML"]),
         ("[start]", '[structure]\nfile = "../../etc/passwd"\n[start]', ["outside the scene's folder", "--set"]),
         ("[start]", '[structure]\nfile = "/etc/passwd"\n[start]', ["outside the scene's folder"]),
@@ -90,6 +102,11 @@ def test_a_bad_scene(old, new, expected, capsys, tmp_path):
     message = refused(capsys, tmp_path, GOOD.replace(old, new))
     for part in ["bad.toml", *expected] if "passwd" not in new else expected:
         assert part in message or (part == "bad.toml" and "none.gro" in message)
+
+
+def test_a_thermostat_cannot_warm_what_is_at_rest(capsys, tmp_path):
+    text = GOOD.replace("duration_ps", 'ensemble = "nvt"\ntemperature_K = 90\nduration_ps').replace("= 300", "= 0")
+    assert "cannot warm what is at rest" in refused(capsys, tmp_path, text)
 
 
 def test_the_good_scene_is_good(tmp_path, capsys):
@@ -165,6 +182,39 @@ def test_output_folders(capsys, tmp_path):
     assert "is a file" in capsys.readouterr().err
     assert main(["run", str(scene), "-o", "/proc/here/there"]) == 2
     assert "cannot be" in capsys.readouterr().err
+
+
+def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tmp_path):
+    scene = tmp_path / "good.toml"
+    scene.write_text(GOOD)
+    out = tmp_path / "out"
+    assert main(["run", str(scene), "-o", str(out)]) == 0
+    (out / "notes.txt").write_text("mine")
+    assert main(["run", str(scene), "-o", str(out), "--force"]) == 0
+    assert (out / "notes.txt").read_text() == "mine"
+    kept = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert main(["run", str(out / "scene.toml"), "-o", str(out), "--force"]) == 2
+    assert "is read by this run" in capsys.readouterr().err
+    restart = ["--set", f"structure.file={out / 'final.npz'}", "--set", "box.lengths_A=20.0"]
+    assert main(["run", str(scene), *restart, "-o", str(out), "--force"]) == 2
+    assert "is read by this run" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == kept
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "scene.toml").write_text(GOOD)
+    assert main(["run", str(project / "scene.toml"), "-o", str(project), "--force"]) == 2
+    assert (project / "scene.toml").read_text() == GOOD
+
+
+def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
+    old = [tmp_path / "thesis", tmp_path / "kernels-0123456789abcdef", tmp_path / "0123456789abcdef"]
+    for folder in old:
+        folder.mkdir()
+        os.utime(folder, (1e9, 1e9))
+    subprocess.run(
+        [sys.executable, "-c", "import rigidmd.jit"], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
+    )
+    assert [folder.exists() for folder in old] == [True, False, True]
 
 
 def test_an_earlier_run_is_kept_when_the_new_scene_is_bad(capsys, tmp_path):
@@ -254,6 +304,10 @@ def lose_velocity(lines):
     lines[10] = lines[10][:44]
 
 
+def wild_velocity(lines):
+    lines[10] = lines[10][:44] + "     nan  0.0000  0.0000"
+
+
 def nonsense(lines):
     lines[10] = lines[10][:20] + "     nan   0.000   0.000" + lines[10][44:]
 
@@ -266,6 +320,7 @@ def nonsense(lines):
         (overlap, ["molecules 1 and 2 overlap"]),
         (bend, ["molecule 1", "is no spce", "from the rigid template"]),
         (lose_velocity, ["ASE cannot read it", "velocities were not specified"]),
+        (wild_velocity, ["atom 9", "a velocity that is not a finite number"]),
         (nonsense, ["atom 9", "not a finite number"]),
     ],
 )
@@ -275,10 +330,42 @@ def test_a_bad_structure_file(change, expected, capsys, tmp_path):
         assert part in message
 
 
+def test_the_box_of_the_scene_counts_for_a_saved_state_too(tmp_path):
+    Simulation(small_scene({"argon": 20}, 20.0), tmp_path / "out").run()
+    for box, edge in (({}, 20.0), ({"lengths_A": 40.0}, 40.0), ({"periodic": False}, np.inf)):
+        data = small_scene({"argon": 20}, 20.0).model_dump() | {"box": box, "structure": {"file": "final.npz"}}
+        assert build(Scene.from_dict(data, tmp_path / "out")).space.x == edge
+    with np.load(tmp_path / "out" / "final.npz") as saved:
+        good = dict(saved)
+    for key, value in {
+        "species": good["species"] + 5,
+        "velocity": good["velocity"][:3],
+        "position": good["position"] * np.nan,
+    }.items():
+        np.savez(tmp_path / "out" / "final.npz", **good | {key: value})
+        with pytest.raises(StructureError, match=f"{key}.*: damaged"):
+            build(Scene.from_dict(data, tmp_path / "out"))
+
+
+def test_points_from_a_file_fit_wherever_they_are(tmp_path):
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3) * 5 + rng.random((64, 3))
+    atoms = "".join(
+        f"{k + 1:5d}AR      AR{k + 1:5d}{x[0] / 10:8.3f}{x[1] / 10:8.3f}{x[2] / 10:8.3f}\n" for k, x in enumerate(grid)
+    )
+    (tmp_path / "ar.gro").write_text(f"argon\n64\n{atoms}   2.00000   2.00000   2.00000\n")
+    data = small_scene({"argon": 64}, None).model_dump() | {"box": {}, "structure": {"file": "ar.gro"}}
+    assert len(build(Scene.from_dict(data, tmp_path)).state.position) == 64
+
+
 def test_structure_files_with_other_faults(capsys, tmp_path):
     assert "count is 200" in refused(capsys, tmp_path, structure_scene(tmp_path, WATER216, extra="count = 200\n"))
     assert "may be spce or tip3p" in refused(
         capsys, tmp_path, structure_scene(tmp_path, WATER216, models=("spce", "tip3p"))
+    )
+    two = "1\n\nAr 0 0 0\n" * 2
+    assert "holds 2 structures" in refused(
+        capsys, tmp_path, structure_scene(tmp_path, two, "two.xyz", models=("argon",))
     )
     xyz = "3\n\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n"
     assert "has no box" in refused(capsys, tmp_path, structure_scene(tmp_path, xyz, "a.xyz"))
@@ -286,6 +373,7 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
         structure_scene(tmp_path, WATER216)
         .replace("[structure]", "[structure]\nvelocities = true")
         .replace("start.gro", "b.xyz")
+        .replace("[start]\ntemperature_K = 300\n", "")
     )
     (tmp_path / "b.xyz").write_text(
         '3\nLattice="20 0 0 0 20 0 0 0 20"\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n'
@@ -334,8 +422,6 @@ def test_a_molecule_from_a_geometry_file(tmp_path):
     ]
     data = small_scene({"argon": 5}, 25.0).model_dump()
     data["molecules"] = [{"file": "co2.xyz", "sites": sites, "count": 20}]
-    from rigidmd.build.system import build
-
     system = build(Scene.from_dict(data, tmp_path))
     co2 = system.species[0]
     assert (co2.name, co2.kind, co2.charge) == ("co2", "linear", 0)
@@ -347,8 +433,8 @@ def test_a_molecule_from_a_geometry_file(tmp_path):
 
 def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
     simulation = Simulation(small_scene({"spce": 20}, 20.0), tmp_path / "out")
-    good = simulation.state.position.copy()
-    simulation.state.velocity[7] = 1e150  # gone within a step
+    good = simulation.system.state.position.copy()
+    simulation.system.state.velocity[7] = 1e150  # gone within a step
     with pytest.raises(SimulationError, match=r"after step 0 .* molecule 8 is nowhere.*timestep_fs.*last_good_state"):
         simulation.run()
     with np.load(tmp_path / "out" / "last_good_state.npz") as saved:

@@ -39,9 +39,7 @@ def test_every_system_runs_a_few_steps(path, tmp_path):
         np.ptp(results["conserved"][results["stage"] == len(scene.stages) - 1])
         < 1e-3 * np.abs(results["kinetic"]).max()
     )
-    names = {file.name for file in (tmp_path / "out").iterdir()} - {
-        f"input_{p.name}" for p in (ROOT / "systems" / "structures").iterdir()
-    }
+    names = {file.name for file in (tmp_path / "out").iterdir() if not file.name.startswith(("input_", "."))}
     assert names == {
         "scene.toml",
         "summary.json",
@@ -70,7 +68,7 @@ def test_the_final_state_starts_another_run(tmp_path):
     first = Simulation(small_scene({"spce": 20, "argon": 3}, 18.5, stages=stages), tmp_path / "a").run()
     scene = small_scene(
         {"spce": 20, "argon": 3}, None, tmp_path / "a", stages=stages, box={},
-        structure={"file": "final.npz", "velocities": True},
+        structure={"file": "final.npz", "velocities": True}, start={},
     )  # fmt: skip
     system = build(scene)
     for a, b in zip(first.state, system.state, strict=True):
@@ -165,6 +163,63 @@ def test_the_smallest_systems(counts, edge, ensemble, tmp_path):
     if counts == {"argon": 1}:  # no total momentum: nothing is left to be warm
         assert results.summary["degrees_of_freedom"] == 0
         assert results.summary["stages"][0]["temperature_K"] is None
+
+
+def test_a_simulation_runs_twice_alike_and_keeps_true_times():
+    stages = [{"duration_ps": 0.06}, {"duration_ps": 0.06, "timestep_fs": 3.0}]
+    simulation = Simulation(small_scene({"spce": 20}, 18.5, stages=stages, output={"trajectory_interval_ps": 0.02}))
+    first = simulation.run()
+    kept = first.state.copy()
+    second = simulation.run()
+    for a, b, c in zip(first.state, kept, second.state, strict=True):
+        assert a.tobytes() == b.tobytes() == c.tobytes()
+    times = [frame.time for frame in first.universe().trajectory]
+    assert times == pytest.approx([0, 0.02, 0.04, 0.06, 0.081, 0.102])  # 20 fs are seven steps of 3 fs
+
+
+def test_the_topology_is_the_first_frame_relief_included(tmp_path):
+    short = {"stages.0.duration_ps": 0.004, "stages.1.duration_ps": 0.004, "output.positions": "unwrapped"}
+    results = Simulation(Scene.read(ROOT / "systems" / "water_nitrogen.toml", short), tmp_path / "out").run()
+    assert results.summary["relief_steps"] > 0
+    universe = results.universe()
+    first = mda.Universe(str(tmp_path / "out" / "topology.gro")).atoms.positions
+    assert first == pytest.approx(universe.trajectory[0].positions, abs=0.011)
+    assert main(["energy", str(ROOT / "systems" / "water_nitrogen.toml"), "--json"]) == 0
+
+
+def test_input_files_of_one_name_are_kept_apart(tmp_path):
+    model = (ROOT / "rigidmd" / "models" / "argon.toml").read_text()
+    for name, mass in (("aa", "39.948"), ("bb", "83.798")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mol.toml").write_text(
+            model.replace("39.948", mass).replace('name = "argon"', f'name = "{name}"')
+        )
+    data = small_scene({"argon": 1}, 25.0).model_dump()
+    data["molecules"] = [{"file": f"{name}/mol.toml", "count": 10} for name in ("aa", "bb")]
+    first = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "out").run()
+    again = Simulation(Scene.read(tmp_path / "out" / "scene.toml")).run()
+    assert [m.mass for m in again.system.species] == [39.948, 83.798]
+    assert first.state.position.tobytes() == again.state.position.tobytes()
+
+
+@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.pdb", "t.xyz", "t.nc", "t.dcd"])
+def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
+    """What a kill would leave: the file is read back while the run still holds it open."""
+    seen = []
+
+    def look(moment):
+        if moment.step and moment.step % 4 == 0:
+            universe = mda.Universe(str(tmp_path / "out" / "topology.gro"), str(tmp_path / "out" / name))
+            seen.append(sum(1 for _ in universe.trajectory))
+
+    scene = small_scene(
+        {"argon": 300},
+        40.0,
+        stages=[{"duration_ps": 0.04}],
+        output={"trajectory": name, "trajectory_interval_ps": 0.008},
+    )
+    Simulation(scene, tmp_path / "out", observers=[Every(0.008, look)]).run()
+    assert seen == [2, 3, 4, 5, 6]
 
 
 def test_from_python_in_five_lines():
@@ -266,7 +321,7 @@ def test_the_commands(capsys, tmp_path):
     assert main(["models"]) == 0
     assert "dipole 2.351 D" in capsys.readouterr().out  # SPC/E
     assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
+    schema = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert "timestep_fs" in schema["$defs"]["Stage"]["properties"]
     assert main(["check", water, "--set", "stages.1.timestep_fs=4", "--set", "molecules.0.model=tip3p"]) == 0
     out = capsys.readouterr().out

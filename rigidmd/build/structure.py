@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.errors import StructureError
-from rigidmd.mechanics.rotation import align
+from rigidmd.mechanics.rotation import align, orthogonality_error
 from rigidmd.molecules import Molecule
 
 # ASE's velocity unit (Å sqrt(u/eV)) in Å/ps.
 ASE_VELOCITY = 98.22694788464063
 MOST_PERMUTATIONS = 720
+NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 MOST_NAMED = 5  # how many molecules a message names before it only counts
 
 
@@ -48,16 +49,21 @@ def read_structure(path: Path, species: list[Molecule], edges, periodic: bool, t
     edges: those the scene asks for, or None to take the file's. tolerance: see Scene.structure.
     """
     if path.suffix == ".npz":
-        return _read_state(path, species)
+        state = _read_state(path, species)
+        return state._replace(edges=_edges(path, state.edges, edges, periodic))
     atoms = _read_atoms(path)
-    if not periodic:
-        edges = None
-    elif edges is None:
-        if atoms.edges is None:
-            raise StructureError(str(path), ["has no box: give [box] lengths_A, or periodic = false"])
-        edges = tuple(float(x) for x in atoms.edges)
+    edges = _edges(path, atoms.edges, edges, periodic)
     groups = _recognise(path, atoms, species, edges, tolerance)
     return _fit_all(path, atoms, groups, species, edges, tolerance)
+
+
+def _edges(path: Path, found, wanted, periodic: bool) -> tuple[float, float, float] | None:
+    """The box: what the scene says, else what the file says, or none."""
+    if not periodic:
+        return None
+    if wanted is None and found is None:
+        raise StructureError(str(path), ["has no box: give [box] lengths_A, or periodic = false"])
+    return tuple(float(x) for x in (found if wanted is None else wanted))
 
 
 def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndarray]:
@@ -75,14 +81,22 @@ def _read(path: Path):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            atoms = ase.io.read(path)
+            frames = ase.io.read(path, index=":")
     except Exception as error:  # ASE's readers raise whatever their parsing trips over, ImportError to IndexError
         raise StructureError(str(path), [f"ASE cannot read it: {type(error).__name__}: {error}"]) from None
+    if len(frames) > 1:
+        raise StructureError(
+            str(path), [f"holds {len(frames)} structures one after another; keep the one to start from"]
+        )
+    atoms = frames[0] if frames else ()
     if len(atoms) == 0:
         raise StructureError(str(path), ["holds no atoms"])
     if not np.isfinite(atoms.positions).all():
         bad = int(np.argmin(np.isfinite(atoms.positions).all(axis=1)))
         raise StructureError(str(path), [f"atom {bad + 1} has a position that is not a finite number"])
+    if atoms.has("momenta") and not np.isfinite(atoms.get_momenta()).all():
+        bad = int(np.argmin(np.isfinite(atoms.get_momenta()).all(axis=1)))
+        raise StructureError(str(path), [f"atom {bad + 1} has a velocity that is not a finite number"])
     if path.suffix == ".gro":
         promised = path.read_text().splitlines()[1].strip()
         if not promised.isdigit() or int(promised) != len(atoms):
@@ -253,6 +267,8 @@ def _fit(atoms: _Atoms, orders: list[list[int]], molecule: Molecule, edges) -> _
         moved = relative[:, permutation]
         rotation = align(template, moved, masses)
         deviation = np.linalg.norm(moved - np.einsum("nij,sj->nsi", rotation, template), axis=2)
+        if len(sites) == 1:
+            deviation[:] = 0.0  # a point fits wherever it is; what is left is the rounding of its centre
         if best is None:
             best = _Fit(centre, rotation, deviation, order)
         else:
@@ -331,14 +347,19 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
     known = [molecule.name for molecule in species]
     if missing := [name for name in names if name not in known]:
         raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
-    n = len(arrays["position"])
+    n = len(arrays["species"])
+    turning = len(arrays["rotation"]) > 0
     shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "edges": (3,)}
-    bad = [k for k, shape in shapes.items() if arrays[k].shape != shape]
-    bad += [k for k, a in arrays.items() if k != "edges" and not np.isfinite(a).all()]
+    shapes |= {"rotation": (n, 3, 3), "angular_momentum_body": (n, 3)} if turning else {}
+    bad = [k for k, shape in shapes.items() if arrays[k].shape != shape or arrays[k].dtype.kind not in "fi"]
+    bad += [k for k, a in arrays.items() if k not in (*bad, "edges") and not np.isfinite(a).all()]
+    if not bad and (arrays["species"].dtype.kind != "i" or not np.isin(arrays["species"], np.arange(len(names))).all()):
+        bad.append("species")
+    if not bad and orthogonality_error(arrays["rotation"]) > NOT_A_ROTATION:
+        bad.append("rotation")
     if bad:
-        raise StructureError(str(path), [f"{', '.join(sorted(set(bad)))}: damaged (wrong shape or not finite)"])
+        raise StructureError(str(path), [f"{', '.join(sorted(set(bad)))}: damaged (wrong shape or values)"])
     edges = tuple(float(x) for x in arrays["edges"])
-    turning = len(arrays["rotation"]) == n
     return Arrangement(
         species=np.array([known.index(name) for name in names])[arrays["species"]],
         position=arrays["position"],

@@ -302,6 +302,8 @@ def _terms(scene: Scene, species: list[Molecule], model: Model, space: Space, cu
         kind = np.concatenate([[kinds.index(pair) for pair in pairs[k]] for k in index]).astype(np.int64)
         sigma, epsilon = np.array(kinds).T
         law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing)
+        if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
+            raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
         terms["lennard_jones"] = pair_forces(law, space, _taking_part(species, index, chosen), forces.skin_A)
         if forces.tail_correction:
             constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)

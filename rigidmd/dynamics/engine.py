@@ -53,7 +53,7 @@ class Engine:
         while status := advance(
             self.model, state, self.load, self._terms, thermostat, kicks, drifts, dt, steps, progress
         ):
-            self._answer(status, state, int(progress.cursor[0]))
+            self._answer(status, state)
         self._stale = False
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
@@ -63,22 +63,21 @@ class Engine:
         for k, name in enumerate(self.names):
             tally = np.zeros(TALLY_SIZE)
             while status := add_term(self._terms[k], state, load, tally):
-                self._answer(status, state, 0)
+                self._answer(status, state)
             tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
         return load, tallies
 
-    def _answer(self, status: int, state: State, step: int) -> None:
+    def _answer(self, status: int, state: State) -> None:
         if status == LIST_FULL:
             self._terms = tuple(with_room(term) for term in self._terms)
         elif status == NOT_FINITE:
-            raise NotFiniteError(step, state)
+            raise NotFiniteError(state)
 
 
 class NotFiniteError(SimulationError):
-    """Positions or momenta that are no numbers any more, `step` steps after the last look at the state."""
+    """Positions or momenta that are no numbers any more."""
 
-    def __init__(self, step: int, state: State):
-        self.step = step
+    def __init__(self, state: State):
         rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in state if len(array)]
         size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
         self.molecule = int(size.argmax())

@@ -87,6 +87,7 @@ def tail(law: LennardJones, volume: float) -> tuple[float, float]:
 
     U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated); for endings that shift the whole
     potential the constant inside counts too, as in GROMACS' dispersion correction. Allen & Tildesley (2017), 2.8.
+    All N² pairs are counted, those of a molecule with itself among them: a relative error of 1/(number of molecules).
     """
     count = np.bincount(law.kind, minlength=len(law.c6))
     energy = pressure = 0.0

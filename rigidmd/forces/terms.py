@@ -12,7 +12,7 @@ from numba import literal_unroll
 
 from rigidmd.jit import implements, is_a, kernel
 
-# What a kernel reports; the worst one wins, Python acts on it (dynamics.run and simulation).
+# What a kernel reports; the worst one wins, Python acts on it (dynamics.engine).
 OK = 0
 LIST_FULL = 1  # the neighbour list needs more room: enlarge it and call again
 NOT_FINITE = 2  # a position is not a number, or so large that it says nothing any more

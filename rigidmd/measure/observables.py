@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.system import System, build
+from rigidmd.build.system import System
 from rigidmd.dynamics.engine import Engine
 from rigidmd.forces.terms import Load, State
 from rigidmd.mechanics.rotation import orthogonality_error
-from rigidmd.scene import Scene
 from rigidmd.units import BAR, BOLTZMANN
 
 
@@ -89,23 +88,3 @@ def observe(system: System, engine: Engine, state: State) -> Observation:
 
 def _temperature(kinetic: float, freedom: int) -> float:
     return 2 * kinetic / (freedom * BOLTZMANN) if freedom else nan
-
-
-def start_energy(scene: Scene, size: float, unit: str) -> dict:
-    """Energies, virial, pressure and largest force of a scene's start; energies in a unit of `size` u Å²/ps²."""
-    system = build(scene)
-    engine = Engine(system.model, system.terms)
-    seen = observe(system, engine, system.state)
-    force, molecule = seen.largest_force
-    return {
-        "unit": unit,
-        "molecules": len(system.model.species),
-        "components": {name: energy / size for name, energy in seen.components.items()},
-        "potential": seen.potential / size,
-        "kinetic": seen.kinetic / size,
-        "virial": float(seen.virial.trace()) / size,
-        "virial_tensor": (seen.virial / size).tolist(),
-        "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
-        "largest_force_per_A": force / size,
-        "largest_force_molecule": molecule + 1,
-    }

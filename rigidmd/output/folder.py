@@ -2,26 +2,33 @@
 
 import contextlib
 import os
-import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rigidmd.errors import OutputError
 
-SCENE_FILE = "scene.toml"  # every run writes it first, so it marks a folder as that of a run
+SCENE_FILE = "scene.toml"
+#: Marks a folder as that of a run and lists the files the run may write, one a line: what --force may remove.
+MARKER = ".rigidmd-run"
 
 
-def check_folder(folder: Path, force: bool) -> None:
-    """Raise OutputError if a run could not be written to `folder`; changes nothing."""
+def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None:
+    """Raise OutputError if a run could not be written there, or would remove one of its inputs; changes nothing."""
     if folder.exists():
         if not folder.is_dir():
             raise OutputError(f"{folder} is a file; name another folder with -o")
         if any(folder.iterdir()):
-            if not (folder / SCENE_FILE).is_file():
+            if not (folder / MARKER).is_file():
                 raise OutputError(f"{folder} is not empty and holds no earlier run; name another folder with -o")
             if not force:
                 raise OutputError(f"{folder} holds an earlier run; --force replaces it, -o names another folder")
+            doomed = {(folder / name).resolve() for name in _written(folder)}
+            for path in inputs:
+                if path.resolve() in doomed:
+                    raise OutputError(
+                        f"{path} is read by this run and would be replaced by it; name another folder with -o"
+                    )
     parent = folder
     while not parent.exists():
         parent = parent.parent
@@ -29,15 +36,27 @@ def check_folder(folder: Path, force: bool) -> None:
         raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")
 
 
-def make_folder(folder: Path, force: bool) -> None:
-    """Make an empty folder for a run; an earlier run in it is removed if `force`. Raises OutputError."""
-    check_folder(folder, force)
+def make_folder(folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
+    """Make the folder of a run that will write files of these names; of an earlier run in it only what it wrote goes.
+
+    Raises OutputError.
+    """
+    check_folder(folder, force, inputs)
     try:
-        if folder.exists() and (folder / SCENE_FILE).is_file():
-            shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        for name in _written(folder):
+            (folder / name).unlink(missing_ok=True)
+        (folder / MARKER).write_text("\n".join(names) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder} cannot be made: {error.strerror}") from None
+
+
+def _written(folder: Path) -> list[str]:
+    """Files that an earlier run in this folder may have written; plain names only, whatever its marker says."""
+    marker = folder / MARKER
+    if not marker.is_file():
+        return []
+    return [name for name in marker.read_text(encoding="utf-8").split("\n") if name and Path(name).name == name]
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""The scene of a run, in its folder, with every default spelled out and the files it reads: enough to run it again."""
+"""The scene of a run, in its folder, with its defaults spelled out and the files it reads: enough to run it again."""
 
 import shutil
 from math import inf
@@ -11,16 +11,23 @@ from rigidmd.output.folder import SCENE_FILE, whole_file
 from rigidmd.scene import Scene
 
 
+def input_names(scene: Scene) -> dict[str, str]:
+    """What the copies of a scene's input files are called: dotted key -> name; no two alike."""
+    return {
+        key: f"input_{key.removesuffix('.file').replace('molecules.', '')}_{path.name}"
+        for key, path in scene.inputs.items()
+    }
+
+
 def write_scene(folder: Path, scene: Scene, system: System) -> None:
     """Write the resolved scene and copies of its input files."""
     data = scene.model_dump(exclude_none=True)
     if system.cutoff < inf:
         data["forces"]["cutoff_A"] = system.cutoff
-    for section in [data.get("structure", {}), *data["molecules"]]:
-        if "file" in section:
-            source = scene.path(section["file"])
-            section["file"] = f"input_{source.name}"
-            with whole_file(folder / section["file"]) as temporary:
-                shutil.copyfile(source, temporary)
+    for key, copied in input_names(scene).items():
+        with whole_file(folder / copied) as temporary:
+            shutil.copyfile(scene.inputs[key], temporary)
+        section = data["structure"] if key == "structure.file" else data["molecules"][int(key.split(".")[1])]
+        section["file"] = copied
     with whole_file(folder / SCENE_FILE) as temporary:
         temporary.write_text(tomli_w.dumps(data), encoding="utf-8")

@@ -1,19 +1,22 @@
 """Trajectories and topology files through MDAnalysis. The only room that imports it."""
 
+import ctypes
+import os
 import warnings
 from math import inf
 from pathlib import Path
 
 import MDAnalysis as mda
 import numpy as np
+from MDAnalysis.coordinates.memory import MemoryReader
 
 from rigidmd.build.system import System
 from rigidmd.forces.terms import State
 from rigidmd.output.folder import whole_file
 
 
-def universe(system: System, velocities: bool = False) -> mda.Universe:
-    """An MDAnalysis Universe of all sites, one residue a molecule; one frame, at the start."""
+def universe(system: System, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
+    """An MDAnalysis Universe of all sites, one residue a molecule; one frame with this state."""
     u = mda.Universe.empty(
         len(system.sites.molecule),
         n_residues=len(system.model.species),
@@ -28,7 +31,7 @@ def universe(system: System, velocities: bool = False) -> mda.Universe:
     u.add_TopologyAttr("masses", system.sites.mass)
     u.add_TopologyAttr("resnames", names[system.model.species])
     u.add_TopologyAttr("resids", np.arange(1, len(system.model.species) + 1))
-    set_frame(u, system, system.state, 0.0, 0, velocities, wrapped=True)
+    set_frame(u, system, state, 0.0, 0, velocities, wrapped)
     return u
 
 
@@ -49,12 +52,26 @@ def dimensions(system: System) -> list[float] | None:
 
 
 def in_memory(system: System, times: list[float], positions: list[np.ndarray]) -> mda.Universe:
-    """A Universe that holds frames (positions (s, 3) each) in memory; times (ps), evenly spaced."""
-    u = universe(system)
-    step = times[1] - times[0] if len(times) > 1 else 1.0
+    """A Universe that holds frames (positions (s, 3) each) in memory, each with its own time (ps)."""
+    u = universe(system, system.state)
     box = np.tile(dimensions(system), (len(times), 1)) if system.space.volume < inf else None
-    u.load_new(np.array(positions), order="fac", dimensions=box, dt=step)
+    u.trajectory = _TimedFrames(np.array(positions), times, order="fac", dimensions=box)
     return u
+
+
+class _TimedFrames(MemoryReader):
+    """Frames in memory that need not be evenly spaced, as those of MDAnalysis' own reader must."""
+
+    format = "RIGIDMD"
+
+    def __init__(self, positions: np.ndarray, times: list[float], **options):
+        self._times = times
+        super().__init__(positions, **options)
+
+    def _read_next_timestep(self, ts=None):
+        frame = super()._read_next_timestep(ts)
+        frame.time = self._times[frame.frame]
+        return frame
 
 
 def from_files(topology: Path, trajectory: Path) -> mda.Universe:
@@ -62,11 +79,11 @@ def from_files(topology: Path, trajectory: Path) -> mda.Universe:
     return mda.Universe(str(topology), str(trajectory))
 
 
-def write_topology(path: Path, system: System) -> None:
+def write_topology(path: Path, system: System, state: State, wrapped: bool) -> None:
     """Names, molecules and first positions: what viewers open beside a trajectory."""
     with whole_file(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a format cannot hold (occupancies, ...) is not ours to give
-        universe(system).atoms.write(str(temporary))
+        universe(system, state, wrapped=wrapped).atoms.write(str(temporary))
 
 
 class TrajectoryFile:
@@ -79,7 +96,7 @@ class TrajectoryFile:
         self._system = system
         self._velocities = velocities
         self._wrapped = wrapped
-        self._universe = universe(system, velocities)
+        self._universe = universe(system, system.state, velocities)
         options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -98,6 +115,15 @@ class TrajectoryFile:
             self._writer.write(self._universe.atoms)
             if self._format == ".pdb" and (box := dimensions(self._system)):
                 self._writer.CRYST1(box)  # MDAnalysis reads what stands between a model and the next as the model's own
+        self._flush()
+
+    def _flush(self) -> None:
+        """Bring the frame to the disk: a run that is killed leaves whole frames."""
+        for name in ("_xyz", "pdbfile"):
+            if (file := getattr(self._writer, name, None)) is not None:
+                file.flush()
+        if os.name == "posix":  # XTC and TRR go through C streams that their writers cannot flush: flush them all
+            ctypes.CDLL(None).fflush(None)
 
     def _extended_xyz(self, time: float) -> str:
         """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
