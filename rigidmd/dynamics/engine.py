@@ -7,7 +7,7 @@ import numpy as np
 from rigidmd.dynamics.advance import Model, advance, new_progress
 from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
-from rigidmd.forces.pairs import with_room
+from rigidmd.forces.pairs import forget_list, with_room
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, TALLY_SIZE, Load, NoForce, State, add_term
 
 
@@ -31,6 +31,8 @@ class Engine:
         self.model = model
         self.names = list(terms)
         self._terms = tuple(terms.values()) or (NoForce(),)
+        for term in self._terms:
+            forget_list(term)  # a list left by another engine has its pairs in another order, and sums other last bits
         n = len(model.species)
         turning = n if model.inertia.any() else 0
         self.load = Load(np.zeros((n, 3)), np.zeros((turning, 3)))

@@ -46,6 +46,12 @@ def with_room(term: NamedTuple) -> NamedTuple:
     return term
 
 
+def forget_list(term: NamedTuple) -> None:
+    """Have the term's neighbour list built anew at its next use, in place."""
+    if isinstance(term, PairForces):
+        term.pairs.counters[0] = 0
+
+
 def pair(law, i, j, r2):
     """(energy, force/r) of sites i and j of a law at squared distance r2 below cutoff²; force > 0 repels."""
     raise TypeError(f"{type(law).__name__} is no pair law, or this was called outside compiled code")
