@@ -19,6 +19,12 @@ MIXTURES = [
 ]
 
 
+def ended(name):
+    """Forces that end at 6 Å in this way, from 4.5 Å on where it has a start."""
+    start = {"switch_start_A": 4.5} if name in ("force_switch", "switch") else {}
+    return {"cutoff_A": 6.0, "truncation": name} | start
+
+
 def energies(engine, state):
     return {name: tally.energy for name, tally in engine.evaluate(state)[1].items()}
 
@@ -26,7 +32,7 @@ def energies(engine, state):
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize(("counts", "edge"), MIXTURES)
 def test_energies_are_those_of_the_oracle(counts, edge, ending):
-    forces = {"cutoff_A": 6.0, "truncation": ending, "switch_start_A": 4.5, "reaction_field_permittivity": 78.5}
+    forces = ended(ending) | {"reaction_field_permittivity": 78.5}
     for seed, mixing in enumerate(["lorentz-berthelot", "geometric"]):
         system, engine, state = built(counts, edge, seed, forces=forces | {"mixing": mixing})
         lj, coulomb = Oracle(system).energy(state.position, state.rotation)
@@ -59,7 +65,7 @@ def test_a_box_with_unequal_edges_and_many_cells():
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_forces_and_torques_are_the_slope_of_the_energy(ending):
-    forces = {"cutoff_A": 6.0, "truncation": ending, "switch_start_A": 4.5}
+    forces = ended(ending)
     _, engine, state = built({"tip4p2005": 6, "nitrogen": 4, "argon": 3}, 13.0, 1, forces=forces)
     load, _ = engine.evaluate(state)
 
