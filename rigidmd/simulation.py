@@ -341,7 +341,7 @@ class Simulation:
         write_state(self._folder / "final.npz", self.system, self.state)
         results.files.append(self._folder / "final.npz")
         if self.scene.output.figure and len(results.samples.rows) > 1:
-            draw_energy(self._folder / "energy.png", self.system, results.samples)
+            draw_energy(self._folder / "energy.png", self.system, results.samples, results.summary)
             results.files.append(self._folder / "energy.png")
         results.files.append(self._folder / "summary.json")
         results.summary["files"] = [str(path) for path in results.files]

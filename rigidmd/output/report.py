@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.build.system import System
-from rigidmd.measure.drift import slope
 from rigidmd.measure.samples import Samples
 from rigidmd.output.folder import whole_file
 from rigidmd.units import KJ_PER_MOL
@@ -89,7 +88,7 @@ def _signed(value: float, error: float) -> str:
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
-def draw_energy(path: Path, system: System, samples: Samples) -> None:
+def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> None:
     """energy.png: the drift of the last stage, large enough to be seen; energies and temperatures of the whole run."""
     from matplotlib.figure import Figure
 
@@ -101,12 +100,13 @@ def draw_energy(path: Path, system: System, samples: Samples) -> None:
     drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
     own = stage == stage[-1]
     drift.plot(time[own], samples["drift"][own] / scale, color=COOL, lw=0.9)
-    if own.sum() > 2:
-        line = slope(time[own], samples["drift"][own] / scale)
-        fitted = (samples["drift"][own] / scale).mean() + line.value * (time[own] - time[own].mean())
+    last = summary["stages"][-1]
+    if own.sum() > 2 and last["drift_kJ_mol_ns_per_molecule"] is not None:
+        gradient, error = last["drift_kJ_mol_ns_per_molecule"], last["drift_error_kJ_mol_ns_per_molecule"]
+        fitted = (samples["drift"][own] / scale).mean() + gradient / 1000 * (time[own] - time[own].mean())
         drift.plot(time[own], fitted, color=WARM, lw=1.4)
         drift.set_title(
-            f"{stages[stage[-1]].label}: drift {_signed(line.value * 1000, line.error * 1000)} kJ/mol/ns per molecule",
+            f"{last['name']}: drift {_signed(gradient, error)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
