@@ -19,7 +19,7 @@ from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
 from rigidmd.jit import kernel
 
 BLOCKS = 16  # enough for 16 threads; every block adds one array of site forces
-SITES_PER_BLOCK = 32  # fewer are not worth a thread
+SITES_PER_BLOCK = 32  # small systems get fewer blocks, the smallest one, and then no thread is started
 
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its cell a site is
 
