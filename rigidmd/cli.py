@@ -12,6 +12,7 @@ EXAMPLES = """examples:
   rigidmd run systems/water.toml            run it, into runs/water
   rigidmd run systems/water.toml --set stages.1.timestep_fs=4 -o runs/water4
   rigidmd energy systems/water.toml --unit kcal/mol
+  rigidmd run systems/heavy_top_3.toml      one body: a top, with figures of its motion
 """
 
 
@@ -63,7 +64,9 @@ def _parser() -> argparse.ArgumentParser:
         "rigidmd energy systems/water_dimer.toml --json",
     )
     _scene_arguments(energy)
-    energy.add_argument("--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], default="kJ/mol", help="unit of energy")
+    energy.add_argument(
+        "--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], help="unit of energy (kJ/mol; J for a body)"
+    )
     energy.add_argument("--json", action="store_true", help="print JSON")
 
     check = _command(
@@ -127,23 +130,12 @@ def _run(options: argparse.Namespace) -> int:
     from rigidmd.output.folder import check_folder
 
     check_folder(folder, options.force)  # before anything slow is imported
-    from rigidmd.output.report import summary_text
     from rigidmd.simulation import Simulation
 
     simulation = Simulation(scene, folder, options.force, say=_say)
-    system = simulation.system
-    print(
-        f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites, "
-        f"{system.freedom.total} degrees of freedom; {simulation.threads} threads"
-        + (
-            f" (the scene asks for {scene.threads}; this machine has no more)"
-            * ((scene.threads or 0) > simulation.threads)
-        )
-    )
-    for note in system.notes:
-        print(f"  {note}")
+    print(simulation.introduction())
     results = simulation.run(progress=True)
-    print(summary_text(results.summary))
+    print(simulation.conclusion(results))
     print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
     return INTERRUPTED if results.interrupted else 0
 
@@ -155,15 +147,18 @@ def _say(sentence: str) -> None:
 
 
 def _energy(options: argparse.Namespace) -> int:
-    from rigidmd.simulation import start_energy
+    from rigidmd.scene import BodyScene
+    from rigidmd.simulation import Simulation
     from rigidmd.units import ENERGY_UNITS
 
     scene = _read_scene(options)
-    found = start_energy(scene, ENERGY_UNITS[options.unit], options.unit)
+    if isinstance(scene, BodyScene):
+        return _body_energy(scene, options)
+    unit = options.unit or "kJ/mol"
+    found = Simulation(scene).start_energy(ENERGY_UNITS[unit], unit)
     if options.json:
         print(json.dumps(found, indent=2))
         return 0
-    unit = options.unit
     relieved = f", after {found['relief_steps']} steps of overlap relief" if found["relief_steps"] else ""
     print(f"{scene.name}: energies of the start, {found['molecules']} molecules{relieved}")
     for name, value in [*found["components"].items(), ("potential", found["potential"])]:
@@ -177,11 +172,29 @@ def _energy(options: argparse.Namespace) -> int:
     return 0
 
 
+def _body_energy(scene, options: argparse.Namespace) -> int:
+    from rigidmd.errors import SceneError
+    from rigidmd.simulation import Simulation
+
+    if options.unit is not None:
+        raise SceneError(scene.source, [f"--unit {options.unit} is for molecules; the energy of a body is in J"])
+    found = Simulation(scene).start_energy()
+    if options.json:
+        print(json.dumps(found, indent=2))
+        return 0
+    print(f"{scene.name}: energy of the start")
+    for name in ("kinetic", "potential", "energy"):
+        print(f"  {name:<22}{found[name]:>22.15g} J")
+    for key, name, unit in (("force_N", "force (lab)", "N"), ("torque_body_N_m", "torque (body)", "N m")):
+        if found[key] is not None:
+            print(f"  {name:<22}{' '.join(f'{x:>22.15g}' for x in found[key])} {unit}")
+    return 0
+
+
 def _check(options: argparse.Namespace) -> int:
     from rigidmd.build.describe import describe
-    from rigidmd.build.system import build
 
-    print(describe(build(_read_scene(options))))
+    print(describe(_read_scene(options)))
     return 0
 
 
@@ -202,9 +215,9 @@ def _models(options: argparse.Namespace) -> int:
 
 
 def _schema(options: argparse.Namespace) -> int:
-    from rigidmd.scene import Scene
+    from rigidmd.scene import schema
 
-    print(json.dumps(_strict(Scene.model_json_schema()), indent=2, allow_nan=False))
+    print(json.dumps(_strict(schema()), indent=2, allow_nan=False))
     return 0
 
 

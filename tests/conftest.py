@@ -10,10 +10,12 @@ from rigidmd.build.system import System, build
 from rigidmd.dynamics.engine import Engine
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.scene import Scene
+from rigidmd.scene import BodyScene, Scene
 
 ROOT = Path(__file__).parent.parent
 SYSTEMS = sorted((ROOT / "systems").glob("*.toml"))
+BODIES = [path for path in SYSTEMS if isinstance(Scene.read(path), BodyScene)]
+MOLECULES = [path for path in SYSTEMS if path not in BODIES]
 
 
 @pytest.fixture(scope="session")

@@ -116,8 +116,8 @@ def test_splitting_a_run_changes_no_bit(liquid):
     whole = run(engine, state, 0.002, 60)
     parts = state.copy()
     engine.forget()
-    for steps in (1, 19, 40):
-        engine.advance(parts, VERLET, 0.002, steps, NoThermostat())
+    for done, steps in ((0, 1), (1, 19), (20, 40)):
+        engine.advance(parts, VERLET, 0.002, steps, NoThermostat(), done)
     for a, b in zip(whole, parts, strict=True):
         assert a.tobytes() == b.tobytes()
 
@@ -199,7 +199,7 @@ def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
         return np.concatenate([a.ravel() for a in s])
 
     def unpack(y):
-        return State(*(part.reshape(a.shape) for part, a in zip(np.split(y, [6, 12, 30]), state, strict=True)))
+        return State(*(part.reshape(a.shape) for part, a in zip(np.split(y, [6, 12, 30, 36]), state, strict=True)))
 
     def slopes(_, y):
         s = unpack(y)
@@ -209,7 +209,7 @@ def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
         hat[:, 0, 1], hat[:, 0, 2], hat[:, 1, 2] = -w[:, 2], w[:, 1], -w[:, 0]
         hat -= np.swapaxes(hat, 1, 2).copy()
         turning = (np.cross(s.angular_momentum_body, w) + load.torque_body) * (inverse > 0)
-        return pack(State(s.velocity, load.force / mass, s.rotation @ hat, turning))
+        return pack(State(s.velocity, load.force / mass, s.rotation @ hat, turning, np.ones(1)))
 
     exact = unpack(solve_ivp(slopes, (0, 0.05), pack(state), method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1])
     moved = run(engine, state, 0.05 / 4000, 4000)

@@ -4,13 +4,47 @@ from math import inf
 
 import numpy as np
 
-from rigidmd.build.system import System
+from rigidmd.build.body import BodySystem, build_body
+from rigidmd.build.system import System, build
+from rigidmd.dynamics.odes import Solver
 from rigidmd.mechanics.rotor import NoRotor
-from rigidmd.scene import Stage
+from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene.molecules import Stage
 from rigidmd.units import FEMTOSECOND
 
 
-def describe(system: System) -> str:
+def describe(scene: Scene) -> str:
+    """What a scene would do, in words. Raises as building it does."""
+    return _body(build_body(scene)) if isinstance(scene, BodyScene) else _molecules(build(scene))
+
+
+def _body(system: BodySystem) -> str:
+    """Kind, inertia, terms, steps."""
+    scene, run = system.scene, system.scene.run
+    pinned = "" if system.flies else ", pinned"
+    moments = " ".join(f"{x:.9g}" for x in system.inertia)
+    about = "the centre of mass" if system.flies else "the pivot"
+    lines = [
+        f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of freedom"
+    ]
+    if system.turns:
+        lines.append(f"  principal moments about {about}: {moments} kg m²")
+    if not np.array_equal(system.axes, np.eye(3)):
+        lines.append(f"  principal axes (columns, body's axes): {np.array2string(system.axes, precision=6)}")
+    if system.centre.any():
+        lines.append(f"  centre of mass from the pivot: {' '.join(f'{x:g}' for x in system.centre)} m")
+    parts = [system.body.flight, system.body.rotor, system.body.frame, system.body.resistance]
+    lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
+    lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
+    lines.append("left out:")
+    lines += [f"  {reason}" for reason in system.left_out]
+    how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
+    lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
+    lines.append(f"a sample every {scene.interval:g} s")
+    return "\n".join(lines)
+
+
+def _molecules(system: System) -> str:
     """Species, degrees of freedom, terms, stages, memory."""
     scene, freedom = system.scene, system.freedom
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites"]

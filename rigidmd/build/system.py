@@ -20,7 +20,8 @@ from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
 from rigidmd.molecules import Molecule, Site, load_model, molecule, read_molecule
-from rigidmd.scene import Molecules, Scene
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.molecules import Molecules
 from rigidmd.units import COULOMB, GRAM_PER_CM3
 
 DEFAULT_CUTOFF = 9.0  # Å
@@ -48,7 +49,7 @@ class Sites(NamedTuple):
 class System:
     """What a scene becomes. `state` is the start; nothing else here changes during a run."""
 
-    scene: Scene
+    scene: MolecularScene
     species: list[Molecule]
     model: Model
     space: Space
@@ -74,6 +75,11 @@ class System:
         sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
         return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
 
+    @property
+    def residue_names(self) -> np.ndarray:
+        """What each molecule (n,) is called in topology files."""
+        return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
+
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
         centre = state.position
@@ -97,7 +103,7 @@ class System:
         return np.einsum("sij,sj->si", state.rotation[self.sites.molecule], self.sites.offset_body)
 
 
-def build(scene: Scene) -> System:
+def build(scene: MolecularScene) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
     species = _species(scene)
     arrangement = _arrange(scene, species)
@@ -111,6 +117,7 @@ def build(scene: Scene) -> System:
         np.zeros((n, 3)),
         np.ascontiguousarray(arrangement.rotation) if turning else np.zeros((0, 3, 3)),
         np.zeros((n if turning else 0, 3)),
+        np.zeros(1),
     )
     terms, constants, tail_pressure = _terms(scene, species, model, space, cutoff)
     system = System(
@@ -139,7 +146,7 @@ def build(scene: Scene) -> System:
     return system
 
 
-def _species(scene: Scene) -> list[Molecule]:
+def _species(scene: MolecularScene) -> list[Molecule]:
     found, faults = [], []
     for k, entry in enumerate(scene.molecules):
         try:
@@ -155,7 +162,7 @@ def _species(scene: Scene) -> list[Molecule]:
     return found
 
 
-def _one_species(scene: Scene, entry: Molecules) -> Molecule:
+def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     if entry.model is not None:
         found = load_model(entry.model)
     elif entry.file is not None and entry.file.endswith(".toml"):
@@ -167,7 +174,7 @@ def _one_species(scene: Scene, entry: Molecules) -> Molecule:
     return Molecule(**{**vars(found), **changed})
 
 
-def _sites_from_file(scene: Scene, entry: Molecules) -> tuple[Site, ...]:
+def _sites_from_file(scene: MolecularScene, entry: Molecules) -> tuple[Site, ...]:
     """Geometry from the file, everything else from the scene's sites, found by atom name or else by element."""
     path = scene.path(entry.file)
     faults = []
@@ -198,7 +205,7 @@ def _sites_from_file(scene: Scene, entry: Molecules) -> tuple[Site, ...]:
     return tuple(sites)
 
 
-def _arrange(scene: Scene, species: list[Molecule]) -> Arrangement:
+def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     if scene.structure is not None:
         path = scene.path(scene.structure.file)
         found = read_structure(path, species, scene.box.edges, scene.box.periodic, scene.structure.tolerance)
@@ -229,7 +236,7 @@ def _arrange(scene: Scene, species: list[Molecule]) -> Arrangement:
     )
 
 
-def _cutoff(scene: Scene, space: Space, species: list[Molecule]) -> float:
+def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> float:
     forces = scene.forces
     cutoff = forces.cutoff_A or (DEFAULT_CUTOFF if space.volume < inf else inf)
     faults = []
@@ -289,7 +296,7 @@ def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.nda
     return BodySites(first, member, np.ascontiguousarray(offset))
 
 
-def _terms(scene: Scene, species: list[Molecule], model: Model, space: Space, cutoff: float):
+def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float):
     """Terms by name, constant energies by name, tail pressure."""
     forces = scene.forces
     index = model.species
@@ -321,7 +328,7 @@ def _terms(scene: Scene, species: list[Molecule], model: Model, space: Space, cu
     return terms, constants, tail_pressure
 
 
-def _left_out(scene: Scene, terms: dict, model: Model, space: Space) -> list[str]:
+def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
     """What is not compiled, and why."""
     out = []
     if "lennard_jones" not in terms:

@@ -7,13 +7,13 @@ from numba import prange
 
 from rigidmd.dynamics.thermostats import apply
 from rigidmd.forces.sites import SERIAL
-from rigidmd.forces.terms import OK, load_bodies
-from rigidmd.jit import kernel
+from rigidmd.forces.terms import OK, account, load_bodies
+from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.rotor import NoRotor, SplitRotor, turn
 
 
 class Model(NamedTuple):
-    """What never changes during a run."""
+    """What never changes during a run of molecules."""
 
     species: np.ndarray  # (n,) species of each molecule
     mass: np.ndarray  # (species,) u
@@ -25,59 +25,100 @@ class Model(NamedTuple):
 class Progress(NamedTuple):
     """How far `advance` has come, so that it can stop for more memory and go on at the same place."""
 
-    cursor: np.ndarray  # (3,) steps done; kicks done in this step; whether `load` is that of the present positions
+    cursor: np.ndarray  # (3,) steps done; stages done in this step; whether `load` is that of the present positions
 
 
-def new_progress() -> Progress:
-    """Nothing done, load unknown."""
-    return Progress(np.zeros(3, np.int64))
+def new_progress(steps: int, fresh: bool) -> Progress:
+    """At the beginning of a step; steps taken since the origin of time, whether the load is known."""
+    return Progress(np.array([steps, 0, fresh], np.int64))
 
 
 @kernel
-def advance(model, state, load, terms, thermostat, kicks, drifts, dt, steps, progress):
-    """Take `steps` steps of dt (ps) of the scheme with these kicks and drifts, counted from progress.cursor[0] = 0.
+def advance(model, state, load, terms, thermostat, scheme, dt, origin, steps, progress):
+    """Step until `steps` steps of dt have been taken since time `origin`, counted in progress.cursor[0].
+
+    scheme : kicks, drifts and the moments (fractions of dt) at which the kicks act.
 
     The scheme is walked as kick, drift, kick, ..., kick; forces are evaluated before a kick where positions have
     changed since, so the last evaluation of a step serves the next one. A status code: when it is not OK, state and
     progress are such that calling again continues without a trace.
     """
+    kicks, drifts, moments = scheme
     cursor = progress.cursor
     while cursor[0] < steps:
-        while cursor[1] < len(kicks):
+        if cursor[1] == 0:
+            lose(model, state, 0.5 * dt)
+            cursor[1] = 1
+        while cursor[1] <= len(kicks):
+            k = cursor[1] - 1
             if cursor[2] == 0:
                 status = load_bodies(terms, state, load)
                 if status != OK:
                     return status
                 cursor[2] = 1
-            kick(model, state, load, kicks[cursor[1]] * dt)
-            if cursor[1] < len(drifts):
-                drift(model, state, drifts[cursor[1]] * dt)
+            account(terms, model, state, load, kicks[k] * dt)
+            kick(model, state, load, kicks[k] * dt)
+            if k < len(drifts):
+                drift(model, state, drifts[k] * dt)
+                state.time[0] = origin + (cursor[0] + moments[k + 1]) * dt
                 cursor[2] = 0
             cursor[1] += 1
+        lose(model, state, 0.5 * dt)
         apply(thermostat, model, state, dt)
         cursor[1] = 0
         cursor[0] += 1
     return OK
 
 
-@kernel
 def kick(model, state, load, h):
-    """Exact flow of the potential: V += h F/m, L += h n_body."""
-    if len(state.position) <= SERIAL:
-        for m in range(len(state.position)):
-            _kick_molecule(model.species[m], model.mass, model.inverse_inertia, state, load, m, h)
-    else:
-        _kick_threaded(model.species, model.mass, model.inverse_inertia, state, load, h)
+    """Exact flow of the potential, in place: V += h F/m, L += h n_body."""
+    raise TypeError("compiled code only")
 
 
-@kernel
 def drift(model, state, h):
-    """Flow of the kinetic energy: free flight, exact, and the rotor."""
-    if len(state.position) <= SERIAL:
-        for m in range(len(state.position)):
-            _drift_molecule(model.rotor, model.species[m], state, m, h)
-    else:
-        _drift_threaded(model.rotor, model.species, state, h)
+    """Flow of the kinetic energy, in place: free flight and free rotation."""
+    raise TypeError("compiled code only")
+
+
+def lose(model, state, h):
+    """What resistance takes, in place."""
+    raise TypeError("compiled code only")
+
+
+@implements(kick)
+def _kick_molecules(model, state, load, h):
+    if not is_a(model, Model):
+        return None
+
+    def kick_molecules(model, state, load, h):
+        if len(state.position) <= SERIAL:
+            for m in range(len(state.position)):
+                _kick_molecule(model.species[m], model.mass, model.inverse_inertia, state, load, m, h)
+        else:
+            _kick_threaded(model.species, model.mass, model.inverse_inertia, state, load, h)
+
+    return kick_molecules
+
+
+@implements(drift)
+def _drift_molecules(model, state, h):
+    if not is_a(model, Model):
+        return None
+
+    def drift_molecules(model, state, h):
+        if len(state.position) <= SERIAL:
+            for m in range(len(state.position)):
+                _drift_molecule(model.rotor, model.species[m], state, m, h)
+        else:
+            _drift_threaded(model.rotor, model.species, state, h)
+
+    return drift_molecules
+
+
+@implements(lose)
+def _lose_nothing(model, state, h):
+    if is_a(model, Model):
+        return lambda model, state, h: None
 
 
 @kernel(parallel=True)

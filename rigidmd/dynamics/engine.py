@@ -1,14 +1,17 @@
 """The Python side of the compiled code: it gives kernels room when they ask for it and tells apart what they report."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.dynamics.advance import Model, advance, new_progress
+from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
+from rigidmd.forces.fields import answer
 from rigidmd.forces.pairs import forget_list, with_room
-from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, TALLY_SIZE, Load, NoForce, State, add_term
+from rigidmd.forces.terms import ASK, LIST_FULL, NOT_FINITE, TALLY_SIZE, Load, NoForce, State, add_term, no_load
 
 
 class Tally(NamedTuple):
@@ -25,17 +28,27 @@ class Engine:
     ----------
     model : what never changes
     terms : name -> term, in the order in which forces are added
+    applied : functions of (time, state) that terms of type `Told` stand for: name -> function
     """
 
-    def __init__(self, model: Model, terms: dict[str, NamedTuple]):
+    def __init__(
+        self,
+        model: Model | Body,
+        terms: dict[str, NamedTuple],
+        applied: dict[str, Callable[[float, State], tuple]] | None = None,
+    ):
         self.model = model
         self.names = list(terms)
         self._terms = tuple(terms.values()) or (NoForce(),)
         for term in self._terms:
             forget_list(term)  # a list left by another engine has its pairs in another order, and sums other last bits
-        n = len(model.species)
-        turning = n if model.inertia.any() else 0
-        self.load = Load(np.zeros((n, 3)), np.zeros((turning, 3)))
+        self._applied = applied or {}
+        # Only a body keeps accounts of work: drives, resistance, a driven rotor. They begin with the engine.
+        parts = (*self._terms, *(getattr(model, name, None) for name in ("resistance", "rotor")))
+        self._accounts = [part.work for part in parts if isinstance(getattr(part, "work", None), np.ndarray)]
+        for account in self._accounts:
+            account[:] = 0.0
+        self.load: Load | None = None
         self._stale = True
 
     @property
@@ -47,20 +60,36 @@ class Engine:
         """Say that positions were changed from outside since the last step."""
         self._stale = True
 
-    def advance(self, state: State, scheme: Scheme, dt: float, steps: int, thermostat: NamedTuple) -> None:
-        """Move the state by `steps` steps of dt (ps), in place. Raises SimulationError."""
-        progress = new_progress()
-        progress.cursor[2] = 0 if self._stale else 1
-        kicks, drifts = np.array(scheme.kicks), np.array(scheme.drifts)
+    def advance(
+        self, state: State, scheme: Scheme, dt: float, steps: int, thermostat: NamedTuple, done: int = 0
+    ) -> None:
+        """Move the state by `steps` steps of dt, in place. Raises SimulationError.
+
+        done : steps taken since an origin of time, `done` times dt ago; a run in parts keeps the very times of a whole.
+        """
+        if self.load is None:
+            self.load = no_load(state)
+        progress = new_progress(done, not self._stale)
+        origin = float(state.time[0]) if done == 0 else self._origin
+        self._origin = origin
+        rows = (
+            np.array(scheme.kicks),
+            np.array(scheme.drifts),
+            np.array([*np.cumsum((0.0, *scheme.drifts))[:-1], 1.0]),
+        )
         while status := advance(
-            self.model, state, self.load, self._terms, thermostat, kicks, drifts, dt, steps, progress
+            self.model, state, self.load, self._terms, thermostat, rows, dt, origin, done + steps, progress
         ):
             self._answer(status, state)
         self._stale = False
 
+    def work(self) -> float:
+        """Work done on a body so far by all that drives and brakes it: its energy less this is conserved."""
+        return float(sum(account[0] for account in self._accounts))
+
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
-        load = Load(np.zeros_like(self.load.force), np.zeros_like(self.load.torque_body))
+        load = no_load(state)
         tallies = {}
         for k, name in enumerate(self.names):
             tally = np.zeros(TALLY_SIZE)
@@ -74,13 +103,17 @@ class Engine:
             self._terms = tuple(with_room(term) for term in self._terms)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
+        elif status == ASK:
+            for name, function in self._applied.items():
+                answer(self.terms[name], function, state)
 
 
 class NotFiniteError(SimulationError):
     """Positions or momenta that are no numbers any more."""
 
     def __init__(self, state: State):
-        rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in state if len(array)]
+        moving = [array for array in state[:-1] if len(array)]
+        rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in moving]
         size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
         self.molecule = int(size.argmax())
         super().__init__(f"molecule {self.molecule + 1} is nowhere: its position or momentum is no finite number")

@@ -4,6 +4,7 @@ A row says by which fractions of the time step the two flows alternate, kick fir
 time-reversible, so any palindrome of them is too; its coefficients decide its order.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 
@@ -17,6 +18,18 @@ class Scheme(NamedTuple):
     source: str
 
 
+def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Scheme:
+    """Velocity Verlet steps of these lengths one after the other; neighbouring kicks are one."""
+    kicks = (steps[0] / 2, *((a + b) / 2 for a, b in pairwise(steps)), steps[-1] / 2)
+    return Scheme(name, kicks, steps, order, source)
+
+
+def palindrome(*half: float) -> tuple[float, ...]:
+    """Step lengths that are mirrored about the middle one, which makes their sum 1."""
+    return (*half, 1 - 2 * sum(half), *reversed(half))
+
+
+# Compositions of a step that is itself symmetric keep their order with any rotor and any force.
 SCHEMES = {
     scheme.name: scheme
     for scheme in (
@@ -26,6 +39,35 @@ SCHEMES = {
             drifts=(1.0,),
             order=2,
             source="Swope et al. 1982, J. Chem. Phys. 76, 637; for rigid bodies Dullweber et al. 1997",
+        ),
+        composed(
+            "suzuki_4",
+            palindrome(0.4144907717943757, 0.4144907717943757),
+            order=4,
+            source="Suzuki 1990, Phys. Lett. A 146, 319",
+        ),
+        composed(
+            "kahan_li_6",
+            palindrome(
+                0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230
+            ),
+            order=6,
+            source="Kahan & Li 1997, Math. Comp. 66, 1089, s9odr6a; Hairer, Lubich & Wanner, eq. V.3.11",
+        ),
+        composed(
+            "kahan_li_8",
+            palindrome(
+                0.13020248308889008088,
+                0.56116298177510838456,
+                -0.38947496264484728641,
+                0.15884190655515560090,
+                -0.39590389413323757734,
+                0.18453964097831570709,
+                0.25837438768632204729,
+                0.29501172360931029887,
+            ),
+            order=8,
+            source="Kahan & Li 1997, Math. Comp. 66, 1089, s17odr8a; Hairer, Lubich & Wanner, eq. V.3.13",
         ),
     )
 }

@@ -14,20 +14,23 @@ from rigidmd.jit import implements, is_a, kernel
 
 # What a kernel reports; the worst one wins, Python acts on it (dynamics.engine).
 OK = 0
-LIST_FULL = 1  # the neighbour list needs more room: enlarge it and call again
-NOT_FINITE = 2  # a position is not a number, or so large that it says nothing any more
+ASK = 1  # a Python function has to be asked for its force: ask it and call again
+LIST_FULL = 2  # the neighbour list needs more room: enlarge it and call again
+NOT_FINITE = 3  # a position is not a number, or so large that it says nothing any more
 
 
 class State(NamedTuple):
-    """Everything that changes during a run, and nothing else. float64; n molecules.
+    """Everything that changes during a run, and nothing else. float64; n bodies; molecules in Å, ps, u, bodies in SI.
 
-    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3): what does not turn is not stored.
+    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3): what does not turn is not stored. Nor is
+    the position and velocity of a body that is pinned at a point: (0, 3).
     """
 
-    position: np.ndarray  # (n, 3) centre of mass, lab frame, Å, never wrapped
-    velocity: np.ndarray  # (n, 3) lab frame, Å/ps
+    position: np.ndarray  # (n, 3) centre of mass, lab frame, never wrapped
+    velocity: np.ndarray  # (n, 3) lab frame
     rotation: np.ndarray  # (n, 3, 3) Q, body to lab
-    angular_momentum_body: np.ndarray  # (n, 3) u Å²/ps
+    angular_momentum_body: np.ndarray  # (n, 3)
+    time: np.ndarray  # (1,)
 
     def copy(self) -> "State":
         """A state that shares nothing with this one."""
@@ -37,8 +40,13 @@ class State(NamedTuple):
 class Load(NamedTuple):
     """What acts on the bodies at the present positions."""
 
-    force: np.ndarray  # (n, 3) lab frame, u Å/ps²
-    torque_body: np.ndarray  # (n, 3) body frame, u Å²/ps²; (0, 3) for points
+    force: np.ndarray  # (n, 3) lab frame; (0, 3) for a pinned body
+    torque_body: np.ndarray  # (n, 3) body frame; (0, 3) for points
+
+
+def no_load(state: State) -> Load:
+    """Zero forces and torques for the bodies of a state."""
+    return Load(np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body))
 
 
 # A tally is a float64 array (10,): energy, then the molecular virial tensor sum F (x) R in rows (u Å²/ps²).
@@ -49,6 +57,28 @@ TALLY_SIZE = 10
 def add_forces(term, state, load, tally):
     """Add a term's forces and torques to `load`, its energy and virial to `tally` unless None; a status code."""
     raise TypeError(f"{type(term).__name__} is no term, or this was called outside compiled code")
+
+
+def spend(term, model, state, load, h):
+    """Add to a driving term's `work` what it does in a kick of `load` over h that is about to come."""
+    raise TypeError("compiled code only")
+
+
+@implements(spend)
+def _spend_nothing(term, model, state, load, h):
+    if "work" not in term.instance_class._fields:  # what has an energy, or none, keeps no account
+        return lambda term, model, state, load, h: None
+
+
+def power(term, state, velocity, omega):
+    """Power of a driving term at a body's velocity and angular velocity (lab and body frame, tuples); else 0."""
+    raise TypeError("compiled code only")
+
+
+@implements(power)
+def _no_power(term, state, velocity, omega):
+    if "work" not in term.instance_class._fields:
+        return lambda term, state, velocity, omega: 0.0
 
 
 class NoForce(NamedTuple):
@@ -78,3 +108,19 @@ def load_bodies(terms, state, load):
     for term in literal_unroll(terms):
         status = max(status, add_forces(term, state, load, None))
     return status
+
+
+@kernel
+def account(terms, model, state, load, h):
+    """`spend` of all terms."""
+    for term in literal_unroll(terms):
+        spend(term, model, state, load, h)
+
+
+@kernel
+def total_power(terms, state, velocity, omega):
+    """`power` of all terms."""
+    total = 0.0
+    for term in literal_unroll(terms):
+        total += power(term, state, velocity, omega)
+    return total

@@ -33,6 +33,29 @@ def inertia_tensor(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
     )
 
 
+def shifted(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
+    """Inertia tensor (3, 3) about a point from that about the centre of mass, `offset` (3,) away (parallel axes).
+
+    A negative mass goes the other way.
+    """
+    return tensor + inertia_tensor(np.array([mass]), np.array([offset], dtype=float))
+
+
+def impossible(tensor: np.ndarray) -> str:
+    """Why no distribution of mass has this inertia tensor (3, 3); empty if one has.
+
+    Moments are not negative and none is more than the sum of the others. The two sides may differ by rounding, 1e-12
+    of the largest moment.
+    """
+    low, middle, high = np.linalg.eigvalsh(tensor)
+    slack = 1e-12 * max(abs(low), abs(high))
+    if low < -slack:
+        return f"a principal moment is {low:.6g}, must not be negative"
+    if low + middle < high - slack:
+        return f"principal moments {low:.6g} and {middle:.6g} together are less than {high:.6g} (triangle inequality)"
+    return ""
+
+
 def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | None = None) -> PrincipalFrame:
     """Principal frame of masses (s,) at positions (s, 3).
 
@@ -57,6 +80,9 @@ def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | Non
         moments = np.array([0.0, moments[2], moments[2]])
     elif kind == "spherical":
         moments = np.full(3, moments.mean())
+    elif kind == "symmetric":  # equal to the last bit, which the rotor turns exactly
+        pair = [0, 1] if moments[1] - moments[0] < moments[2] - moments[1] else [1, 2]
+        moments[pair] = moments[pair].mean()
     return PrincipalFrame(mass, centre, axes, moments, kind)
 
 

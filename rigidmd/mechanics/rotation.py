@@ -1,4 +1,8 @@
-"""Rotation matrices Q (body to lab, x_lab = Q x_body), stacks of them included. Plain NumPy; nothing here is hot."""
+"""Rotation matrices Q (body to lab, x_lab = Q x_body), stacks of them included. Plain NumPy; nothing here is hot.
+
+Also what other people write instead of Q: quaternions (w, x, y, z), Euler angles (phi, theta, psi) in the sequence
+3-1-3, yaw, pitch and roll in the sequence 3-2-1, attitude matrices. Angles are in rad.
+"""
 
 import numpy as np
 
@@ -20,11 +24,144 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def to_quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z, the first component that is not 0 positive.
+
+    Q determines all products of two components; the row of the largest component has no cancellation at any angle
+    (Shepperd 1978, J. Guid. Control 1, 223).
+    """
+    q = np.asarray(rotation, dtype=float)
+    xx, yy, zz = q[..., 0, 0], q[..., 1, 1], q[..., 2, 2]
+    wx, xw = q[..., 2, 1] - q[..., 1, 2], q[..., 2, 1] + q[..., 1, 2]
+    wy, yw = q[..., 0, 2] - q[..., 2, 0], q[..., 0, 2] + q[..., 2, 0]
+    wz, zw = q[..., 1, 0] - q[..., 0, 1], q[..., 1, 0] + q[..., 0, 1]
+    products = _matrix(
+        [
+            [1 + xx + yy + zz, wx, wy, wz],
+            [wx, 1 + xx - yy - zz, zw, yw],
+            [wy, zw, 1 - xx + yy - zz, xw],
+            [wz, yw, xw, 1 - xx - yy + zz],
+        ]
+    )
+    largest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
+    row = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    first = np.take_along_axis(row, (row != 0).argmax(axis=-1)[..., None], axis=-1)
+    return np.sign(first) * row / np.linalg.norm(row, axis=-1, keepdims=True) + 0.0  # + 0.0: no -0 among the zeros
+
+
 def from_vector(vector: np.ndarray) -> np.ndarray:
     """Rotations (..., 3, 3) by the angle |vector| (rad) about the directions of vectors (..., 3)."""
     vector = np.asarray(vector, dtype=float)
     half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
     return from_quaternion(np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1))
+
+
+def from_euler_angles(euler_angles: np.ndarray) -> np.ndarray:
+    """Q = Rz(phi) Rx(theta) Rz(psi) (..., 3, 3) of 3-1-3 Euler angles (..., 3) = (phi, theta, psi)."""
+    (cf, ct, cp), (sf, st, sp) = _cosines_and_sines(euler_angles)
+    return _matrix(
+        [
+            [cf * cp - sf * ct * sp, -cf * sp - sf * ct * cp, sf * st],
+            [sf * cp + cf * ct * sp, -sf * sp + cf * ct * cp, -cf * st],
+            [st * sp, st * cp, ct],
+        ]
+    )
+
+
+def to_euler_angles(rotation: np.ndarray) -> np.ndarray:
+    """3-1-3 Euler angles (..., 3) of Q (..., 3, 3): phi and psi in (-pi, pi], theta in [0, pi].
+
+    Where sin(theta) is 0 only phi + psi (theta = 0) or phi - psi (theta = pi) is defined: there psi = 0. Close to it
+    phi is what rounding left of it, and psi is read off Rz(-phi) Q, so that the three together are still Q to rounding.
+    """
+    q = np.asarray(rotation, dtype=float)
+    sin_theta = np.hypot(q[..., 0, 2], q[..., 1, 2])
+    locked = sin_theta == 0
+    phi = np.where(locked, _angle(q[..., 1, 0], q[..., 0, 0]), _angle(q[..., 0, 2], -q[..., 1, 2]))
+    row = np.cos(phi)[..., None] * q[..., 0, :] + np.sin(phi)[..., None] * q[..., 1, :]  # (cos psi, -sin psi, 0)
+    psi = np.where(locked, 0.0, _angle(-row[..., 1], row[..., 0]))
+    return np.stack([phi, np.arctan2(sin_theta, q[..., 2, 2]), psi], axis=-1) + 0.0  # + 0.0: no -0
+
+
+def from_yaw_pitch_roll(yaw_pitch_roll: np.ndarray) -> np.ndarray:
+    """Q = Rz(yaw) Ry(pitch) Rx(roll) (..., 3, 3) of the 3-2-1 angles (..., 3) = (yaw, pitch, roll)."""
+    (cy, cp, cr), (sy, sp, sr) = _cosines_and_sines(yaw_pitch_roll)
+    return _matrix(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def to_yaw_pitch_roll(rotation: np.ndarray) -> np.ndarray:
+    """3-2-1 angles (..., 3) of Q (..., 3, 3): yaw and roll in (-pi, pi], pitch in [-pi/2, pi/2].
+
+    Where cos(pitch) is 0 only yaw - roll (pitch = pi/2) or yaw + roll (pitch = -pi/2) is defined: there roll = 0.
+    Close to it yaw is what rounding left of it, and roll is read off Rz(-yaw) Q.
+    """
+    q = np.asarray(rotation, dtype=float)
+    cos_pitch = np.hypot(q[..., 0, 0], q[..., 1, 0])
+    locked = cos_pitch == 0
+    yaw = np.where(locked, _angle(-q[..., 0, 1], q[..., 1, 1]), _angle(q[..., 1, 0], q[..., 0, 0]))
+    row = np.cos(yaw)[..., None] * q[..., 1, :] - np.sin(yaw)[..., None] * q[..., 0, :]  # (0, cos roll, -sin roll)
+    roll = np.where(locked, 0.0, _angle(-row[..., 2], row[..., 1]))
+    return np.stack([yaw, np.arctan2(-q[..., 2, 0], cos_pitch), roll], axis=-1) + 0.0  # + 0.0: no -0
+
+
+def hat(vector: np.ndarray) -> np.ndarray:
+    """Skew matrices (..., 3, 3) of vectors (..., 3): hat(a) b = a x b, so that dQ/dt = Q hat(omega_body)."""
+    x, y, z = np.moveaxis(np.asarray(vector, dtype=float), -1, 0)
+    zero = np.zeros_like(x)
+    return _matrix([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+
+
+def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """omega (..., 3) in the body frame of 3-1-3 angles (..., 3) and their time derivatives (..., 3), rad per time."""
+    (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
+    phi_dot, theta_dot, psi_dot = np.moveaxis(np.asarray(rates, dtype=float), -1, 0)
+    return np.stack(
+        np.broadcast_arrays(
+            phi_dot * st * sp + theta_dot * cp,
+            phi_dot * st * cp - theta_dot * sp,
+            phi_dot * ct + psi_dot,
+        ),
+        axis=-1,
+    )
+
+
+def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> np.ndarray:
+    """Time derivatives (..., 3) of the 3-1-3 angles (..., 3) of a body turning with omega (..., 3), body frame.
+
+    ValueError where sin(theta) is 0 to rounding: there phi and psi turn about one axis and have no rates of their own.
+    """
+    (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
+    if np.any(np.abs(st) <= 4 * np.finfo(float).eps):
+        raise ValueError(
+            "the rates of the 3-1-3 Euler angles are singular at theta = 0 and theta = pi (sin theta = 0), "
+            "where phi and psi turn about one and the same axis; use the angular velocity itself there"
+        )
+    w1, w2, w3 = np.moveaxis(np.asarray(angular_velocity_body, dtype=float), -1, 0)
+    phi_dot = (w1 * sp + w2 * cp) / st
+    return np.stack(np.broadcast_arrays(phi_dot, w1 * cp - w2 * sp, w3 - phi_dot * ct), axis=-1)
+
+
+def attitude_matrix(rotation: np.ndarray) -> np.ndarray:
+    """T = Q^T (..., 3, 3) of the satellite texts: lab to body, dT/dt = -hat(omega_body) T."""
+    return np.swapaxes(np.asarray(rotation, dtype=float), -1, -2).copy()
+
+
+def from_attitude_matrix(attitude: np.ndarray) -> np.ndarray:
+    """Q = T^T (..., 3, 3) of attitude matrices T (lab to body)."""
+    return np.swapaxes(np.asarray(attitude, dtype=float), -1, -2).copy()
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The proper rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm, by their SVD."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
 
 
 def orthogonality_error(rotation: np.ndarray) -> float:
@@ -49,3 +186,20 @@ def align(points_body: np.ndarray, points_lab: np.ndarray, weights: np.ndarray) 
     u, _, vt = np.linalg.svd(covariance)
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
     return u @ vt
+
+
+def _matrix(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Matrices (..., m, n) of m rows of n entries (...)."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _cosines_and_sines(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cosines and sines, each (3, ...), of angles (..., 3)."""
+    angles = np.moveaxis(np.asarray(angles, dtype=float), -1, 0)
+    return np.cos(angles), np.sin(angles)
+
+
+def _angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Angle in (-pi, pi]; arctan2 alone gives -pi for a sine of -0 or one too small to show beside pi."""
+    angle = np.arctan2(sine, cosine)
+    return np.where(angle <= -np.pi, np.pi, angle)

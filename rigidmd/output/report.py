@@ -44,6 +44,26 @@ def summary_text(summary: dict) -> str:
     return "\n".join(lines)
 
 
+def body_summary_text(summary: dict) -> str:
+    """The summary of a single body's run as a person reads it."""
+    speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
+    rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
+    if summary["work_J"]:
+        rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
+    if summary["theta_range_deg"]:
+        low, high = summary["theta_range_deg"]
+        rows.append(("theta", f"from {low:.6f}° to {high:.6f}°"))
+    for name, error in summary["largest_relative_error"].items():
+        rows.append((f"{name} error", f"at most {error:.1e}, relative"))
+    if summary["largest_orthogonality_error"] is not None:
+        rows.append(("orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"))
+    lines = [f"\n{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"]
+    lines += [f"  {name:<16}{value}" for name, value in rows]
+    if summary["interrupted"]:
+        lines += ["", "  interrupted: the figures are those so far"]
+    return "\n".join(lines)
+
+
 def _stage_title(stage: dict) -> str:
     title = f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs, {stage['duration_ps']:g} ps"
     if stage["steps_per_s"]:

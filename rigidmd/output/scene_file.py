@@ -8,7 +8,7 @@ import tomli_w
 
 from rigidmd.build.system import System
 from rigidmd.output.folder import SCENE_FILE, whole_file
-from rigidmd.scene import Scene
+from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 
 def input_names(scene: Scene) -> dict[str, str]:
@@ -19,7 +19,7 @@ def input_names(scene: Scene) -> dict[str, str]:
     }
 
 
-def write_scene(folder: Path, scene: Scene, system: System) -> None:
+def write_scene(folder: Path, scene: MolecularScene, system: System) -> None:
     """Write the resolved scene and copies of its input files."""
     data = scene.model_dump(exclude_none=True)
     if system.cutoff < inf:
@@ -29,5 +29,14 @@ def write_scene(folder: Path, scene: Scene, system: System) -> None:
             shutil.copyfile(scene.inputs[key], temporary)
         section = data["structure"] if key == "structure.file" else data["molecules"][int(key.split(".")[1])]
         section["file"] = copied
+    _write(folder, data)
+
+
+def write_body_scene(folder: Path, scene: BodyScene) -> None:
+    """Write the resolved scene of a body."""
+    _write(folder, scene.model_dump(exclude_none=True))
+
+
+def _write(folder: Path, data: dict) -> None:
     with whole_file(folder / SCENE_FILE) as temporary:
         temporary.write_text(tomli_w.dumps(data), encoding="utf-8")

@@ -10,32 +10,35 @@ import MDAnalysis as mda
 import numpy as np
 from MDAnalysis.coordinates.memory import MemoryReader
 
+from rigidmd.build.body import BodySystem
 from rigidmd.build.system import System
 from rigidmd.forces.terms import State
 from rigidmd.output.folder import whole_file
 
 
-def universe(system: System, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
+def universe(system: System | BodySystem, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
     """An MDAnalysis Universe of all sites, one residue a molecule; one frame with this state."""
+    names = system.residue_names
     u = mda.Universe.empty(
         len(system.sites.molecule),
-        n_residues=len(system.model.species),
+        n_residues=len(names),
         atom_resindex=system.sites.molecule,
         trajectory=True,
         velocities=velocities,
     )
-    names = np.array([m.residue_names[0] for m in system.species], dtype=object)
     u.add_TopologyAttr("names", system.sites.name)
     u.add_TopologyAttr("types", system.sites.element)
     u.add_TopologyAttr("elements", system.sites.element)
     u.add_TopologyAttr("masses", system.sites.mass)
-    u.add_TopologyAttr("resnames", names[system.model.species])
-    u.add_TopologyAttr("resids", np.arange(1, len(system.model.species) + 1))
+    u.add_TopologyAttr("resnames", names)
+    u.add_TopologyAttr("resids", np.arange(1, len(names) + 1))
     set_frame(u, system, state, 0.0, 0, velocities, wrapped)
     return u
 
 
-def set_frame(u: mda.Universe, system: System, state: State, time: float, step: int, velocities: bool, wrapped: bool):
+def set_frame(
+    u: mda.Universe, system: System | BodySystem, state: State, time: float, step: int, velocities: bool, wrapped: bool
+):
     """Put a state into the universe's present frame."""
     frame = u.trajectory.ts
     frame.positions = system.site_positions(state, wrapped)
@@ -46,12 +49,12 @@ def set_frame(u: mda.Universe, system: System, state: State, time: float, step: 
     frame.data["step"] = step
 
 
-def dimensions(system: System) -> list[float] | None:
+def dimensions(system: System | BodySystem) -> list[float] | None:
     """Box as MDAnalysis wants it; None without one."""
     return [*system.space, 90.0, 90.0, 90.0] if system.space.volume < inf else None
 
 
-def in_memory(system: System, times: list[float], positions: list[np.ndarray]) -> mda.Universe:
+def in_memory(system: System | BodySystem, times: list[float], positions: list[np.ndarray]) -> mda.Universe:
     """A Universe that holds frames (positions (s, 3) each) in memory, each with its own time (ps)."""
     u = universe(system, system.state)
     box = np.tile(dimensions(system), (len(times), 1)) if system.space.volume < inf else None
@@ -79,7 +82,7 @@ def from_files(topology: Path, trajectory: Path) -> mda.Universe:
     return mda.Universe(str(topology), str(trajectory))
 
 
-def write_topology(path: Path, system: System, state: State, wrapped: bool) -> None:
+def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
     """Names, molecules and first positions: what viewers open beside a trajectory."""
     with whole_file(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a format cannot hold (occupancies, ...) is not ours to give
@@ -92,7 +95,7 @@ class TrajectoryFile:
     interval: time between frames (ps); only .dcd needs it, which stores it once for all frames.
     """
 
-    def __init__(self, path: Path, system: System, interval: float, velocities: bool, wrapped: bool):
+    def __init__(self, path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool):
         self._system = system
         self._velocities = velocities
         self._wrapped = wrapped

@@ -1,18 +1,16 @@
-"""The scene: one frozen, validated value from which everything a run does follows."""
+"""The scene of molecules: species, box, forces, stages."""
 
-import os
 import re
-import tomllib
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, Strict, ValidationError, field_validator, model_validator
+from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.errors import SceneError
 from rigidmd.molecules import Site, SiteName, available_models
-from rigidmd.validation import Count, Flag, NonNegative, Positive, Section, faults_of
+from rigidmd.scene.base import Scene
+from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
 
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc")
@@ -233,11 +231,9 @@ def _file_name(name: str, endings: tuple[str, ...]) -> str:
     return name
 
 
-class Scene(Section):
-    """Everything a run does follows from this value. Read one with `Scene.read(path)`."""
+class MolecularScene(Scene):
+    """Molecules that move."""
 
-    name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=100)] = "scene"
-    """What to call the run; the file's name when not given"""
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Everything random follows from it"""
     precision: Literal["double"] = "double"
@@ -251,18 +247,6 @@ class Scene(Section):
     start: Start = Start()
     stages: tuple[Stage, ...] = Field(min_length=1)
     output: Output = Output()
-
-    _source: str = PrivateAttr("scene")
-    _folder: Path = PrivateAttr(Path())
-
-    @property
-    def source(self) -> str:
-        """The file it was read from, for messages."""
-        return self._source
-
-    def path(self, file: str) -> Path:
-        """A file named in the scene: relative to the scene's own folder."""
-        return self._folder / file
 
     @property
     def inputs(self) -> dict[str, Path]:
@@ -319,93 +303,17 @@ class Scene(Section):
         return faults
 
     @classmethod
-    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "Scene":
-        """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
-
-        Files named in the scene must lie in its folder or below; files named in `overrides` may be anywhere, and are
-        taken relative to the working directory.
-        """
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-            data = tomllib.loads(text)
-        except OSError as error:
-            raise SceneError(str(path), [f"cannot be read: {error.strerror}"]) from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise SceneError(str(path), [f"is not TOML: {error}"]) from None
-        data.setdefault("name", re.sub(r"[^\w.\-]", "_", path.stem))
-        return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
-
-    @classmethod
-    def from_dict(
-        cls,
-        data: dict[str, Any],
-        folder: str | os.PathLike = ".",
-        overrides: dict[str, Any] | None = None,
-        source: str = "scene",
-        text: str = "",
-    ) -> "Scene":
-        """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault."""
-        folder = Path(folder)
-        faults = _strange_paths(data, folder)
-        for key, value in (overrides or {}).items():
-            faults += _override(data, key, value)
-        try:
-            scene = cls.model_validate(data)
-        except ValidationError as error:
-            raise SceneError(source, faults + faults_of(error, cls, text)) from None
-        if faults:
-            raise SceneError(source, faults)
-        scene._source = source
-        scene._folder = folder
-        return scene
-
-
-def _strange_paths(data: dict, folder: Path) -> list[str]:
-    """Files named in a scene that are not in its folder."""
-    named = []
-    if isinstance(structure := data.get("structure"), dict):
-        named.append(("structure.file", structure.get("file")))
-    if isinstance(species := data.get("molecules"), list):
-        named += [
-            (f"molecules.{k}.file", entry.get("file")) for k, entry in enumerate(species) if isinstance(entry, dict)
+    def strange_paths(cls, data: dict[str, Any], folder: Path) -> list[str]:
+        """Files named in a scene that are not in its folder."""
+        named = []
+        if isinstance(structure := data.get("structure"), dict):
+            named.append(("structure.file", structure.get("file")))
+        if isinstance(species := data.get("molecules"), list):
+            named += [
+                (f"molecules.{k}.file", entry.get("file")) for k, entry in enumerate(species) if isinstance(entry, dict)
+            ]
+        return [
+            f"{key}: {file!r} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
+            for key, file in named
+            if isinstance(file, str) and not (folder / file).resolve().is_relative_to(folder.resolve())
         ]
-    return [
-        f"{key}: {file!r} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
-        for key, file in named
-        if isinstance(file, str) and not (folder / file).resolve().is_relative_to(folder.resolve())
-    ]
-
-
-def _override(data: dict, key: str, value: Any) -> list[str]:
-    """Set one dotted key in nested tables and lists, in place; a list of faults."""
-    if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.file", key):
-        value = os.path.abspath(value) if isinstance(value, str) else value
-    *parents, last = key.split(".")
-    target: Any = data
-    for depth, part in enumerate([*parents, last]):
-        here = ".".join(key.split(".")[:depth])
-        if isinstance(target, list):
-            if not part.isdigit() or int(part) >= len(target):
-                return [f"--set {key}: {here} has entries 0 to {len(target) - 1}, not {part!r}"]
-            part = int(part)
-        elif not isinstance(target, dict):
-            return [f"--set {key}: {here} is no table"]
-        if depth == len(parents):
-            target[part] = value
-        elif isinstance(target, dict):
-            target = target.setdefault(part, {})
-        else:
-            target = target[part]
-    return []
-
-
-def parse_override(text: str) -> tuple[str, Any]:
-    """KEY=VALUE of the command line; the value as TOML would read it, or else as text. Raises SceneError."""
-    key, equals, value = text.partition("=")
-    if not equals or not key.strip():
-        raise SceneError("--set", [f"{text!r} is not KEY=VALUE, for example stages.1.timestep_fs=4"])
-    try:
-        return key.strip(), tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return key.strip(), value.strip()

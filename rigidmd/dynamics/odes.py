@@ -1,0 +1,264 @@
+"""The motion of a single body as the textbooks write it: a first-order system for a general solver.
+
+Variables: attitude (matrix, quaternion or Euler angles), angular velocity (body frame), position and velocity of a
+body that flies, and the work of all that drives or brakes it, so that its energy can be balanced. Solved by classical
+RK4 (compiled) or by SciPy's DOP853 and Radau. The flows of `body` are the engine's own way; these are for comparison,
+and nothing here keeps Q a rotation but accuracy.
+"""
+
+from math import hypot, sin
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import DOP853 as Dop853
+from scipy.integrate import Radau
+
+from rigidmd.dynamics.engine import Engine
+from rigidmd.errors import SimulationError
+from rigidmd.forces.frame import frame_rate
+from rigidmd.forces.resistance import braking
+from rigidmd.forces.terms import OK, State, load_bodies, no_load, total_power
+from rigidmd.jit import kernel
+from rigidmd.mechanics.flight import along, inertial_mass
+from rigidmd.mechanics.odes import (
+    EulerAngles,
+    Form,
+    Matrix,
+    NoAttitude,
+    Quaternion,
+    attitude_rates,
+    read_attitude,
+    variables_of,
+)
+from rigidmd.mechanics.rotor import moment_rates
+
+FORMULATIONS = {"matrix": Matrix(), "quaternion": Quaternion(), "euler_angles": EulerAngles()}
+RK4, DOP853, RADAU = "rk4", "dop853", "radau"
+SOLVERS = (RK4, DOP853, RADAU)
+
+SINGULAR = 4  # beyond the codes of forces.terms: Euler angles too near theta = 0 or pi
+#: Half of the digits of phi and psi are gone there: theta itself has an error of 1e-16.
+SMALLEST_SINE = 1e-8
+
+
+class Solver(NamedTuple):
+    """A general solver of first-order systems, in place of a scheme of flows."""
+
+    name: str  # RK4, DOP853 or RADAU
+    formulation: str  # of FORMULATIONS
+    relative_tolerance: float = 1e-12  # of DOP853 and RADAU
+    absolute_tolerance: float = 1e-12
+
+
+@kernel
+def moment_rates_of(rotor, time, k):
+    """`moment_rates`, to be called from Python."""
+    return moment_rates(rotor, time, k)
+
+
+@kernel
+def read(form, model, state, time, y):
+    """The variables as a state, in place."""
+    n = form.variables
+    state.time[0] = time
+    read_attitude(form, y, state.rotation)
+    for m in range(len(state.angular_momentum_body)):
+        for k in range(3):
+            inertia, _, carried, _ = moment_rates(model.rotor, time, k)
+            state.angular_momentum_body[m, k] = inertia * y[n + k] + carried
+        n += 3
+    for m in range(len(state.position)):
+        for k in range(3):
+            state.position[m, k] = y[n + k]
+            state.velocity[m, k] = y[n + 3 + k]
+
+
+@kernel
+def slopes(form, model, terms, state, load, time, y, dy):
+    """Rates of all variables, in place; a status code. Frame axes; quantities are relative to the frame where so named.
+
+    I w' = n + L x w + P x v - h' - I' w; X' = v - Omega x X; V' = F/m - Omega x V; attitude by w - Q^T Omega;
+    W' = the power of drives and brakes, relative to the frame, and of what changes I and h.
+    """
+    read(form, model, state, time, y)
+    status = load_bodies(terms, state, load)
+    if status != OK:
+        return status
+    W = frame_rate(model.frame, time)
+    n = form.variables
+    flies = len(state.position) > 0
+    turns = len(state.rotation) > 0
+    v = (0.0, 0.0, 0.0)
+    w = (0.0, 0.0, 0.0)
+    drift = (0.0, 0.0, 0.0)
+    if flies:
+        V = state.velocity[0]
+        v = (V[0], V[1], V[2])
+        if turns:
+            q = state.rotation[0]
+            a = along(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
+            b = along(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
+            c = along(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
+            v = (
+                q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
+                q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,
+                q[2, 0] * a + q[2, 1] * b + q[2, 2] * c,
+            )
+        x = state.position[0]
+        drift = (
+            v[0] - W[1] * x[2] + W[2] * x[1],
+            v[1] - W[2] * x[0] + W[0] * x[2],
+            v[2] - W[0] * x[1] + W[1] * x[0],
+        )
+    if turns:
+        q = state.rotation[0]
+        w = (y[n] - along(q, W, 0), y[n + 1] - along(q, W, 1), y[n + 2] - along(q, W, 2))
+        attitude_rates(form, y, w[0], w[1], w[2], dy)
+    work = total_power(terms, state, drift, w) + braking(model.resistance, state, load, drift, w)
+    if turns:
+        L = state.angular_momentum_body[0]
+        N = load.torque_body[0]
+        q = state.rotation[0]
+        for k in range(3):
+            i = (k + 1) % 3
+            j = (k + 2) % 3
+            inertia, growth, carried, motor = moment_rates(model.rotor, time, k)
+            torque = N[k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
+            if flies:
+                vi, vj = along(q, v, i), along(q, v, j)
+                torque += (inertial_mass(model.flight, i) - inertial_mass(model.flight, j)) * vi * vj
+            dy[n + k] = torque / inertia if inertia > 0 else 0.0
+            work -= (motor + 0.5 * growth * y[n + k]) * y[n + k]
+        n += 3
+    if flies:
+        F = load.force[0]
+        for k in range(3):
+            i = (k + 1) % 3
+            j = (k + 2) % 3
+            dy[n + k] = drift[k]
+            dy[n + 3 + k] = F[k] / model.flight.mass - W[i] * state.velocity[0, j] + W[j] * state.velocity[0, i]
+        n += 6
+    dy[n] = work
+    return OK
+
+
+@kernel
+def singular(form, y, dy, dt):
+    """Whether Euler angles are nearer to theta = 0 or pi than the axis moves in a step of dt, or too near for rounding."""
+    if form.variables != 3:
+        return False
+    s = sin(y[1])
+    return not abs(s) > max(dt * hypot(dy[1], dy[0] * s), SMALLEST_SINE)
+
+
+@kernel
+def rk4(form, model, terms, state, load, y, stages, dt, origin, steps, cursor):
+    """Classical Runge-Kutta steps until cursor[0] = steps; cursor[1] counts the stages of a step, stages (5, variables)."""
+    shift = (0.0, 0.5, 0.5, 1.0)
+    while cursor[0] < steps:
+        time = origin + cursor[0] * dt
+        while cursor[1] < 4:
+            k = cursor[1]
+            for i in range(len(y)):
+                stages[4, i] = y[i] + shift[k] * dt * stages[max(k - 1, 0), i] if k else y[i]
+            status = slopes(form, model, terms, state, load, time + shift[k] * dt, stages[4], stages[k])
+            if status != OK:
+                return status
+            if k == 0 and singular(form, y, stages[0], dt):
+                return SINGULAR
+            cursor[1] += 1
+        for i in range(len(y)):
+            y[i] += dt / 6 * (stages[0, i] + 2 * stages[1, i] + 2 * stages[2, i] + stages[3, i])
+        cursor[1] = 0
+        cursor[0] += 1
+    return OK
+
+
+class OdeEngine(Engine):
+    """An engine that moves a body by a general solver. The variables live here between calls; the state shows them."""
+
+    _y = np.zeros(1)
+    _integrator = None
+
+    def advance(
+        self, state: State, solver: Solver, dt: float, steps: int, thermostat: NamedTuple, done: int = 0
+    ) -> None:
+        """Move the state by `steps` steps of dt, in place, as `Engine.advance`; the steps of DOP853 and Radau are
+        their own, dt only says where to look. Raises SimulationError."""
+        form = FORMULATIONS[solver.formulation] if len(state.rotation) else NoAttitude()
+        if self._stale:
+            self._y = self._variables(form, state)
+            self._integrator = None
+            self.load = no_load(state)
+            self._stale = False
+        self._origin = float(state.time[0]) if done == 0 else self._origin
+        if solver.name == RK4:
+            self._rk4(form, state, dt, steps, done)
+        else:
+            self._adaptive(form, state, solver, self._origin + (done + steps) * dt)
+
+    def work(self) -> float:
+        """As `Engine.work`."""
+        return float(self._y[-1])
+
+    def _variables(self, form: Form, state: State) -> np.ndarray:
+        omega = []
+        if len(state.rotation):
+            for k in range(3):
+                inertia, _, carried, _ = moment_rates_of(self.model.rotor, state.time[0], k)
+                omega.append((state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0)
+        flight = [state.position.ravel(), state.velocity.ravel()]
+        return np.concatenate([variables_of(form, state.rotation), omega, *flight, [0.0]])
+
+    def _rk4(self, form: Form, state: State, dt: float, steps: int, done: int) -> None:
+        cursor, stages = np.array([done, 0]), np.zeros((5, len(self._y)))
+        while status := rk4(
+            form, self.model, self._terms, state, self.load, self._y, stages, dt, self._origin, done + steps, cursor
+        ):
+            if status == SINGULAR:
+                raise SingularError(self._y[1], self._origin + cursor[0] * dt)
+            self._answer(status, state)
+        read(form, self.model, state, self._origin + (done + steps) * dt, self._y)
+
+    def _adaptive(self, form: Form, state: State, solver: Solver, end: float) -> None:
+        dy = np.zeros(len(self._y))
+
+        def rates(time, y):
+            while status := slopes(form, self.model, self._terms, state, self.load, time, y, dy):
+                self._answer(status, state)
+            return dy.copy()
+
+        if self._integrator is None:
+            if singular(form, self._y, rates(state.time[0], self._y), 0.0):
+                raise SingularError(self._y[1], state.time[0])
+            kind = {DOP853: Dop853, RADAU: Radau}[solver.name]
+            self._integrator = kind(
+                rates, state.time[0], self._y, np.inf, rtol=solver.relative_tolerance, atol=solver.absolute_tolerance
+            )
+        integrator = self._integrator
+        while integrator.t < end:
+            before = integrator.t
+            with np.errstate(all="ignore"):
+                problem = integrator.step()
+            if singular(form, integrator.y, rates(integrator.t, integrator.y), integrator.t - before):
+                raise SingularError(integrator.y[1], integrator.t)
+            if problem or not np.isfinite(integrator.y).all():
+                raise SimulationError(
+                    f"at t = {integrator.t:.6g}: {solver.name} finds no step that keeps its tolerances "
+                    f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
+                )
+            self._between = integrator.dense_output()
+        if end > self._origin:
+            self._y = self._between(end)
+        read(form, self.model, state, end, self._y)
+
+
+class SingularError(SimulationError):
+    """Euler angles where they say nothing."""
+
+    def __init__(self, theta: float, time: float):
+        where = "0" if np.cos(theta) > 0 else "pi"
+        super().__init__(
+            f"the Euler angles became singular at t = {time:.6g}: theta = {theta:.9g} is too near {where}, where phi "
+            "and psi are not defined; use formulation = 'matrix' or 'quaternion', or the engine's own integrators"
+        )

@@ -1,0 +1,189 @@
+"""Forces on a single body from outside: weight, buoyancy, whatever a scene or a Python function applies."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.forces.frame import frame_rate
+from rigidmd.forces.terms import ASK, OK, add_forces, power, spend
+from rigidmd.jit import implements, is_a, kernel
+from rigidmd.mechanics.course import Course, piece, value
+from rigidmd.mechanics.flight import along, inertial_mass
+from rigidmd.mechanics.rotor import moments
+
+
+class SteadyForce(NamedTuple):
+    """A constant force at a point of the body: weight, buoyancy. Energy -F . (X + Q point)."""
+
+    force: np.ndarray  # (3,) lab
+    point: np.ndarray  # (3,) body, from the centre of mass, or from the pivot of a pinned body
+
+
+class Drive(NamedTuple):
+    """Force at a point of the body and torque, each following time as told; along the lab's or the body's axes."""
+
+    force: Course
+    torque: Course
+    point: np.ndarray  # (3,) body
+    follows_body: bool  # force and torque are given along the body's axes
+    force_lab: np.ndarray  # (3,) as last evaluated
+    torque_body: np.ndarray  # (3,) as last evaluated, that of the force included
+    work: np.ndarray  # (1,) done on the body so far
+
+
+class Told(NamedTuple):
+    """Force at the centre of mass (or pivot) and torque that a Python function says, asked before every kick."""
+
+    fresh: np.ndarray  # (1,) whether the answer is that for the present moment
+    force_lab: np.ndarray  # (3,)
+    torque_body: np.ndarray  # (3,)
+    work: np.ndarray  # (1,) done on the body so far
+
+
+@implements(add_forces)
+def _add_steady_force(term, state, load, tally):
+    if not is_a(term, SteadyForce):
+        return None
+
+    def add_steady_force(term, state, load, tally):
+        for k in range(len(load.force)):
+            for i in range(3):
+                load.force[k, i] += term.force[i]
+        for k in range(len(load.torque_body)):
+            add_torque(term.point, state.rotation[k], term.force, load.torque_body[k])
+        if tally is not None:
+            for i in range(3):
+                x = 0.0
+                if len(state.position):
+                    x += state.position[0, i]
+                if len(state.rotation):
+                    q = state.rotation[0]
+                    x += q[i, 0] * term.point[0] + q[i, 1] * term.point[1] + q[i, 2] * term.point[2]
+                tally[0] -= term.force[i] * x
+        return OK
+
+    return add_steady_force
+
+
+@kernel(inline=True)
+def add_torque(point, rotation, force_lab, torque_body):
+    """Add point x Q^T F to a torque (3,), all in the body frame."""
+    a = along(rotation, force_lab, 0)
+    b = along(rotation, force_lab, 1)
+    c = along(rotation, force_lab, 2)
+    torque_body[0] += point[1] * c - point[2] * b
+    torque_body[1] += point[2] * a - point[0] * c
+    torque_body[2] += point[0] * b - point[1] * a
+
+
+@implements(add_forces)
+def _add_drive(term, state, load, tally):
+    if not is_a(term, Drive):
+        return None
+
+    def add_drive(term, state, load, tally):
+        at_force = piece(term.force, state.time[0])
+        at_torque = piece(term.torque, state.time[0])
+        force = (value(term.force, at_force, 0), value(term.force, at_force, 1), value(term.force, at_force, 2))
+        torque = (value(term.torque, at_torque, 0), value(term.torque, at_torque, 1), value(term.torque, at_torque, 2))
+        for k in range(3):
+            term.force_lab[k] = force[k]
+            term.torque_body[k] = torque[k]
+        if len(state.rotation):
+            q = state.rotation[0]
+            for k in range(3):
+                if term.follows_body:
+                    term.force_lab[k] = q[k, 0] * force[0] + q[k, 1] * force[1] + q[k, 2] * force[2]
+                else:
+                    term.torque_body[k] = along(q, torque, k)
+            add_torque(term.point, q, term.force_lab, term.torque_body)
+        return hand_over(term, load)
+
+    return add_drive
+
+
+@implements(add_forces)
+def _add_told(term, state, load, tally):
+    if not is_a(term, Told):
+        return None
+
+    def add_told(term, state, load, tally):
+        if term.fresh[0] == 0:
+            return ASK
+        term.fresh[0] = 0
+        return hand_over(term, load)
+
+    return add_told
+
+
+@kernel(inline=True)
+def hand_over(term, load):
+    """Add a term's present force and torque to the load of the one body."""
+    for k in range(len(load.force)):
+        for i in range(3):
+            load.force[k, i] += term.force_lab[i]
+    for k in range(len(load.torque_body)):
+        for i in range(3):
+            load.torque_body[k, i] += term.torque_body[i]
+    return OK
+
+
+@implements(spend)
+def _spend_drive(term, model, state, load, h):
+    if not (is_a(term, Drive) or is_a(term, Told)):
+        return None
+
+    def spend_drive(term, model, state, load, h):
+        # The kick changes the kinetic energy by h F . v with v the mean of before and after: exact for the whole
+        # load, and this term's share of it.
+        turning = frame_rate(model.frame, state.time[0])
+        for k in range(len(load.force)):
+            x = state.position[k]
+            for i in range(3):
+                a = (i + 1) % 3
+                b = (i + 2) % 3
+                dragged = turning[a] * x[b] - turning[b] * x[a]
+                term.work[0] -= h * term.force_lab[i] * dragged
+            if len(state.rotation):
+                q = state.rotation[k]
+                for i in range(3):
+                    p = model.flight.mass * along(q, state.velocity[k], i) + 0.5 * h * along(q, load.force[k], i)
+                    term.work[0] += h * along(q, term.force_lab, i) * p / inertial_mass(model.flight, i)
+            else:
+                for i in range(3):
+                    v = state.velocity[k, i] + 0.5 * h * load.force[k, i] / model.flight.mass
+                    term.work[0] += h * term.force_lab[i] * v
+        for k in range(len(load.torque_body)):
+            q = state.rotation[k]
+            for i in range(3):
+                inverse, carried = moments(model.rotor, state.time[0], i)
+                own = state.angular_momentum_body[k, i] + 0.5 * h * load.torque_body[k, i] - carried
+                dragged = q[0, i] * turning[0] + q[1, i] * turning[1] + q[2, i] * turning[2]
+                term.work[0] += h * term.torque_body[i] * (own * inverse - dragged)
+
+    return spend_drive
+
+
+@implements(power)
+def _drive_power(term, state, velocity, omega):
+    if not (is_a(term, Drive) or is_a(term, Told)):
+        return None
+
+    def drive_power(term, state, velocity, omega):
+        total = 0.0
+        for k in range(3):
+            if len(state.position):
+                total += term.force_lab[k] * velocity[k]
+            if len(state.rotation):
+                total += term.torque_body[k] * omega[k]
+        return total
+
+    return drive_power
+
+
+def answer(term: Told, function, state) -> None:
+    """Ask a Python function of (time, state) for its force (3,) in the lab and torque (3,) in the body frame."""
+    force, torque = function(float(state.time[0]), state)
+    term.force_lab[:] = force
+    term.torque_body[:] = torque
+    term.fresh[0] = 1

@@ -1,0 +1,91 @@
+"""Accelerated frames: motion told relative to axes that turn, from an origin that may be accelerated.
+
+Momenta stay those relative to axes that do not turn, only written along the frame's axes. Then the frame adds one flow,
+a plain rotation of position, velocity and Q, and Coriolis, centrifugal and Euler forces come out without being computed.
+The acceleration of the origin is a uniform field.
+"""
+
+from math import sin, sqrt
+from typing import NamedTuple
+
+from rigidmd.jit import implements, is_a, kernel
+from rigidmd.mechanics.course import Course, piece, value
+
+
+class Inertial(NamedTuple):
+    """Axes that do not turn."""
+
+    rate: float = 0.0
+
+
+class Turning(NamedTuple):
+    """Axes that turn. Exact for a constant rate, and for a changing one about a fixed direction; else of order 2."""
+
+    angular_velocity: Course  # along the frame's own axes
+
+
+def follow(frame, state, time, h):
+    """Write the state of a single body along the frame's axes as they are at time + h, in place."""
+    raise TypeError("compiled code only")
+
+
+@implements(follow, inline=True)
+def _follow(frame, state, time, h):
+    if is_a(frame, Inertial):
+        return lambda frame, state, time, h: None
+
+    def turn_back(frame, state, time, h):
+        at = piece(frame.angular_velocity, time + 0.5 * h)
+        x = -h * value(frame.angular_velocity, at, 0)
+        y = -h * value(frame.angular_velocity, at, 1)
+        z = -h * value(frame.angular_velocity, at, 2)
+        if len(state.position):
+            turn_vector(state.position[0], x, y, z)
+            turn_vector(state.velocity[0], x, y, z)
+        for k in range(len(state.rotation)):
+            for column in range(3):
+                turn_vector(state.rotation[k, :, column], x, y, z)
+
+    return turn_back
+
+
+@kernel(inline=True)
+def turn_vector(vector, x, y, z):
+    """Turn a vector (3,) by the rotation vector (x, y, z), in place (Rodrigues)."""
+    angle = sqrt(x * x + y * y + z * z)
+    if angle == 0.0:
+        return
+    s = sin(angle) / angle
+    half = sin(0.5 * angle) / angle
+    versine = 2 * half * half
+    a = vector[0]
+    b = vector[1]
+    c = vector[2]
+    # v + s u x v + versine u x (u x v): what a small turn changes is computed by itself and keeps its digits
+    p = y * c - z * b
+    q = z * a - x * c
+    r = x * b - y * a
+    vector[0] = a + s * p + versine * (y * r - z * q)
+    vector[1] = b + s * q + versine * (z * p - x * r)
+    vector[2] = c + s * r + versine * (x * q - y * p)
+
+
+def frame_rate(frame, time):
+    """Angular velocity of the frame along its own axes, as a tuple."""
+    raise TypeError("compiled code only")
+
+
+@implements(frame_rate, inline=True)
+def _frame_rate(frame, time):
+    if is_a(frame, Inertial):
+        return lambda frame, time: (0.0, 0.0, 0.0)
+
+    def rate(frame, time):
+        at = piece(frame.angular_velocity, time)
+        return (
+            value(frame.angular_velocity, at, 0),
+            value(frame.angular_velocity, at, 1),
+            value(frame.angular_velocity, at, 2),
+        )
+
+    return rate

@@ -1,0 +1,183 @@
+"""The motion of a single body as columns: what motion.csv holds, and how well what should be constant is."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.build.body import BodySystem
+from rigidmd.forces.fields import Drive, SteadyForce, Told
+from rigidmd.forces.frame import Inertial
+from rigidmd.forces.resistance import NoResistance
+from rigidmd.forces.terms import State
+from rigidmd.mechanics.course import is_steady
+from rigidmd.mechanics.flight import Immersed, inertial_masses
+from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
+from rigidmd.mechanics.rotor import DrivenRotor
+
+
+class Snapshot(NamedTuple):
+    """A moment of a run as it is kept until the end."""
+
+    time: float
+    state: State
+    work: float
+
+
+@dataclass
+class Motion:
+    """The samples of a run, by column.
+
+    columns : arrays (t,), SI units, by the names in motion.csv. Position, velocity, attitude and omega are relative to
+        the frame; L is the angular momentum relative to axes that do not turn, along the frame's (lab) or body's axes
+    invariants : what should stay constant; column NAME_error is its relative error since the start
+    """
+
+    columns: dict[str, np.ndarray]
+    invariants: list[str]
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """A column as an array (t,)."""
+        if column not in self.columns:
+            raise KeyError(f"no column {column!r}; there are {', '.join(self.columns)}")
+        return self.columns[column]
+
+
+def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
+    """All columns of the samples of a run."""
+    times = np.array([s.time for s in snapshots])
+    states = State(*(np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields))))
+    position, velocity, rotation, omega = system.motion(times, states)
+    columns = {"t": times} | _vector(("x", "y", "z"), position) | _vector(("vx", "vy", "vz"), velocity)
+    if system.turns:
+        columns |= _rotation_columns(system, states, rotation, omega)
+    columns |= _energies(system, times, states, np.array([s.work for s in snapshots]))
+    errors = _errors(system, columns)
+    columns |= {f"{name}_error": error for name, error in errors.items()}
+    if system.turns:
+        gap = np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)
+        columns["orthogonality_error"] = np.abs(gap).max(axis=(1, 2))
+    return Motion(columns, list(errors))
+
+
+def _vector(names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip(names, values.T, strict=True))
+
+
+def _rotation_columns(system: BodySystem, states: State, rotation: np.ndarray, omega: np.ndarray) -> dict:
+    n = len(rotation)
+    momentum = states.angular_momentum_body.reshape(n, 3) @ system.axes.T
+    columns = {f"q{i + 1}{j + 1}": rotation[:, i, j] for i in range(3) for j in range(3)}
+    columns |= _vector(("qw", "qx", "qy", "qz"), _continuous(to_quaternion(rotation)))
+    columns |= _vector(("phi", "theta", "psi"), to_euler_angles(rotation))
+    for name, body in (("omega", omega), ("L", momentum)):
+        columns |= _vector(tuple(f"{name}_body_{k}" for k in (1, 2, 3)), body)
+        columns |= _vector(tuple(f"{name}_lab_{k}" for k in "xyz"), np.einsum("tij,tj->ti", rotation, body))
+    return columns
+
+
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """The same rotations with signs that do not jump from one sample to the next."""
+    turned = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
+    return quaternions * np.concatenate([[1.0], np.cumprod(np.where(turned < 0, -1.0, 1.0))])[:, None]
+
+
+def _energies(system: BodySystem, times: np.ndarray, states: State, work: np.ndarray) -> dict[str, np.ndarray]:
+    """Kinetic energy (less Omega . J in a turning frame), potential, their sum, and the work of what is neither."""
+    n = len(times)
+    kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
+    if system.turns:
+        rotation, momentum = states.rotation.reshape(n, 3, 3), states.angular_momentum_body.reshape(n, 3)
+        inertia, carried = system.moments(times)
+        own = np.divide((momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0)
+        kinetic += 0.5 * own.sum(axis=1)
+        about_origin += np.einsum("tij,tj->ti", rotation, momentum)
+    if system.flies:
+        position, impulse = states.position.reshape(n, 3), system.mass * states.velocity.reshape(n, 3)
+        along = np.einsum("tji,tj->ti", rotation, impulse) if system.turns else impulse
+        kinetic += 0.5 * (along**2 / inertial_masses(system.body.flight)).sum(axis=1)
+        about_origin += np.cross(position, impulse)
+    kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
+    for term in system.terms.values():
+        if isinstance(term, SteadyForce):
+            if system.flies:
+                potential -= position @ term.force
+            if system.turns:
+                potential -= np.einsum("i,tij,j->t", term.force, rotation, term.point)
+    return {"kinetic": kinetic, "potential": potential, "energy": kinetic + potential, "work": work}
+
+
+def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Relative error since the start of all that this scene conserves."""
+    body = system.body
+    forces = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+    driven = any(isinstance(term, Drive | Told) for term in system.terms.values())
+    lossless = isinstance(body.resistance, NoResistance)
+    inertial = isinstance(body.frame, Inertial)
+    errors = {}
+    if inertial or is_steady(body.frame.angular_velocity):
+        balance = columns["energy"] - columns["work"]
+        errors["energy"] = _relative(balance - balance[0], np.abs(columns["kinetic"]).max() or np.abs(balance[0]))
+    if not system.turns:
+        return errors
+    momentum = {k: columns[f"L_lab_{k}"] for k in "xyz"}
+    size = np.sqrt(sum(part**2 for part in momentum.values()))
+    arms = [term.point for term in forces if term.force.any()]
+    if lossless and not driven and inertial and not isinstance(body.flight, Immersed):
+        if not any(arm.any() for arm in arms):
+            gap = np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values()))
+            errors["L_lab"] = _relative(gap, size.max())
+            errors["L_size"] = _relative(size - size[0], size.max())
+        else:
+            pulling = [np.flatnonzero(term.force) for term in forces if term.point.any() and term.force.any()]
+            if all(len(p) == 1 and p[0] == pulling[0][0] for p in pulling):
+                k = "xyz"[pulling[0][0]]
+                errors[f"L_{k}"] = _relative(momentum[k] - momentum[k][0], size.max())
+    axis = _kept_axis(system, arms, driven)
+    if axis is not None:
+        own = columns[f"L_body_{axis + 1}"]
+        errors[f"L_{axis + 1}"] = _relative(own - own[0], size.max())
+    return errors
+
+
+def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int | None:
+    """The axis of a symmetric body about which nothing acts: L along it is conserved."""
+    body = system.body
+    if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.flight, Immersed):
+        return None
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        symmetric = system.inertia[i] == system.inertia[j] and system.inertia[k] > 0
+        on_axis = not any(arm[[i, j]].any() for arm in arms)
+        if isinstance(body.rotor, DrivenRotor):
+            inertia, momentum = body.rotor.inertia, body.rotor.momentum
+            symmetric &= is_steady(inertia) and not any(part[:, [i, j]].any() for part in momentum[1:])
+        if not isinstance(body.resistance, NoResistance):
+            symmetric &= not any(
+                part[k]
+                for part in (
+                    body.resistance.rotation_dry,
+                    body.resistance.rotation_linear,
+                    body.resistance.rotation_quadratic,
+                )
+            )
+        if symmetric and on_axis:
+            return k
+    return None
+
+
+def _relative(error: np.ndarray, scale: float) -> np.ndarray:
+    return error / scale if scale > 0 else error
+
+
+def drawn_axis(system: BodySystem) -> np.ndarray:
+    """The body axis (3,) whose path is drawn: the one asked for, towards the centre of mass, that of symmetry, or 3."""
+    if system.scene.output.axis is not None:
+        axis = np.array(system.scene.output.axis)
+        return axis / np.linalg.norm(axis)
+    if system.centre.any():
+        return system.centre / np.linalg.norm(system.centre)
+    for k in (2, 0, 1):
+        if system.inertia[k - 1] == system.inertia[k - 2] != system.inertia[k]:
+            return system.axes[:, k]
+    return system.axes[:, 2]

@@ -1,0 +1,109 @@
+"""Courses: vectors that follow time as told (a motor's torque, a shrinking inertia, a frame that spins up)."""
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.jit import kernel
+
+
+class Course(NamedTuple):
+    """Pieces of constant, linear or quadratic change.
+
+    Piece i holds from times[i] to times[i + 1]: constant[i] + d slope[i] + d² curvature[i] with d = t - times[i]. The
+    first begins at time 0, where runs begin; the last has no end.
+    """
+
+    times: np.ndarray  # (k,) increasing, the first 0
+    constant: np.ndarray  # (k, 3)
+    slope: np.ndarray  # (k, 3)
+    curvature: np.ndarray  # (k, 3)
+
+
+def steady(vector) -> Course:
+    """A vector (3,) that does not change."""
+    return Course(np.zeros(1), np.array([vector], dtype=float), np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def table(times, values) -> Course:
+    """Straight lines between values (k, 3) at increasing times (k,), none negative; the outer values hold outside."""
+    times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+    if times[0] > 0:
+        times, values = np.insert(times, 0, 0.0), np.insert(values, 0, values[0], axis=0)
+    slope = np.zeros_like(values)
+    slope[:-1] = np.diff(values, axis=0) / np.diff(times)[:, None]
+    return Course(times, values, slope, np.zeros_like(values))
+
+
+def window(vector, begin: float, end: float) -> Course:
+    """A vector (3,) from one time to another (which may be infinite), zero outside."""
+    on, off = np.asarray(vector, dtype=float), np.zeros(3)
+    pieces = [(0.0, off)] * (begin > 0) + [(max(begin, 0.0), on)] + [(end, off)] * (end < inf)
+    times, values = (np.array(column) for column in zip(*pieces, strict=True))
+    return Course(times, values, np.zeros_like(values), np.zeros_like(values))
+
+
+def integral(course: Course, start) -> Course:
+    """start (3,) plus the integral since time 0 of a course of constant and linear pieces."""
+    constant = np.empty_like(course.constant)
+    constant[0] = start
+    for i, length in enumerate(np.diff(course.times)):
+        constant[i + 1] = constant[i] + length * (course.constant[i] + 0.5 * length * course.slope[i])
+    return Course(course.times, constant, course.constant, 0.5 * course.slope)
+
+
+def is_steady(course: Course) -> bool:
+    """Whether it never changes."""
+    return not (course.slope.any() or course.curvature.any() or np.ptp(course.constant, axis=0).any())
+
+
+def value_at(course: Course, times: np.ndarray) -> np.ndarray:
+    """Values (t, 3) at times (t,)."""
+    i, d = _places(course, times)
+    return course.constant[i] + d * (course.slope[i] + d * course.curvature[i])
+
+
+def total(courses: list[Course]) -> Course:
+    """The sum of courses."""
+    times = np.unique(np.concatenate([course.times for course in courses]))
+    constant = sum(value_at(course, times) for course in courses)
+    slope, curvature = np.zeros((2, len(times), 3))
+    for course in courses:
+        i, d = _places(course, times)
+        slope += course.slope[i] + 2 * d * course.curvature[i]
+        curvature += course.curvature[i]
+    return Course(times, constant, slope, curvature)
+
+
+def _places(course: Course, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    i = np.searchsorted(course.times, times, side="right") - 1
+    return i, (times - course.times[i])[:, None]
+
+
+@kernel(inline=True)
+def piece(course, time):
+    """Index of the piece that holds at a time, and the time since it began."""
+    low = 0
+    high = len(course.times)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if course.times[middle] <= time:
+            low = middle
+        else:
+            high = middle
+    return low, time - course.times[low]
+
+
+@kernel(inline=True)
+def value(course, at, k):
+    """Component k at a place (from `piece`)."""
+    i, d = at
+    return course.constant[i, k] + d * (course.slope[i, k] + d * course.curvature[i, k])
+
+
+@kernel(inline=True)
+def rate(course, at, k):
+    """Rate of change of component k at a place (from `piece`)."""
+    i, d = at
+    return course.slope[i, k] + 2 * d * course.curvature[i, k]

@@ -1,0 +1,136 @@
+"""The attitude as variables of a first-order system, in the three ways of the textbooks.
+
+y holds the attitude first; its rates follow from the angular velocity in the body frame (relative to the frame the
+attitude is told in). Each is a term, chosen by its type.
+"""
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.jit import implements, is_a
+from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
+
+
+class Matrix(NamedTuple):
+    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced; how well it holds is the accuracy control."""
+
+    variables: int = 9
+
+
+class Quaternion(NamedTuple):
+    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced; how well it holds is the accuracy control."""
+
+    variables: int = 4
+
+
+class EulerAngles(NamedTuple):
+    """phi, theta, psi (3-1-3). Singular at theta = 0 and pi."""
+
+    variables: int = 3
+
+
+class NoAttitude(NamedTuple):
+    """A point has none."""
+
+    variables: int = 0
+
+
+Form = Matrix | Quaternion | EulerAngles | NoAttitude
+
+
+def variables_of(form: Form, rotation: np.ndarray) -> np.ndarray:
+    """The attitude variables of a rotation matrix (1, 3, 3)."""
+    if isinstance(form, NoAttitude):
+        return np.zeros(0)
+    return {Matrix: np.ravel, Quaternion: to_quaternion, EulerAngles: to_euler_angles}[type(form)](rotation[0])
+
+
+def read_attitude(form, y, rotation):
+    """Q (1, 3, 3) of the variables, in place. Neither normalised nor projected: Q of a quaternion is |q|² times a rotation."""
+    raise TypeError("compiled code only")
+
+
+@implements(read_attitude, inline=True)
+def _read_attitude(form, y, rotation):
+    if is_a(form, NoAttitude):
+        return lambda form, y, rotation: None
+    if is_a(form, Matrix):
+
+        def read_matrix(form, y, rotation):
+            for i in range(3):
+                for j in range(3):
+                    rotation[0, i, j] = y[3 * i + j]
+
+        return read_matrix
+    if is_a(form, Quaternion):
+
+        def read_quaternion(form, y, rotation):
+            q = rotation[0]
+            w, a, b, c = y[0], y[1], y[2], y[3]
+            q[0, 0] = w * w + a * a - b * b - c * c
+            q[1, 1] = w * w - a * a + b * b - c * c
+            q[2, 2] = w * w - a * a - b * b + c * c
+            q[0, 1] = 2 * (a * b - w * c)
+            q[1, 0] = 2 * (a * b + w * c)
+            q[0, 2] = 2 * (a * c + w * b)
+            q[2, 0] = 2 * (a * c - w * b)
+            q[1, 2] = 2 * (b * c - w * a)
+            q[2, 1] = 2 * (b * c + w * a)
+
+        return read_quaternion
+
+    def read_euler(form, y, rotation):
+        q = rotation[0]
+        c1, s1 = cos(y[0]), sin(y[0])
+        c2, s2 = cos(y[1]), sin(y[1])
+        c3, s3 = cos(y[2]), sin(y[2])
+        q[0, 0] = c1 * c3 - s1 * c2 * s3
+        q[0, 1] = -c1 * s3 - s1 * c2 * c3
+        q[0, 2] = s1 * s2
+        q[1, 0] = s1 * c3 + c1 * c2 * s3
+        q[1, 1] = -s1 * s3 + c1 * c2 * c3
+        q[1, 2] = -c1 * s2
+        q[2, 0] = s2 * s3
+        q[2, 1] = s2 * c3
+        q[2, 2] = c2
+
+    return read_euler
+
+
+def attitude_rates(form, y, w0, w1, w2, rates):
+    """Rates of the attitude variables for an angular velocity in the body frame, in place."""
+    raise TypeError("compiled code only")
+
+
+@implements(attitude_rates, inline=True)
+def _attitude_rates(form, y, w0, w1, w2, rates):
+    if is_a(form, NoAttitude):
+        return lambda form, y, w0, w1, w2, rates: None
+    if is_a(form, Matrix):
+
+        def matrix_rates(form, y, w0, w1, w2, rates):
+            for i in range(0, 9, 3):
+                rates[i] = y[i + 1] * w2 - y[i + 2] * w1
+                rates[i + 1] = y[i + 2] * w0 - y[i] * w2
+                rates[i + 2] = y[i] * w1 - y[i + 1] * w0
+
+        return matrix_rates
+    if is_a(form, Quaternion):
+
+        def quaternion_rates(form, y, w0, w1, w2, rates):
+            rates[0] = 0.5 * (-y[1] * w0 - y[2] * w1 - y[3] * w2)
+            rates[1] = 0.5 * (y[0] * w0 + y[2] * w2 - y[3] * w1)
+            rates[2] = 0.5 * (y[0] * w1 + y[3] * w0 - y[1] * w2)
+            rates[3] = 0.5 * (y[0] * w2 + y[1] * w1 - y[2] * w0)
+
+        return quaternion_rates
+
+    def euler_rates(form, y, w0, w1, w2, rates):
+        across = w0 * sin(y[2]) + w1 * cos(y[2])
+        rates[0] = across / sin(y[1])
+        rates[1] = w0 * cos(y[2]) - w1 * sin(y[2])
+        rates[2] = w2 - rates[0] * cos(y[1])
+
+    return euler_rates

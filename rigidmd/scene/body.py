@@ -1,0 +1,560 @@
+"""The scene of a single body: a top, a gyroscope, a satellite, a falling stone. SI units throughout.
+
+The equations hold no constant of nature, so numbers in any other consistent units serve as well.
+"""
+
+from itertools import pairwise
+from math import inf
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, Strict, field_validator, model_validator
+
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.mechanics.inertia import impossible, shifted
+from rigidmd.mechanics.rotation import (
+    angular_velocity_of_euler_rates,
+    from_attitude_matrix,
+    from_euler_angles,
+    from_quaternion,
+    from_yaw_pitch_roll,
+    nearest_rotation,
+    orthogonality_error,
+)
+from rigidmd.mechanics.solids import NUMBERS, SOLIDS
+from rigidmd.scene.base import Scene
+from rigidmd.scene.molecules import _file_name
+from rigidmd.validation import Flag, NonNegative, Number, Positive, Section, Vector, line_of
+
+Matrix = tuple[Vector, Vector, Vector]
+Quaternion = tuple[Number, Number, Number, Number]
+NonNegativeVector = tuple[NonNegative, NonNegative, NonNegative]
+PositiveVector = tuple[Positive, Positive, Positive]
+Times = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
+
+SOLVERS = ("rk4", "dop853", "radau")
+#: A rotation matrix given with fewer than about nine digits is refused unless it is to be projected.
+LARGEST_ORTHOGONALITY_ERROR = 1e-9
+MOST_STEPS = 1e12
+
+
+class Solid(Section):
+    """A homogeneous solid; axis 3 is its axis of symmetry, a cone stands on its tip."""
+
+    shape: Literal[tuple(SOLIDS)]  # type: ignore[valid-type]
+    """What it is"""
+    radius_m: Positive | None = None
+    """Of a cylinder, cone, sphere, disk, ring"""
+    height_m: Positive | None = None
+    """Of a cylinder, cone"""
+    length_m: Positive | None = None
+    """Of a rod"""
+    lengths_m: PositiveVector | None = None
+    """Of a cuboid"""
+    semi_axes_m: PositiveVector | None = None
+    """Of an ellipsoid"""
+
+    @property
+    def dimensions(self) -> dict[str, Any]:
+        """The dimensions given."""
+        return {key: value for key in NUMBERS if (value := getattr(self, key)) is not None}
+
+    @model_validator(mode="after")
+    def _has_its_dimensions(self):
+        wanted, given = set(SOLIDS[self.shape].dimensions), set(self.dimensions)
+        if wanted != given:
+            raise ValueError(
+                f"a {self.shape} has {' and '.join(sorted(wanted))}, not {' and '.join(sorted(given)) or 'none'}"
+            )
+        return self
+
+
+class PointMass(Section):
+    """A point of a body made of points."""
+
+    mass_kg: Positive
+    position_m: Vector
+    """Body axes, from any origin; from the pivot where the body is pinned"""
+
+
+class BodyTable(Section):
+    """The body: mass, inertia, and where it is pinned, if it is. Without inertia it is a point."""
+
+    mass_kg: Positive | None = None
+    """Mass; the sum of those of points when they are given"""
+    solid: Solid | None = None
+    """Inertia of a homogeneous solid"""
+    points: tuple[PointMass, ...] | None = Field(default=None, min_length=1)
+    """Inertia of point masses"""
+    inertia_kg_m2: NonNegativeVector | None = None
+    """Principal moments, along the body's axes"""
+    inertia_tensor_kg_m2: Matrix | None = None
+    """Inertia tensor along the body's axes, products of inertia with the sign they have in the tensor"""
+    inertia_about: Literal["centre_of_mass", "pivot"] = "centre_of_mass"
+    """Which point the inertia given is about"""
+    pinned: Flag = False
+    """One point of the body stays where it is"""
+    centre_of_mass_m: Vector | None = None
+    """From the pivot, body axes; of a pinned body"""
+
+    @model_validator(mode="after")
+    def _is_a_body(self):
+        faults = []
+        ways = [key for key in ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2") if getattr(self, key)]
+        if len(ways) > 1:
+            faults.append(f"give one of {', '.join(ways)}")
+        if self.points is None and self.mass_kg is None:
+            faults.append("mass_kg is missing")
+        if self.points is not None and self.mass_kg is not None:
+            faults.append("mass_kg would do nothing: points have their masses")
+        if not self.pinned and self.centre_of_mass_m is not None:
+            faults.append("centre_of_mass_m is that of a pinned body, from its pivot; this one is not pinned")
+        if self.points is not None and self.centre_of_mass_m is not None:
+            faults.append("centre_of_mass_m would do nothing: it follows from the points")
+        if self.inertia_about == "pivot":
+            if not self.pinned:
+                faults.append("inertia_about = 'pivot', but the body is not pinned")
+            if ways and ways[0] in ("solid", "points"):
+                faults.append(f"inertia_about would do nothing with {ways[0]}")
+        if not faults:
+            faults += self._impossible()
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    def _impossible(self) -> list[str]:
+        tensor = self.tensor
+        if tensor is None:
+            return []
+        if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():
+            return ["inertia_tensor_kg_m2 is not symmetric"]
+        if self.inertia_about == "pivot":
+            if why := impossible(tensor):
+                return [f"no body has this inertia: {why}"]
+            tensor = shifted(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
+            if why := impossible(tensor):
+                return [
+                    f"no body of this mass and centre of mass has this inertia about its pivot: about the centre of mass {why}"
+                ]
+            return []
+        why = impossible(tensor)
+        return [f"no body has this inertia: {why}"] if why else []
+
+    @property
+    def tensor(self) -> np.ndarray | None:
+        """The inertia tensor (3, 3) given by moments or as a tensor, about the point it is given about."""
+        if self.inertia_tensor_kg_m2 is not None:
+            return np.array(self.inertia_tensor_kg_m2)
+        return None if self.inertia_kg_m2 is None else np.diag(self.inertia_kg_m2)
+
+
+class BodyStart(Section):
+    """The first moment. Attitude and motion are relative to the frame where there is one."""
+
+    euler_angles_deg: Vector | None = None
+    """phi, theta, psi (3-1-3): Q = Rz(phi) Rx(theta) Rz(psi)"""
+    yaw_pitch_roll_deg: Vector | None = None
+    """yaw, pitch, roll (3-2-1): Q = Rz(yaw) Ry(pitch) Rx(roll)"""
+    quaternion_wxyz: Quaternion | None = None
+    """Quaternion, of any length but zero"""
+    rotation: Matrix | None = None
+    """Rows of Q, body to lab: x_lab = Q x_body"""
+    attitude_matrix: Matrix | None = None
+    """Rows of T = Q^T, lab to body, as texts on satellites have it"""
+    project: Flag = False
+    """Take the nearest rotation to the matrix given"""
+    euler_rates_rad_s: Vector | None = None
+    """phi', theta', psi'"""
+    angular_velocity_body_rad_s: Vector | None = None
+    """Along the body's axes"""
+    angular_velocity_lab_rad_s: Vector | None = None
+    """Along the lab's (or frame's) axes"""
+    position_m: Vector | None = None
+    """Of the centre of mass of a body that is not pinned"""
+    velocity_m_s: Vector | None = None
+    """Of the centre of mass of a body that is not pinned"""
+
+    @model_validator(mode="after")
+    def _one_of_each(self):
+        faults = []
+        attitudes = ("euler_angles_deg", "yaw_pitch_roll_deg", "quaternion_wxyz", "rotation", "attitude_matrix")
+        spins = ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")
+        for keys in (attitudes, spins):
+            given = [key for key in keys if getattr(self, key) is not None]
+            if len(given) > 1:
+                faults.append(f"give one of {', '.join(given)}")
+        matrix = self.rotation or self.attitude_matrix
+        if self.project and matrix is None:
+            faults.append("project would do nothing: no matrix is given")
+        if matrix is not None:
+            error = orthogonality_error(np.array([matrix]))
+            sense = np.linalg.det(matrix)
+            if self.project and sense <= 0:
+                faults.append(f"the matrix has determinant {sense:.3g}: no rotation is near it")
+            elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
+                what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"
+                faults.append(
+                    f"the matrix is no rotation: {what}, must be below {LARGEST_ORTHOGONALITY_ERROR:g}; "
+                    "project = true takes the nearest one"
+                )
+        if self.quaternion_wxyz is not None and not any(self.quaternion_wxyz):
+            faults.append("quaternion_wxyz is zero, which is no rotation")
+        if self.euler_rates_rad_s is not None:
+            if self.euler_angles_deg is None:
+                faults.append("euler_rates_rad_s needs euler_angles_deg")
+            elif self.euler_angles_deg[1] % 180 == 0:
+                faults.append(
+                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' turn about one and the "
+                    "same line there; give angular_velocity_body_rad_s"
+                )
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    @property
+    def attitude(self) -> np.ndarray:
+        """Q (3, 3), a rotation to rounding."""
+        if self.euler_angles_deg is not None:
+            return from_euler_angles(np.radians(self.euler_angles_deg))
+        if self.yaw_pitch_roll_deg is not None:
+            return from_yaw_pitch_roll(np.radians(self.yaw_pitch_roll_deg))
+        if self.quaternion_wxyz is not None:
+            return from_quaternion(self.quaternion_wxyz)
+        if self.rotation is not None:
+            return nearest_rotation(np.array(self.rotation))
+        if self.attitude_matrix is not None:
+            return nearest_rotation(from_attitude_matrix(np.array(self.attitude_matrix)))
+        return np.eye(3)
+
+    @property
+    def angular_velocity(self) -> np.ndarray:
+        """Along the body's axes (3,), rad/s."""
+        if self.euler_rates_rad_s is not None:
+            return angular_velocity_of_euler_rates(np.radians(self.euler_angles_deg), self.euler_rates_rad_s)
+        if self.angular_velocity_lab_rad_s is not None:
+            return self.attitude.T @ self.angular_velocity_lab_rad_s
+        return np.array(self.angular_velocity_body_rad_s or (0.0, 0.0, 0.0))
+
+
+class Gravity(Section):
+    """A uniform field."""
+
+    acceleration_m_s2: Vector = (0.0, 0.0, -9.81)
+    """Along the lab's (or frame's) axes"""
+
+
+class Timed(Section):
+    """What may be constant, in a window of time, or a table of values that straight lines join."""
+
+    times_s: Times | None = None
+    """Times of the values, increasing; then each quantity is a list of as many values"""
+    from_s: NonNegative | None = None
+    """When it begins"""
+    to_s: NonNegative | None = None
+    """When it ends"""
+
+    @field_validator("times_s")
+    @classmethod
+    def _increase(cls, times):
+        for k, (a, b) in enumerate(pairwise(times or ())):
+            if not b > a:
+                raise ValueError(f"must increase: entry {k + 1} is {b:g} after {a:g}")
+        return times
+
+    def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
+        """What is wrong between the times and these quantities; a single value is of type `entry`."""
+        faults = []
+        if self.times_s is not None and (self.from_s is not None or self.to_s is not None):
+            faults.append("from_s and to_s would do nothing beside times_s")
+        if not (self.to_s is None or self.to_s > (self.from_s or 0)):
+            faults.append(f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}")
+        for key, value in values.items():
+            if value is None:
+                continue
+            many = isinstance(value, tuple) and (entry is float or isinstance(value[0], tuple))
+            if self.times_s is None and many:
+                faults.append(f"{key} is a list of values: times_s is missing")
+            elif self.times_s is not None and not many:
+                faults.append(f"{key} is one value: with times_s it must be a list of {len(self.times_s)}")
+            elif many and len(value) != len(self.times_s):
+                faults.append(f"{key} has {len(value)} values for {len(self.times_s)} times")
+        return faults
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """When it begins and ends."""
+        return self.from_s or 0.0, inf if self.to_s is None else self.to_s
+
+
+class Applied(Timed):
+    """A force and a torque from outside."""
+
+    axes: Literal["lab", "body"] = "lab"
+    """Along which axes they are given: they stay fixed in the lab, or turn with the body"""
+    force_N: Vector | tuple[Vector, ...] | None = None
+    torque_N_m: Vector | tuple[Vector, ...] | None = None
+    at_m: Vector | None = None
+    """Point of the body where the force acts, body axes, from the centre of mass or the pivot; that point when not given"""
+
+    @model_validator(mode="after")
+    def _does_something(self):
+        faults = self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
+        if self.force_N is None and self.torque_N_m is None:
+            faults.append("needs force_N or torque_N_m")
+        if self.at_m is not None and self.force_N is None:
+            faults.append("at_m would do nothing without force_N")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class Friction(Section):
+    """Friction of bearings, about the body's axes, relative to the frame."""
+
+    viscous_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity, about each axis"""
+    dry_N_m: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque against any turning, about each axis"""
+
+
+class Fluid(Section):
+    """A fluid at rest around the body: resistance, buoyancy, the fluid it carries along. Along the body's axes."""
+
+    linear_resistance_kg_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Force per velocity"""
+    quadratic_resistance_kg_m: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Force per velocity squared"""
+    linear_rotational_resistance_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity"""
+    quadratic_rotational_resistance_N_m_s2: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity squared"""
+    density_kg_m3: Positive | None = None
+    """Of the fluid: displaced and added mass of a sphere or ellipsoid follow"""
+    displaced_mass_kg: NonNegative | None = None
+    """Mass of the fluid displaced: buoyancy is its weight"""
+    centre_of_buoyancy_m: Vector = (0.0, 0.0, 0.0)
+    """Where buoyancy acts, body axes, from the centre of mass or the pivot"""
+    added_mass_kg: NonNegativeVector | None = None
+    """Mass of fluid carried along each axis"""
+    added_inertia_kg_m2: NonNegativeVector | None = None
+    """Inertia of fluid carried about each axis"""
+
+
+class Frame(Timed):
+    """Axes that turn and an origin that is accelerated; motion is told relative to them."""
+
+    angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
+    """Of the frame, along its own axes"""
+    angular_acceleration_rad_s2: Vector | None = None
+    """Of the frame, along its own axes, constant from the start"""
+    origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
+    """Of the frame's origin, along the frame's axes; a field against it acts on the body"""
+
+    @model_validator(mode="after")
+    def _does_something(self):
+        timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
+        faults = self.timing_faults(timed, tuple)
+        if self.from_s is not None or self.to_s is not None:
+            faults.append("from_s and to_s mean nothing here; use times_s")
+        if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
+            faults.append("angular_acceleration_rad_s2 and times_s contradict each other")
+        if not any(timed.values()) and self.angular_acceleration_rad_s2 is None:
+            faults.append("needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class Wheel(Timed):
+    """A rotor on an axis fixed in the body. The body's inertia holds all of the wheel but its inertia about that axis."""
+
+    axis: Vector
+    """Its axis, body axes; only the direction counts"""
+    momentum_kg_m2_s: Number = 0.0
+    """Its angular momentum along the axis at the start, relative to the lab"""
+    motor_torque_N_m: Number | tuple[Number, ...] | None = None
+    """Torque of its motor on the wheel; the body feels the opposite"""
+
+    @model_validator(mode="after")
+    def _turns(self):
+        faults = self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
+        if not any(self.axis):
+            faults.append("axis is zero, which is no direction")
+        idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
+        if self.motor_torque_N_m is None and idle:
+            faults.append(f"{', '.join(idle)} would do nothing without motor_torque_N_m")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class ChangingInertia(Timed):
+    """Principal moments that follow time as told, along the same axes; mass and centre of mass stay."""
+
+    inertia_kg_m2: tuple[PositiveVector, ...]
+    """Principal moments at each time"""
+
+    @model_validator(mode="after")
+    def _is_a_table(self):
+        faults = self.timing_faults({"inertia_kg_m2": self.inertia_kg_m2}, tuple)
+        if self.times_s is None:
+            faults = ["times_s is missing"]
+        if self.from_s is not None or self.to_s is not None:
+            faults.append("from_s and to_s mean nothing here; use times_s")
+        for k, moments in enumerate(self.inertia_kg_m2):
+            if why := impossible(np.diag(moments)):
+                faults.append(f"no body has the inertia of entry {k}: {why}")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class Run(Section):
+    """How long, and how."""
+
+    duration_s: Positive
+    timestep_s: Positive
+    integrator: Literal[(*SCHEMES, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
+    """A scheme of flows, or a general solver of the textbook's equations: rk4, dop853, radau"""
+    formulation: Literal["matrix", "quaternion", "euler_angles"] | None = None
+    """Variables of the attitude under rk4, dop853 and radau; matrix when not given"""
+    relative_tolerance: Annotated[float, Strict(), Field(ge=1e-13, lt=1)] | None = None
+    """Of dop853 and radau; 1e-10 when not given"""
+    absolute_tolerance: Positive | None = None
+    """Of dop853 and radau; 1e-10 when not given"""
+
+    @model_validator(mode="after")
+    def _nothing_idle(self):
+        faults = []
+        if self.formulation is not None and self.integrator not in SOLVERS:
+            faults.append(f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}")
+        tolerances = [key for key in ("relative_tolerance", "absolute_tolerance") if getattr(self, key) is not None]
+        if tolerances and self.integrator not in ("dop853", "radau"):
+            faults.append(f"{', '.join(tolerances)} would do nothing with {self.integrator}")
+        if not self.duration_s / self.timestep_s < MOST_STEPS:
+            faults.append(f"duration_s / timestep_s is more than {MOST_STEPS:g} steps")
+        elif self.duration_s < 0.5 * self.timestep_s:
+            faults.append(f"duration_s = {self.duration_s:g} is less than one step of {self.timestep_s:g} s")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    @property
+    def steps(self) -> int:
+        """Number of steps: the duration in steps, rounded."""
+        return round(self.duration_s / self.timestep_s)
+
+
+class BodyOutput(Section):
+    """What is written, all into the run's own folder."""
+
+    interval_s: Positive | None = None
+    """Time between samples, in motion.csv and the trajectory; a two-thousandth of the duration when not given"""
+    npz: Flag = False
+    """Write motion.npz too, the same columns as arrays"""
+    trajectory: str | Literal[False] = "trajectory.xtc"
+    """Trajectory of the body's points for viewers; the ending chooses the format; false for none"""
+    topology: str = "topology.gro"
+    """File that viewers need beside the trajectory (.gro or .pdb)"""
+    trajectory_A_per_m: Positive | None = None
+    """Ångström in the trajectory for a metre; so that the body has a radius of 10 Å when not given. A second is a ps"""
+    figures: Flag = True
+    """Draw the motion"""
+    axis: Vector | None = None
+    """Body axis whose path is drawn; towards the centre of mass, or the axis of symmetry, or axis 3 when not given"""
+
+    @field_validator("trajectory")
+    @classmethod
+    def _trajectory_name(cls, name):
+        return name if name is False else _file_name(name, (".xtc", ".trr", ".nc", ".xyz", ".pdb"))
+
+    @field_validator("topology")
+    @classmethod
+    def _topology_name(cls, name: str):
+        return _file_name(name, (".gro", ".pdb"))
+
+    @model_validator(mode="after")
+    def _apart(self):
+        if self.topology == self.trajectory:
+            raise ValueError(f"topology and trajectory are both {self.topology}; name them apart")
+        if self.axis is not None and not any(self.axis):
+            raise ValueError("axis is zero, which is no direction")
+        return self
+
+
+class BodyScene(Scene):
+    """One body that moves."""
+
+    body: BodyTable
+    start: BodyStart = BodyStart()
+    gravity: Gravity | None = None
+    applied: tuple[Applied, ...] = ()
+    friction: Friction | None = None
+    fluid: Fluid | None = None
+    frame: Frame | None = None
+    wheels: tuple[Wheel, ...] = ()
+    changing_inertia: ChangingInertia | None = None
+    run: Run
+    output: BodyOutput = BodyOutput()
+
+    @property
+    def interval(self) -> float:
+        """Time between samples, s."""
+        return self.output.interval_s or self.run.duration_s / 2000
+
+    @classmethod
+    def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
+        """Faults between tables that may have faults of their own."""
+        tables = {key: value for key, value in data.items() if isinstance(value, dict)}
+        body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))
+        found = []
+        if body.get("pinned") is True:
+            found += [
+                (["start", key], "the body is pinned at a point and cannot be moved: leave it out")
+                for key in ("position_m", "velocity_m_s")
+                if key in start
+            ]
+            found += [
+                (["fluid", key], "the body is pinned at a point: no force of translation acts on it")
+                for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
+                if key in fluid
+            ]
+        ways = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2", "pinned")
+        if not any(key in body for key in ways) and "changing_inertia" not in data:
+            idle = [["start", key] for key in start if key not in ("position_m", "velocity_m_s")]
+            idle += [[key] for key in ("friction", "wheels") if key in data]
+            found += [(keys, "the body has no inertia: a point does not turn") for keys in idle]
+        if "changing_inertia" in data and any(key in body for key in ways[:4]):
+            key = next(key for key in ways[:4] if key in body)
+            found.append((["body", key], "changing_inertia says the inertia: leave out one of them"))
+        if "fluid" in data and "frame" in data:
+            found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
+        return [f"{_line(keys, text)}{'.'.join(keys)}: {fault}" for keys, fault in found]
+
+    @model_validator(mode="after")
+    def _whole(self):
+        faults = []
+        fluid, body = self.fluid, self.body
+        if fluid is not None:
+            if fluid.density_kg_m3 is not None:
+                if body.solid is None or body.solid.shape not in ("sphere", "ellipsoid") or body.pinned:
+                    faults.append("fluid.density_kg_m3 needs a body.solid that is a sphere or an ellipsoid, not pinned")
+                faults += [
+                    f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows"
+                    for key in ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
+                    if getattr(fluid, key) is not None
+                ]
+            if any(fluid.centre_of_buoyancy_m) and fluid.displaced_mass_kg is None and fluid.density_kg_m3 is None:
+                faults.append("fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or density_kg_m3")
+            if (fluid.displaced_mass_kg or fluid.density_kg_m3) and self.gravity is None:
+                faults.append("fluid: buoyancy needs [gravity]")
+        if self.output.interval_s is not None and self.output.interval_s > self.run.duration_s:
+            faults.append(f"output.interval_s = {self.output.interval_s:g} is longer than run.duration_s")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+def _line(keys: list[str], text: str) -> str:
+    line = line_of(keys, text)
+    return f"line {line}: " if line else ""

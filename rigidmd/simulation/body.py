@@ -1,0 +1,176 @@
+"""A single body: samples at even times, columns at the end, figures."""
+
+import contextlib
+from collections.abc import Callable
+
+import numpy as np
+
+from rigidmd.build.body import Pose, build_body
+from rigidmd.dynamics.engine import NotFiniteError
+from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.errors import SimulationError
+from rigidmd.forces.frame import Inertial
+from rigidmd.measure.body_summary import summarise_body
+from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
+from rigidmd.mechanics.rotor import SplitRotor
+from rigidmd.output.folder import SCENE_FILE
+from rigidmd.scene import BodyScene
+from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
+
+MOTION_FILE = "motion.csv"
+
+
+class BodySimulation(Simulation):
+    """A scene of a single body, ready to run. Besides the parameters of `Simulation`:
+
+    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass or
+        the pivot, and a torque (3,) in N m along the body's axes; asked before every kick
+    """
+
+    time_unit = "s"
+
+    def __init__(
+        self, scene: BodyScene, *arguments, applied: dict[str, Callable[[Pose], tuple]] | None = None, **options
+    ):
+        super().__init__(scene, *arguments, **options)
+        self.system = build_body(scene, applied)
+        self.threads = 1
+        self._reset()
+
+    def observe(self, moment: Moment) -> Pose:
+        """Position and motion in the body's own axes."""
+        return self.system.pose(moment.time, moment.state)
+
+    def _reset(self) -> None:
+        self.engine = self.system.engine()
+        self.state = self.system.state.copy()
+
+    def _prepare(self) -> None:
+        self._say("compiling (kept on disk: the next run starts at once)")
+        self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0, NoThermostat())
+        self._reset()
+
+    def _phases(self) -> list[Phase]:
+        return [Phase(self.scene.run.timestep_s, self.scene.run.steps)]
+
+    def _advance(self, k: int, steps: int, done: int) -> None:
+        self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, steps, NoThermostat(), done)
+
+    def _file_names(self) -> list[str]:
+        from rigidmd.output.body_figures import FIGURES
+
+        output = self.scene.output
+        names = [SCENE_FILE, MOTION_FILE, "motion.npz", "summary.json", output.topology]
+        figures = [f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "svg")]
+        return [*names, *figures, *([output.trajectory] if output.trajectory else [])]
+
+    def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
+        self._snapshots = []
+
+        def sample(moment: Moment) -> None:
+            self._snapshots.append(Snapshot(moment.time, self.state.copy(), self.engine.work()))
+
+        interval = self.scene.interval
+        return [Every(interval, sample), *(Every(interval, write) for write in self._writers(stack, results))]
+
+    def _writers(self, stack: contextlib.ExitStack, results: Results) -> list[Callable[[Moment], None]]:
+        output = self.scene.output
+        if self.folder is None:
+            times, frames = results._frames = ([], [])
+
+            def keep(moment: Moment) -> None:
+                times.append(moment.time)
+                frames.append(moment.site_positions.astype("float32"))
+
+            return [keep] if output.trajectory else []
+        from rigidmd.output.scene_file import write_body_scene
+        from rigidmd.output.trajectory import TrajectoryFile, write_topology
+
+        write_body_scene(self.folder, self.scene)
+        results.files.append(self.folder / SCENE_FILE)
+        if not output.trajectory:
+            return []
+        write_topology(self.folder / output.topology, self.system, self.state, False)
+        path = self.folder / output.trajectory
+        file = TrajectoryFile(path, self.system, self.scene.interval, path.suffix in (".trr", ".nc"), False)
+        stack.callback(file.close)
+        results.files += [self.folder / output.topology, path]
+        return [lambda moment: file.write(moment.state, moment.time, moment.step)]
+
+    def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
+        results.samples = motion(self.system, self._snapshots)
+        results.summary = summarise_body(self.system, results.samples, prepared, wall, computing[0], self._interrupted)
+        if self.folder is None:
+            return
+        from rigidmd.output.body_figures import draw_motion
+        from rigidmd.output.motion_file import write_csv, write_npz
+        from rigidmd.output.report import write_summary
+
+        columns = results.samples.columns
+        write_csv(self.folder / MOTION_FILE, columns)
+        results.files.append(self.folder / MOTION_FILE)
+        if self.scene.output.npz:
+            write_npz(self.folder / "motion.npz", columns)
+            results.files.append(self.folder / "motion.npz")
+        if self.scene.output.figures and len(columns["t"]) > 2:
+            results.files += draw_motion(self.folder, self.scene.name, **self._drawn(results.samples))
+        results.files.append(self.folder / "summary.json")
+        results.summary["files"] = [str(path) for path in results.files]
+        write_summary(self.folder / "summary.json", results.summary)
+
+    def _drawn(self, samples: Motion) -> dict:
+        """What the figures show: omega along the principal axes, where it lies on ellipsoids that stay."""
+        system = self.system
+        omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes if system.turns else []
+        own = {f"omega_body_{k + 1}": omega[:, k] for k in range(3)} if system.turns else {}
+        constant = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
+        return {
+            "columns": samples.columns | own,
+            "axis_body": drawn_axis(system),
+            "inertia": system.inertia if constant else None,
+            "invariants": samples.invariants,
+            "gravity": self.scene.gravity and self.scene.gravity.acceleration_m_s2,
+        }
+
+    def _explain(self, error: SimulationError) -> SimulationError:
+        if isinstance(error, NotFiniteError):
+            error = SimulationError(
+                f"after t = {self._snapshots[-1].time:g} s: position or momentum of the body is no finite number any "
+                "more; timestep_s is too long, or a force grows without bound"
+            )
+        if self.folder is None:
+            return error
+        from rigidmd.output.motion_file import write_csv
+
+        write_csv(self.folder / MOTION_FILE, motion(self.system, self._snapshots).columns)
+        return SimulationError(f"{error}. The motion so far: {self.folder / MOTION_FILE}")
+
+    def introduction(self) -> str:
+        """One line, before the run."""
+        system, run = self.system, self.scene.run
+        pinned = "" if system.flies else ", pinned"
+        return (
+            f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom} degrees of freedom; "
+            f"{run.steps} steps of {run.timestep_s:g} s, {run.integrator.replace('_', ' ')}"
+        )
+
+    def conclusion(self, results: Results) -> str:
+        """The summary as a person reads it."""
+        from rigidmd.output.report import body_summary_text
+
+        return body_summary_text(results.summary)
+
+    def start_energy(self) -> dict:
+        """Energies of the start in J, force in N along the lab's axes, torque in N m along the body's."""
+        self._prepare()
+        load, _ = self.engine.evaluate(self.state)
+        seen = motion(self.system, [Snapshot(0.0, self.state, 0.0)])
+        torque = load.torque_body @ self.system.axes.T
+        return {
+            "unit": "J",
+            "kinetic": float(seen["kinetic"][0]),
+            "potential": float(seen["potential"][0]),
+            "energy": float(seen["energy"][0]),
+            "force_N": load.force[0].tolist() if len(load.force) else None,
+            "torque_body_N_m": torque[0].tolist() if len(torque) else None,
+        }

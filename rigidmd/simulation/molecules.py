@@ -1,0 +1,260 @@
+"""Molecules: relief of overlaps, stages with thermostats, samples, log, trajectory."""
+
+import contextlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rigidmd.build.relief import Relief, relieve
+from rigidmd.build.system import build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
+from rigidmd.errors import SceneError, SimulationError
+from rigidmd.measure.observables import Observation, observe
+from rigidmd.measure.samples import Sample, Samples
+from rigidmd.measure.summary import summarise
+from rigidmd.output.folder import SCENE_FILE
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.molecules import WITH_VELOCITIES
+from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
+from rigidmd.units import BOLTZMANN, FEMTOSECOND
+
+STREAM_THERMOSTAT = 3  # see build.system for the others
+LAST_GOOD_STATE = "last_good_state.npz"
+
+
+class MolecularSimulation(Simulation):
+    """A scene of molecules, ready to run."""
+
+    time_unit = "ps"
+
+    def __init__(self, scene: MolecularScene, *arguments, **options):
+        super().__init__(scene, *arguments, **options)
+        self.system = build(scene)
+        self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
+        self._reset()
+
+    def observe(self, moment: Moment) -> Observation:
+        """Energies, temperatures, pressure."""
+        return observe(self.system, self.engine, self.state)
+
+    def _reset(self) -> None:
+        self.engine = Engine(self.system.model, self.system.terms)
+        self.state = self.system.state.copy()
+        numba.set_num_threads(self.threads)
+
+    def _file_names(self) -> list[str]:
+        """Every file that `run` may write."""
+        from rigidmd.output.scene_file import input_names
+
+        output = self.scene.output
+        names = [SCENE_FILE, output.topology, "log.csv", "final.npz", "energy.png", "summary.json", LAST_GOOD_STATE]
+        return [*names, *input_names(self.scene).values(), *([output.trajectory] if output.trajectory else [])]
+
+    def start(self) -> tuple[Observation, Relief | None]:
+        """The moment before the first step: what `run` starts from, measured, and the relief it took to get there."""
+        self._reset()
+        self._prepare()
+        return observe(self.system, self.engine, self.state), self._relief
+
+    def _prepare(self) -> None:
+        """Compile, and move apart what a lattice put too close."""
+        self._say("compiling (kept on disk: the next run starts at once)")
+        _, tallies = self.engine.evaluate(self.state)
+        if not all(np.isfinite(tally.energy) for tally in tallies.values()):
+            raise SceneError(
+                self.scene.source, ["the start has no finite energy: sites of different molecules coincide"]
+            )
+        first = self.scene.stages[0]
+        relief = None
+        if self.system.from_lattice:
+            radius = np.array([m.radius for m in self.system.species])
+            temperature = self.scene.start.temperature_K or first.temperature_K or 0.0
+            # At 0 K the scale is the deepest well between two sites.
+            thermal = BOLTZMANN * temperature or max((m.epsilon.max() for m in self.system.species), default=0.0)
+            if thermal > 0:
+                scale = self.system.smallest_diameter
+                relief = relieve(self.engine, self.state, radius, scale, thermal, first.timestep_fs * FEMTOSECOND)
+                if relief.excess > 1:
+                    raise SceneError(
+                        self.scene.source,
+                        [
+                            f"the molecules cannot be packed at {self.system.density:.3g} g/cm³ without overlap: after "
+                            f"{relief.steps} steps of relief the first time step would still change a momentum by "
+                            f"{relief.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
+                            "shorten timestep_fs of the first stage"
+                        ],
+                    )
+        for k in range(len(self.scene.stages)):
+            self.engine.advance(self.state, SCHEMES["velocity_verlet"], 0.0, 0, self._thermostat(k))
+        self.engine.forget()
+        self._relief = relief
+        self._thermostats = [self._thermostat(k) for k in range(len(self.scene.stages))]
+
+    def _thermostat(self, k: int) -> NamedTuple:
+        stage = self.scene.stages[k]
+        if stage.ensemble == "nve":
+            return NoThermostat()
+        seed = np.random.SeedSequence([self.scene.seed, STREAM_THERMOSTAT, k])
+        return VelocityRescaling(
+            BOLTZMANN * stage.temperature_K,
+            stage.thermostat_time_ps,
+            self.system.freedom.total,
+            np.random.Generator(np.random.Philox(seed)),
+            np.zeros(1),
+        )
+
+    def _heat(self, k: int) -> float:
+        """Energy that the thermostat of a stage has put in so far."""
+        thermostat = self._thermostats[k]
+        return float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
+
+    def _phases(self) -> list[Phase]:
+        return [Phase(stage.timestep_fs * FEMTOSECOND, stage.steps) for stage in self.scene.stages]
+
+    def _advance(self, k: int, steps: int, done: int) -> None:
+        stage = self.scene.stages[k]
+        dt = stage.timestep_fs * FEMTOSECOND
+        self.engine.advance(self.state, SCHEMES[stage.integrator], dt, steps, self._thermostats[k], done)
+
+    def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
+        results.samples = Samples()
+        log, writers = self._writers(stack, results)
+        return [Every(self.scene.output.log_interval_ps, self._sampler(results.samples, log)), *writers]
+
+    def _sampler(self, samples: Samples, log: Callable[[Sample], None]) -> Callable[[Moment], None]:
+        """An observer that turns moments into samples, logs them, and keeps the last good state."""
+        origin = {}
+
+        def sample(moment: Moment) -> None:
+            seen = moment.observation
+            conserved = seen.energy - self._heat(moment.stage)
+            if moment.stage not in origin:  # the stage began where the last sample was taken
+                origin[moment.stage] = samples.rows[-1].energy if samples.rows else conserved
+            samples.rows.append(
+                Sample(
+                    moment.step,
+                    moment.time,
+                    moment.stage,
+                    self.scene.stages[moment.stage].label,
+                    seen.potential,
+                    seen.kinetic,
+                    seen.energy,
+                    seen.temperature,
+                    seen.temperature_translation,
+                    seen.temperature_rotation,
+                    seen.pressure_bar,
+                    conserved,
+                    conserved - origin[moment.stage],
+                    float(np.linalg.norm(seen.momentum)),
+                    seen.orthogonality,
+                )
+            )
+            log(samples.rows[-1])
+            self._last_good = (moment.step, moment.time, self.state.copy())
+
+        return sample
+
+    def _writers(self, stack: contextlib.ExitStack, results: Results) -> tuple[Callable[[Sample], None], list[Every]]:
+        """What logs a sample, and the observers that write frames, or keep them where there is no folder."""
+        output = self.scene.output
+        wrapped = output.positions == "wrapped"
+        if self.folder is None:
+            times, frames = [], []
+            results._frames = (times, frames)
+
+            def keep(moment: Moment) -> None:
+                times.append(moment.time)
+                frames.append(self.system.site_positions(moment.state, wrapped).astype(np.float32))
+
+            return lambda sample: None, [Every(output.trajectory_interval_ps, keep)] if output.trajectory else []
+        from rigidmd.output.log import Log
+        from rigidmd.output.scene_file import write_scene
+        from rigidmd.output.trajectory import TrajectoryFile, write_topology
+
+        write_scene(self.folder, self.scene, self.system)
+        write_topology(self.folder / output.topology, self.system, self.state, wrapped)
+        log = Log(self.folder / "log.csv", self.system.space.volume, self.system.density)
+        stack.callback(log.close)
+        results.files += [self.folder / name for name in (SCENE_FILE, output.topology, "log.csv")]
+        writers = []
+        if output.trajectory:
+            path = self.folder / output.trajectory
+            velocities = path.suffix in WITH_VELOCITIES if output.velocities is None else output.velocities
+            file = TrajectoryFile(path, self.system, output.trajectory_interval_ps, velocities, wrapped)
+            stack.callback(file.close)
+            results.files.append(path)
+            writers.append(
+                Every(output.trajectory_interval_ps, lambda moment: file.write(moment.state, moment.time, moment.step))
+            )
+        return log.write, writers
+
+    def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
+        results.summary = summarise(
+            self.system, results.samples, self.state, self._relief, self.threads, prepared, wall, computing,
+            self._interrupted,
+        )  # fmt: skip
+        if self.folder is None:
+            return
+        from rigidmd.output.report import draw_energy, write_summary
+        from rigidmd.output.state import write_state
+
+        write_state(self.folder / "final.npz", self.system, self.state)
+        results.files.append(self.folder / "final.npz")
+        if self.scene.output.figure and len(results.samples.rows) > 1:
+            draw_energy(self.folder / "energy.png", self.system, results.samples, results.summary)
+            results.files.append(self.folder / "energy.png")
+        results.files.append(self.folder / "summary.json")
+        results.summary["files"] = [str(path) for path in results.files]
+        write_summary(self.folder / "summary.json", results.summary)
+
+    def _explain(self, error: SimulationError) -> SimulationError:
+        """When, where and what to do; the last good state is saved."""
+        step, time, state = self._last_good
+        where = ""
+        if self.folder is not None:
+            from rigidmd.output.state import write_state
+
+            write_state(self.folder / LAST_GOOD_STATE, self.system, state)
+            where = f" Last good state: {self.folder / LAST_GOOD_STATE}"
+        return SimulationError(
+            f"after step {step} ({time:g} ps): {error}. Molecules overlap or timestep_fs is too long; "
+            f"try a shorter one, or an nvt stage first.{where}"
+        )
+
+    def introduction(self) -> str:
+        """What is about to run."""
+        system, asked = self.system, self.scene.threads or 0
+        more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
+        first = (
+            f"{self.scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites, "
+            f"{system.freedom.total} degrees of freedom; {self.threads} threads{more}"
+        )
+        return "\n".join([first, *(f"  {note}" for note in system.notes)])
+
+    def conclusion(self, results: Results) -> str:
+        """The summary as a person reads it."""
+        from rigidmd.output.report import summary_text
+
+        return summary_text(results.summary)
+
+    def start_energy(self, size: float, unit: str) -> dict:
+        """Energies, virial, pressure and largest force of the start; energies in a unit of `size` u Å²/ps²."""
+        seen, relief = self.start()
+        force, molecule = seen.largest_force
+        return {
+            "unit": unit,
+            "molecules": len(self.system.model.species),
+            "relief_steps": relief.steps if relief else 0,
+            "components": {name: energy / size for name, energy in seen.components.items()},
+            "potential": seen.potential / size,
+            "kinetic": seen.kinetic / size,
+            "virial": float(seen.virial.trace()) / size,
+            "virial_tensor": (seen.virial / size).tolist(),
+            "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
+            "largest_force_per_A": force / size,
+            "largest_force_molecule": molecule + 1,
+        }
