@@ -182,8 +182,11 @@ class BodySystem:
 
 
 def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None = None) -> BodySystem:
-    """The system of a scene; applied: name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at
-    the centre of mass or pivot, and a torque (3,) in N m along the body's axes. Raises SceneError with every fault."""
+    """The system of a scene. Raises SceneError with every fault.
+
+    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass or
+        the pivot, and a torque (3,) in N m along the body's axes
+    """
     faults: list[str] = []
     mass, tensor, centre, points, names = _inertia(scene)
     added_mass, added_inertia, displaced = _carried_fluid(scene)
@@ -270,7 +273,7 @@ def _inertia(scene: BodyScene):
 
 
 def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
-    """Centre and tips of the axes (7, 3) of the homogeneous ellipsoid with this inertia tensor; of a point, its place."""
+    """Centre and tips of the axes (7, 3) of the homogeneous ellipsoid of this inertia tensor; of a point, its place."""
     moments, axes = np.linalg.eigh(tensor)
     half = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
     if not half.any():

@@ -25,7 +25,8 @@ def _body(system: BodySystem) -> str:
     moments = " ".join(f"{x:.9g}" for x in system.inertia)
     about = "the centre of mass" if system.flies else "the pivot"
     lines = [
-        f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of freedom"
+        f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, "
+        f"{system.degrees_of_freedom} degrees of freedom"
     ]
     if system.turns:
         lines.append(f"  principal moments about {about}: {moments} kg m²")

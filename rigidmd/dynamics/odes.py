@@ -122,7 +122,7 @@ def slopes(form, model, terms, state, load, time, y, dy):
         for k in range(3):
             i = (k + 1) % 3
             j = (k + 2) % 3
-            inertia, growth, carried, motor = moment_rates(model.rotor, time, k)
+            inertia, growth, _, motor = moment_rates(model.rotor, time, k)
             torque = N[k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
             if flies:
                 vi, vj = along(q, v, i), along(q, v, j)
@@ -144,7 +144,7 @@ def slopes(form, model, terms, state, load, time, y, dy):
 
 @kernel
 def singular(form, y, dy, dt):
-    """Whether Euler angles are nearer to theta = 0 or pi than the axis moves in a step of dt, or too near for rounding."""
+    """Whether theta is nearer to 0 or pi than the axis moves in a step of dt, or too near for rounding."""
     if form.variables != 3:
         return False
     s = sin(y[1])
@@ -153,7 +153,7 @@ def singular(form, y, dy, dt):
 
 @kernel
 def rk4(form, model, terms, state, load, y, stages, dt, origin, steps, cursor):
-    """Classical Runge-Kutta steps until cursor[0] = steps; cursor[1] counts the stages of a step, stages (5, variables)."""
+    """Classical Runge-Kutta until cursor[0] = steps; cursor[1]: stages done in a step; stages (5, variables)."""
     shift = (0.0, 0.5, 0.5, 1.0)
     while cursor[0] < steps:
         time = origin + cursor[0] * dt

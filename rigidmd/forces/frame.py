@@ -1,7 +1,7 @@
 """Accelerated frames: motion told relative to axes that turn, from an origin that may be accelerated.
 
 Momenta stay those relative to axes that do not turn, only written along the frame's axes. Then the frame adds one flow,
-a plain rotation of position, velocity and Q, and Coriolis, centrifugal and Euler forces come out without being computed.
+a plain rotation of position, velocity and Q; Coriolis, centrifugal and Euler forces come out without being computed.
 The acceleration of the origin is a uniform field.
 """
 

@@ -4,7 +4,7 @@ The flow of resistance alone, everything else held, is solved exactly on each ax
 half a step after the rest, which makes the step of order 2 and stable for any strength.
 """
 
-from math import exp, expm1, pi, sqrt, tan, tanh
+from math import copysign, exp, expm1, pi, sqrt, tan, tanh
 from typing import NamedTuple
 
 import numpy as np
@@ -137,8 +137,8 @@ def slowed(speed, dry, linear, quadratic, h):
         g = tan(0.5 * root * h) / root
     else:
         g = 0.5 * h
-    left = (s * (1 - linear * g) - 2 * dry * g) / (1 + (linear + 2 * quadratic * s) * g)
-    return left if speed > 0.0 else -left if left > 0.0 else 0.0
+    left = max(0.0, (s * (1 - linear * g) - 2 * dry * g) / (1 + (linear + 2 * quadratic * s) * g))
+    return copysign(left, speed)
 
 
 def braking(resistance, state, load, velocity, omega):

@@ -14,13 +14,13 @@ from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 
 class Matrix(NamedTuple):
-    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced; how well it holds is the accuracy control."""
+    """Nine direction cosines, Q' = Q hat(omega). Nothing enforces Q^T Q = 1: how well it holds is the accuracy control."""
 
     variables: int = 9
 
 
 class Quaternion(NamedTuple):
-    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced; how well it holds is the accuracy control."""
+    """w, x, y, z with q' = q (0, omega) / 2. Nothing enforces |q| = 1: how well it holds is the accuracy control."""
 
     variables: int = 4
 
@@ -48,7 +48,7 @@ def variables_of(form: Form, rotation: np.ndarray) -> np.ndarray:
 
 
 def read_attitude(form, y, rotation):
-    """Q (1, 3, 3) of the variables, in place. Neither normalised nor projected: Q of a quaternion is |q|² times a rotation."""
+    """Q (1, 3, 3) of the variables, in place. Nothing is normalised: Q of a quaternion is |q|² times a rotation."""
     raise TypeError("compiled code only")
 
 

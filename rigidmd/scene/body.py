@@ -133,9 +133,7 @@ class BodyTable(Section):
                 return [f"no body has this inertia: {why}"]
             tensor = shifted(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
             if why := impossible(tensor):
-                return [
-                    f"no body of this mass and centre of mass has this inertia about its pivot: about the centre of mass {why}"
-                ]
+                return [f"no body of this mass has this inertia about its pivot: about its centre of mass {why}"]
             return []
         why = impossible(tensor)
         return [f"no body has this inertia: {why}"] if why else []
@@ -204,8 +202,8 @@ class BodyStart(Section):
                 faults.append("euler_rates_rad_s needs euler_angles_deg")
             elif self.euler_angles_deg[1] % 180 == 0:
                 faults.append(
-                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' turn about one and the "
-                    "same line there; give angular_velocity_body_rad_s"
+                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' turn about "
+                    "one and the same line there; give angular_velocity_body_rad_s"
                 )
         if faults:
             raise ValueError("; ".join(faults))
@@ -294,7 +292,7 @@ class Applied(Timed):
     force_N: Vector | tuple[Vector, ...] | None = None
     torque_N_m: Vector | tuple[Vector, ...] | None = None
     at_m: Vector | None = None
-    """Point of the body where the force acts, body axes, from the centre of mass or the pivot; that point when not given"""
+    """Where the force acts, body axes, from the centre of mass or the pivot; there when not given"""
 
     @model_validator(mode="after")
     def _does_something(self):
@@ -366,7 +364,7 @@ class Frame(Timed):
 
 
 class Wheel(Timed):
-    """A rotor on an axis fixed in the body. The body's inertia holds all of the wheel but its inertia about that axis."""
+    """A rotor on an axis fixed in the body, whose inertia holds all of the wheel but its own about that axis."""
 
     axis: Vector
     """Its axis, body axes; only the direction counts"""

@@ -141,10 +141,10 @@ class Simulation(ABC):
             check_folder(self.folder, self._force, inputs)
         self._interrupted = False
         self._reset()
-        results = Results(self.system, self.state, None)
         began = clock.perf_counter()
         self._prepare()
         prepared = clock.perf_counter() - began
+        results = Results(self.system, self.state, None)
         if self.folder is not None:
             make_folder(self.folder, self._force, self._file_names(), inputs)
         with contextlib.ExitStack() as stack:

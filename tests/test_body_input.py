@@ -1,0 +1,108 @@
+"""Scenes of a body that cannot be what their author meant: each fault one clear message, all at once."""
+
+import pytest
+from conftest import ROOT
+
+from rigidmd.build.body import build_body
+from rigidmd.cli import main
+from rigidmd.errors import SceneError
+from rigidmd.scene import Scene
+
+RUN = {"duration_s": 1.0, "timestep_s": 0.01}
+TOP = {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 0.5], "pinned": True, "centre_of_mass_m": [0.0, 0.0, 1.0]}
+
+
+def faults(**tables):
+    with pytest.raises(SceneError) as caught:
+        build_body(Scene.from_dict({"body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 2.0, 2.5]}, "run": RUN} | tables))
+    return "\n".join(caught.value.faults)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 2.0, 4.0]}}, "triangle inequality"),
+        ({"body": {"mass_kg": 1.0, "inertia_tensor_kg_m2": [[1, 5.0, 0], [5.0, 1, 0], [0, 0, 1]]}}, "must not be negative"),
+        ({"body": {"mass_kg": 1.0, "inertia_tensor_kg_m2": [[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]]}}, "is not symmetric"),
+        ({"body": TOP | {"inertia_about": "pivot"}}, "inertia about its pivot: about its centre of mass"),
+        ({"body": {"mass_kg": -1.0}}, "must be greater than 0"),
+        ({"body": {}}, "mass_kg is missing"),
+        ({"body": {"mass_kg": 1.0, "solid": {"shape": "con", "radius_m": 1.0}}}, "did you mean cone?"),
+        ({"body": {"mass_kg": 1.0, "solid": {"shape": "cone", "radius_m": 1.0}}}, "a cone has height_m and radius_m, not radius_m"),
+        ({"body": {"mass_kg": 1.0, "solid": {"shape": "disk", "radius_m": 1.0}, "inertia_kg_m2": [1.0, 1, 1]}}, "give one of"),
+        ({"body": {"points": [{"mass_kg": 1.0, "position_m": [0.0, 0, 0]}], "mass_kg": 2.0}}, "mass_kg would do nothing"),
+        ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "this one is not pinned"),
+        ({"body": {"mass_kg": 1.0, "pinned": True}}, "nothing to move"),
+        ({"start": {"rotation": [[1.0, 0.01, 0], [0, 1, 0], [0, 0, 1]]}}, "|Q^T Q - 1| is 0.01"),
+        ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]]}}, "a reflection"),
+        ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]], "project": True}}, "no rotation is near it"),
+        ({"start": {"quaternion_wxyz": [0.0, 0, 0, 0]}}, "quaternion_wxyz is zero"),
+        ({"start": {"euler_angles_deg": [0.0, 0, 0], "euler_rates_rad_s": [1.0, 0, 0]}}, "euler_rates_rad_s with theta = 0"),
+        ({"start": {"euler_angles_deg": [0.0, 180, 0], "euler_rates_rad_s": [1.0, 0, 0]}}, "with theta = 180"),
+        ({"start": {"euler_rates_rad_s": [1.0, 0, 0]}}, "needs euler_angles_deg"),
+        ({"start": {"euler_angles_deg": [0.0, 1, 0], "quaternion_wxyz": [1.0, 0, 0, 0]}}, "give one of euler_angles_deg, quat"),
+        ({"body": TOP, "start": {"position_m": [0.0, 0, 1]}}, "start.position_m: the body is pinned"),
+        ({"body": TOP, "fluid": {"added_mass_kg": [1.0, 1, 1]}}, "no force of translation acts"),
+        ({"body": {"mass_kg": 1.0}, "start": {"euler_angles_deg": [0.0, 1, 0]}}, "a point does not turn"),
+        ({"body": {"mass_kg": 1.0}, "applied": [{"torque_N_m": [0.0, 1, 0]}]}, "a point cannot be turned"),
+        ({"friction": {"viscous_N_m_s": [1.0, -1, 0]}}, "must not be less than 0"),
+        ({"fluid": {"linear_resistance_kg_s": [1.0, -1, 0]}}, "must not be less than 0"),
+        ({"fluid": {"density_kg_m3": 1000.0}, "gravity": {}}, "needs a body.solid that is a sphere or an ellipsoid"),
+        ({"fluid": {"displaced_mass_kg": 1.0}}, "buoyancy needs [gravity]"),
+        ({"applied": [{"force_N": [[1.0, 0, 0], [2.0, 0, 0]], "times_s": [1.0, 1.0]}]}, "must increase: entry 1 is 1 after 1"),
+        ({"applied": [{"force_N": [[1.0, 0, 0]], "times_s": [0.0, 1.0]}]}, "has 1 values for 2 times"),
+        ({"applied": [{"force_N": [[1.0, 0, 0], [1.0, 0, 0]]}]}, "times_s is missing"),
+        ({"applied": [{"force_N": [1.0, 0, 0], "from_s": 2.0, "to_s": 1.0}]}, "to_s = 1 is not after from_s = 2"),
+        ({"applied": [{}]}, "needs force_N or torque_N_m"),
+        ({"frame": {}}, "needs angular_velocity_rad_s"),
+        ({"frame": {"angular_velocity_rad_s": [1.0, 0, 0]}, "fluid": {}}, "are not supported"),
+        ({"wheels": [{"axis": [0.0, 0, 0]}]}, "axis is zero"),
+        ({"wheels": [{"axis": [0.0, 0, 1], "to_s": 1.0}]}, "would do nothing without motor_torque_N_m"),
+        ({"changing_inertia": {"times_s": [0.0, 1.0], "inertia_kg_m2": [[1.0, 1, 1], [1.0, 1, 3]]}}, "triangle inequality"),
+        ({"run": RUN | {"formulation": "quaternion"}}, "formulation would do nothing with velocity_verlet"),
+        ({"run": RUN | {"integrator": "rk5"}}, "did you mean rk4?"),
+        ({"run": RUN | {"relative_tolerance": 1e-8}}, "would do nothing with velocity_verlet"),
+        ({"run": {"duration_s": 1.0, "timestep_s": 3.0}}, "less than one step"),
+        ({"output": {"interval_s": 3.0}}, "longer than run.duration_s"),
+        ({"output": {"axis": [0.0, 0, 0]}}, "axis is zero"),
+        ({"gravity": {"accelaration_m_s2": [0.0, 0, 1]}}, "did you mean acceleration_m_s2?"),
+        ({"stages": []}, "unknown key"),
+        ({"body": {"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}},
+          "start": {"angular_velocity_body_rad_s": [0.0, 0, 1]}}, "no inertia about an axis about which it is to turn"),
+        ({"body": {"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}},
+          "applied": [{"axes": "body", "torque_N_m": [0.0, 0, 1]}]}, "nothing resists a torque about the axis"),
+        ({"body": {"mass_kg": 1.0, "inertia_tensor_kg_m2": [[2.0, 0.1, 0], [0.1, 2.5, 0.2], [0, 0.2, 3.0]]},
+          "friction": {"viscous_N_m_s": [1.0, 0, 0]}}, "which are not principal axes of its inertia"),
+    ],
+)  # fmt: skip
+def test_each_fault_has_its_message(tables, message):
+    assert message in faults(**tables)
+
+
+def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        "[body]\nmass_kg = 1\ninertia_kg_m2 = [1, 2, 4]\npinned = true\n\n"
+        "[start]\nposition_m = [0, 0, 1]\nrotation = [[1, 0, 0], [0, 2, 0], [0, 0, 1]]\n\n"
+        "[friction]\nviscous_N_m_s = [1, -1, 0]\n\n"
+        "[[applied]]\ntimes_s = [0, 2, 1]\nforce_N = [[1, 0, 0], [0, 0, 0], [0, 0, 0]]\n\n"
+        "[run]\nduration_s = 1\ntimestep_s = 0.01\nintegrater = 'rk4'\n"
+    )
+    assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    for part in (
+        "6 faults", "line 1: body: no body has this inertia", "line 7: start.position_m: the body is pinned",
+        "line 6: start: the matrix is no rotation", "line 11: friction.viscous_N_m_s.1: is -1, must not be less than 0",
+        "line 14: applied.0.times_s: must increase: entry 2 is 1 after 2",
+        "line 20: run.integrater: unknown key; did you mean integrator?",
+    ):  # fmt: skip
+        assert part in said, part
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_energy_of_a_body_is_in_joule(capsys):
+    scene = str(ROOT / "systems" / "fast_heavy_top.toml")
+    assert main(["energy", scene, "--unit", "K"]) == 2
+    assert "the energy of a body is in J" in capsys.readouterr().err
+    assert main(["energy", scene]) == 0
+    assert "5435.696790865" in capsys.readouterr().out

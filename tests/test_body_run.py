@@ -1,0 +1,140 @@
+"""A run of a single body from end to end: the commands, every file written and read back, interruption."""
+
+import csv
+import json
+
+import MDAnalysis as mda
+import numpy as np
+import pytest
+from conftest import BODIES, ROOT
+
+import rigidmd
+from rigidmd.cli import main
+from rigidmd.errors import SimulationError
+from rigidmd.scene import Scene
+from rigidmd.simulation import Every, Simulation
+
+TOP = ROOT / "systems" / "heavy_top_3.toml"
+SHORT = ["--set", "run.duration_s=0.05"]
+
+
+def read(path):
+    with path.open() as file:
+        rows = list(csv.reader(file))
+    return dict(zip(rows[0], np.array(rows[1:], dtype=float).T, strict=True))
+
+
+def test_a_run_leaves_what_it_promises(tmp_path, capsys):
+    folder = tmp_path / "top"
+    assert main(["run", str(TOP), "-o", str(folder), "--set", "output.npz=true", *SHORT]) == 0
+    said = capsys.readouterr().out
+    for part in ("3 degrees of freedom", "L_z error", "orthogonality", "motion.csv", "axis.png"):
+        assert part in said
+    names = {path.name for path in folder.iterdir()} - {".rigidmd-run"}
+    figures = {
+        f"{name}.{end}" for name in ("axis", "angles", "ellipsoids", "path", "invariants") for end in ("png", "svg")
+    }
+    files = {"scene.toml", "motion.csv", "motion.npz", "summary.json", "topology.gro", "trajectory.xtc"}
+    assert names == figures | files
+    assert (folder / "axis.png").read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in (folder / "axis.svg").read_bytes()[:1000]
+    columns = read(folder / "motion.csv")
+    wanted = ["t", "x", "y", "z", "vx", "vy", "vz", *(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "qw", "qx", "qy",
+              "qz", "phi", "theta", "psi", "kinetic", "potential", "energy", "work"]  # fmt: skip
+    wanted += [f"{name}_body_{k}" for name in ("omega", "L") for k in (1, 2, 3)]
+    wanted += [f"{name}_lab_{k}" for name in ("omega", "L") for k in "xyz"]
+    assert set(wanted) <= set(columns)
+    assert {"energy_error", "L_z_error", "L_3_error", "orthogonality_error"} <= set(columns)
+    # the same from Python, to the last bit
+    scene = rigidmd.Scene.read(TOP, {"run.duration_s": 0.05})
+    results = rigidmd.Simulation(scene).run()
+    with np.load(folder / "motion.npz") as stored:
+        for name, column in columns.items():
+            assert column.tobytes() == results[name].tobytes() == stored[name].tobytes(), name
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["steps"] == 100
+    assert summary["largest_relative_error"]["energy"] < 1e-12
+    # nothing is overwritten unasked
+    assert main(["run", str(TOP), "-o", str(folder), *SHORT]) == 2
+    assert main(["run", str(TOP), "-o", str(folder), "--force", *SHORT]) == 0
+    # the resolved scene is the same run
+    again = Simulation(Scene.read(folder / "scene.toml")).run()
+    assert again["theta"].tobytes() == results["theta"].tobytes()
+
+
+def test_columns_agree_with_each_other():
+    results = Simulation(Scene.read(ROOT / "systems" / "gyroscope_friction.toml",
+                                    {"run.duration_s": 0.2, "output.interval_s": 1e-4})).run()  # fmt: skip
+    q = np.stack([results[f"q{i}{j}"] for i in (1, 2, 3) for j in (1, 2, 3)], -1).reshape(-1, 3, 3)
+    w = np.stack([results[f"omega_body_{k}"] for k in (1, 2, 3)], -1)
+    x = np.stack([results[k] for k in "xyz"], -1)
+    assert x == pytest.approx(0.04 * q[:, :, 2], abs=1e-15)
+    speed = np.gradient(x, results["t"], axis=0, edge_order=2)
+    assert np.abs(speed - np.stack([results[f"v{k}"] for k in "xyz"], -1)).max() < 1e-4 * np.abs(speed).max()
+    lab = np.stack([results[f"omega_lab_{k}"] for k in "xyz"], -1)
+    assert lab == pytest.approx(np.einsum("tij,tj->ti", q, w), abs=1e-12)
+    assert results["L_body_3"] == pytest.approx(1.2e-4 * w[:, 2], rel=1e-14)
+    assert results["kinetic"] == pytest.approx(0.5 * (w**2 @ results.system.inertia), rel=1e-13)
+    assert results["potential"] == pytest.approx(0.15 * 9.81 * results["z"], abs=1e-15)
+    quaternion = np.stack([results[k] for k in ("qw", "qx", "qy", "qz")], -1)
+    assert np.abs(np.diff(quaternion, axis=0)).max() < 0.1  # its sign does not jump
+    theta = np.arccos(q[:, 2, 2])
+    assert results["theta"] == pytest.approx(theta, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", ["trajectory.xtc", "t.trr", "t.nc", "t.xyz", "t.pdb"])
+def test_trajectories_show_the_body(name, tmp_path):
+    scene = Scene.read(ROOT / "systems" / "body_in_fluid.toml", {
+        "run.duration_s": 0.05, "output.interval_s": 0.01, "output.trajectory": name, "output.figures": False,
+        "start.velocity_m_s": [0.3, 0.2, 0.1]})  # fmt: skip
+    results = Simulation(scene, tmp_path / "run").run()
+    universe = mda.Universe(str(tmp_path / "run" / "topology.gro"), str(tmp_path / "run" / name))
+    assert len(universe.trajectory) == 6
+    system = results.system
+    assert system.scale == pytest.approx(10 / 0.2)  # the half-axis of 0.2 m is drawn with 10 Å
+    for k, frame in enumerate(universe.trajectory):
+        centre = np.array([results[c][k] for c in "xyz"]) * 50
+        assert universe.atoms.positions.mean(axis=0) == pytest.approx(centre, abs=0.01)
+        span = np.linalg.norm(universe.atoms.positions - centre, axis=1).max()
+        assert span == pytest.approx(10, abs=0.02)
+        if name in ("t.trr", "t.nc"):
+            speed = np.array([results["v" + c][k] for c in "xyz"]) * 50
+            assert frame.velocities.mean(axis=0) == pytest.approx(speed, abs=1e-3)
+        if name not in ("t.xyz", "t.pdb"):
+            assert frame.time == pytest.approx(0.01 * k, abs=1e-6)
+    in_memory = Simulation(scene).run().universe()
+    assert len(in_memory.trajectory) == 6
+
+
+@pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
+def test_check_tells_every_scene(path, capsys):
+    assert main(["check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "degrees of freedom" in said
+    assert "left out:" in said
+    assert "pair forces" in said
+
+
+def test_an_observer_sees_the_body_and_an_interrupted_run_keeps_what_it_has(tmp_path):
+    poses = []
+
+    def look(moment):
+        poses.append(moment.observation)
+        if moment.time > 0.02:
+            simulation._interrupted = True
+
+    scene = Scene.read(TOP, {"output.figures": False})
+    simulation = Simulation(scene, tmp_path / "run", observers=[Every(0.005, look)])
+    results = simulation.run()
+    assert results.interrupted
+    assert results["t"][-1] == pytest.approx(0.025)
+    assert read(tmp_path / "run" / "motion.csv")["t"][-1] == results["t"][-1]
+    assert poses[-1].rotation[2, 2] == pytest.approx(np.cos(results["theta"][-1]), abs=1e-14)
+
+
+def test_a_run_that_fails_keeps_the_motion_so_far(tmp_path):
+    scene = Scene.read(TOP, {"output.figures": False, "run.integrator": "rk4", "run.formulation": "euler_angles",
+                             "start.euler_angles_deg": [0.0, 1e-3, 0.0], "start.euler_rates_rad_s": [0.0, -5.0, 0.0]})  # fmt: skip
+    with pytest.raises(SimulationError, match=r"singular at t = .* too near 0"):
+        Simulation(scene, tmp_path / "run").run()
+    assert len(read(tmp_path / "run" / "motion.csv")["t"]) >= 1
