@@ -176,7 +176,7 @@ def rotor_end(t_end):
         w = np.linalg.solve(tensor, angular - rotors(t))
         weight = 2 * (np.array([0, 0, -9.81]) - [1.0, 0.5, 0.2])
         n = np.cross(arm, q.T @ frame @ weight) + q.T @ frame @ [0.5, 0.2, -0.3]
-        n += np.cross([0.2, 0.0, 0.1], [1.0, 2.0, -1.0]) + [0.0, 0.1, 0.0]
+        n += np.cross([0.2, 0.0, 0.1], [1.0, 2.0, -1.0]) + np.array([0.0, 0.1, 0.0])
         n += np.cross([0.0, 0.3, 0.0], q.T @ frame @ [0.0, 3 * t, 1.0])
         n -= 0.2 * (w - q.T @ turning)
         return np.concatenate([(q @ hat(w)).ravel(), np.cross(angular, w) + n])

@@ -35,10 +35,10 @@ def liquid():
     return simulation.system, simulation.engine, state
 
 
-def run(engine, state, dt, steps, thermostat=None):
+def run(engine, state, dt, steps, scheme=VERLET):
     moved = state.copy()
     engine.forget()
-    engine.advance(moved, VERLET, dt, steps, thermostat or NoThermostat())
+    engine.advance(moved, scheme, dt, steps, NoThermostat())
     return moved
 
 
@@ -56,14 +56,16 @@ def test_the_energy_error_is_of_order_two(liquid):
     assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.1)
 
 
-def test_trajectories_converge_with_order_two():
+@pytest.mark.parametrize(("name", "steps"), [("velocity_verlet", 32), ("suzuki_4", 32), ("kahan_li_6", 24)])
+def test_trajectories_converge_with_the_order_of_the_scheme(name, steps):
     _, engine, state = built({"spce": 2}, None, 8, start={"temperature_K": 50.0})
     state.position[1] = state.position[0] + [3.0, 0.4, 0.1]
-    ends = [run(engine, state, 0.064 / steps, steps) for steps in (32, 64, 128, 256)]
+    ends = [run(engine, state, 0.064 / n, n, scheme=SCHEMES[name]) for n in (steps, 2 * steps, 4 * steps, 8 * steps)]
     gaps = [
         max(np.abs(a.position - b.position).max(), np.abs(a.rotation - b.rotation).max()) for a, b in pairwise(ends)
     ]
-    assert np.log2(np.array(gaps[:-1]) / gaps[1:]) == pytest.approx([2, 2], abs=0.1)
+    order = SCHEMES[name].order
+    assert np.log2(np.array(gaps[:-1]) / gaps[1:]) == pytest.approx([order, order], abs=0.1)
 
 
 def test_time_can_be_reversed(liquid):

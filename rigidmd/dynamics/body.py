@@ -19,7 +19,7 @@ class Body(NamedTuple):
     resistance: NoResistance | Resistance = NoResistance()
 
 
-@implements(kick)
+@implements(kick, inline=True)
 def _kick_body(model, state, load, h):
     if not is_a(model, Body):
         return None
@@ -36,7 +36,7 @@ def _kick_body(model, state, load, h):
     return kick_body
 
 
-@implements(drift)
+@implements(drift, inline=True)
 def _drift_body(model, state, h):
     if not is_a(model, Body):
         return None
@@ -49,7 +49,7 @@ def _drift_body(model, state, h):
     return drift_body
 
 
-@implements(lose)
+@implements(lose, inline=True)
 def _lose_body(model, state, h):
     if not is_a(model, Body):
         return None

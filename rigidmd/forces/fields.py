@@ -40,7 +40,7 @@ class Told(NamedTuple):
     work: np.ndarray  # (1,) done on the body so far
 
 
-@implements(add_forces)
+@implements(add_forces, inline=True)
 def _add_steady_force(term, state, load, tally):
     if not is_a(term, SteadyForce):
         return None

@@ -99,7 +99,7 @@ def add_term(term, state, load, tally):
     return add_forces(term, state, load, tally)
 
 
-@kernel
+@kernel(inline=True)
 def load_bodies(terms, state, load):
     """Forces and torques of all terms (a tuple) at the present positions; the worst status code."""
     load.force[:] = 0.0
@@ -110,7 +110,7 @@ def load_bodies(terms, state, load):
     return status
 
 
-@kernel
+@kernel(inline=True)
 def account(terms, model, state, load, h):
     """`spend` of all terms."""
     for term in literal_unroll(terms):

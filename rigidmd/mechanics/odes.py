@@ -14,13 +14,13 @@ from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 
 class Matrix(NamedTuple):
-    """Nine direction cosines, Q' = Q hat(omega). Nothing enforces Q^T Q = 1: how well it holds is the accuracy control."""
+    """Nine direction cosines, Q' = Q hat(omega). Nothing enforces Q^T Q = 1: how well it holds is the control."""
 
     variables: int = 9
 
 
 class Quaternion(NamedTuple):
-    """w, x, y, z with q' = q (0, omega) / 2. Nothing enforces |q| = 1: how well it holds is the accuracy control."""
+    """w, x, y, z with q' = q (0, omega) / 2. Nothing enforces |q| = 1: how well it holds is the control."""
 
     variables: int = 4
 

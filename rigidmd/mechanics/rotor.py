@@ -127,8 +127,19 @@ def sine_and_versine(angle):
     """sin and 1 - cos, which a turn adds to what it turns.
 
     cos² + sin² is 1 only to rounding, and a turn by the same angle repeats the same error at every step: written as a
-    change, its error is smaller by the angle squared, and only the sum rounds, differently every time.
+    change, its error is smaller by the angle squared, and only the sum rounds, differently every time. Below a quarter
+    of a radian, where steps are, Taylor's series are good to 1e-17 and half as long as two calls of the library.
     """
+    x = angle * angle
+    if x < 0.0625:
+        x2 = x * x
+        odd = (1 - 1 / 6 * x) + x2 * (
+            (1 / 120 - 1 / 5040 * x) + x2 * ((1 / 362880 - 1 / 39916800 * x) + 1 / 6227020800 * x2)
+        )
+        even = (1 / 2 - 1 / 24 * x) + x2 * (
+            (1 / 720 - 1 / 40320 * x) + x2 * ((1 / 3628800 - 1 / 479001600 * x) + 1 / 87178291200 * x2)
+        )
+        return angle * odd, x * even
     s = sin(angle)
     c = cos(angle)
     return s, (s * s / (1 + c) if c > 0 else 1 - c)

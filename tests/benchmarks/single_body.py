@@ -1,0 +1,165 @@
+"""Error against run time of a heavy top, every integrator of the engine and SciPy's DOP853, alternating in one run.
+
+    python tests/benchmarks/single_body.py
+
+writes results/single_body.csv and results/single_body.png and prints the table of README. The top is that of
+systems/heavy_top_3.toml for 20 nutations; the error is that of Q at the end against the elliptic solution. SciPy solves
+the 12-variable system (direction cosines and angular velocity) once with a right-hand side in plain Python as a user
+would write it, once through this engine (integrator = "dop853"). Medians of five; one thread.
+"""
+
+import csv
+import sys
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import known
+
+from rigidmd.dynamics.odes import OdeEngine, Solver
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.scene import Scene
+from rigidmd.simulation import Simulation
+
+ROOT = Path(__file__).parents[2]
+RESULTS = Path(__file__).parent / "results"
+NUTATIONS, REPEATS = 20, 5
+STEPS = {  # a nutation
+    "velocity_verlet": (60, 100, 300, 1000, 3000, 10000, 30000, 100000),
+    "suzuki_4": (10, 15, 30, 60, 120, 250, 500, 1000),
+    "kahan_li_6": (6, 8, 11, 16, 25, 40, 60, 100, 160),
+    "kahan_li_8": (4, 6, 9, 12, 16, 22, 32, 45),
+}
+TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13)
+PYTHON, COMPILED = "DOP853, slopes in Python", "DOP853 through this engine"
+
+
+def main():
+    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"output.trajectory": False})
+    system = Simulation(scene).system
+    i1, _, i3 = (float(x) for x in system.inertia)
+    mgl = system.mass * 9.81 * float(system.centre[2])
+    top = known.LagrangeTop(i1, i3, mgl, np.radians(40), 0.0, 0.0, 60.0)
+    end = NUTATIONS * top.period
+    exact = top.rotation(np.array([end]))[0]
+    start = system.state
+    y0 = np.concatenate([start.rotation.ravel(), start.angular_momentum_body[0] / system.inertia])
+
+    def slopes(t, y):
+        q11, q12, q13, q21, q22, q23, q31, q32, q33, p, q, r = y
+        return [
+            q12 * r - q13 * q, q13 * p - q11 * r, q11 * q - q12 * p,
+            q22 * r - q23 * q, q23 * p - q21 * r, q21 * q - q22 * p,
+            q32 * r - q33 * q, q33 * p - q31 * r, q31 * q - q32 * p,
+            ((i1 - i3) * q * r + mgl * q32) / i1, ((i3 - i1) * p * r - mgl * q31) / i1, 0.0,
+        ]  # fmt: skip
+
+    def flows(name, n):
+        engine, state = system.engine(), start.copy()
+        began = time.perf_counter()
+        engine.advance(state, SCHEMES[name], top.period / n, NUTATIONS * n, NoThermostat())
+        return time.perf_counter() - began, state.rotation[0]
+
+    def python(tolerance):
+        began = time.perf_counter()
+        y = solve_ivp(slopes, (0, end), y0, method="DOP853", rtol=tolerance, atol=tolerance).y[:, -1]
+        return time.perf_counter() - began, y[:9].reshape(3, 3)
+
+    def compiled(tolerance):
+        engine, state = OdeEngine(system.body, system.terms), start.copy()
+        began = time.perf_counter()
+        engine.advance(state, Solver("dop853", "matrix", tolerance, tolerance), end, 1, NoThermostat())
+        return time.perf_counter() - began, state.rotation[0]
+
+    cases = [(name, n, lambda name=name, n=n: flows(name, n)) for name, ns in STEPS.items() for n in ns]
+    cases += [(PYTHON, tolerance, lambda t=tolerance: python(t)) for tolerance in TOLERANCES]
+    cases += [(COMPILED, tolerance, lambda t=tolerance: compiled(t)) for tolerance in TOLERANCES]
+    seconds = {key[:2]: [] for key in cases}
+    errors = {}
+    for repeat in range(REPEATS + 1):
+        for name, setting, run in cases:
+            spent, rotation = run()
+            if repeat:  # the first one compiles
+                seconds[name, setting].append(spent)
+            errors[name, setting] = float(np.abs(rotation - exact).max())
+    rows = [(name, setting, median(seconds[name, setting]), errors[name, setting]) for name, setting, _ in cases]
+    with (RESULTS / "single_body.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["method", "steps a nutation or tolerance", "seconds", "error of Q at the end"])
+        writer.writerows(rows)
+    speed(system, start, top)
+    table(rows)
+    draw(rows)
+
+
+def speed(system, start, top):
+    """Steps a second of velocity Verlet, one call of a million steps."""
+    spent = []
+    for _ in range(REPEATS):
+        engine, state = system.engine(), start.copy()
+        began = time.perf_counter()
+        engine.advance(state, SCHEMES["velocity_verlet"], top.period / 1e4, 1_000_000, NoThermostat())
+        spent.append(time.perf_counter() - began)
+    print(f"velocity Verlet, one core: {1 / median(spent):.2f} million steps a second\n")
+
+
+def curve(rows, names):
+    """(errors, seconds) of the fastest of these methods for each error, errors descending."""
+    points = sorted(((error, spent) for name, _, spent, error in rows if name in names), key=lambda point: point[1])
+    front = []
+    for error, spent in points:
+        if not front or error < front[-1][0]:
+            front.append((error, spent))
+    return np.array(front).T
+
+
+def seconds_for(error, front):
+    """Seconds to reach an error, along straight lines between the logarithms; NaN outside."""
+    errors, spent = front
+    if not errors.min() <= error <= errors.max():
+        return np.nan
+    return float(np.exp(np.interp(np.log(error), np.log(errors[::-1]), np.log(spent[::-1]))))
+
+
+def table(rows):
+    """Times at equal error, and how many times faster the best of the engine's integrators is."""
+    own, python, compiled = (curve(rows, names) for names in (tuple(STEPS), (PYTHON,), (COMPILED,)))
+    print(
+        "| error of Q | best integrator here | DOP853, slopes in Python | ratio | DOP853 through this engine | ratio |\n|---|---|---|---|---|---|"
+    )
+    for error in (1e-4, 1e-6, 1e-8, 1e-10):
+        best = min(STEPS, key=lambda name: np.nan_to_num(seconds_for(error, curve(rows, (name,))), nan=np.inf))
+        a, b, c = (seconds_for(error, front) for front in (own, python, compiled))
+        print(
+            f"| {error:.0e} | {best}, {a * 1e3:.2f} ms | {b * 1e3:.0f} ms | {b / a:.0f} | {c * 1e3:.0f} ms | {c / a:.0f} |"
+        )
+
+
+def draw(rows):
+    """Log error against log run time."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.5, 5), layout="constrained")
+    axis = figure.subplots()
+    colors = dict(
+        zip([*STEPS, PYTHON, COMPILED], ["#8fb4cf", "#5a93bb", "#2b6f9e", "#123d5c", "#c8553d", "#e2a08f"], strict=True)
+    )
+    for name, color in colors.items():
+        errors, spent = zip(*[(error, spent) for method, _, spent, error in rows if method == name], strict=True)
+        axis.loglog(spent, errors, "o-", ms=4, lw=1.3, color=color, label=name.replace("_", " "))
+    axis.set_xlabel("seconds")
+    axis.set_ylabel("error of Q after 20 nutations")
+    axis.set_title("a heavy top: error against run time", loc="left", fontsize=11)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(frameon=False, fontsize=8)
+    figure.savefig(RESULTS / "single_body.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()
