@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
     except MemoryError:
-        print(f"rigidmd: {options.scene}: not enough memory; take fewer molecules", file=sys.stderr)
+        print(f"rigidmd: {options.scene}: not enough memory; take fewer molecules or samples", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         sys.stderr.close()
@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="rigidmd",
-        description="Molecular dynamics of rigid molecules, from a scene file.",
+        description="Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene file.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -125,7 +125,14 @@ def _read_scene(options: argparse.Namespace, **more):
 
 
 def _run(options: argparse.Namespace) -> int:
-    scene = _read_scene(options, **({} if options.threads is None else {"threads": options.threads}))
+    scene = _read_scene(options)
+    if options.threads is not None:
+        from rigidmd.errors import SceneError
+        from rigidmd.scene import BodyScene
+
+        if isinstance(scene, BodyScene):
+            raise SceneError(scene.source, ["--threads is for molecules; one body is moved by one thread"])
+        scene = _read_scene(options, threads=options.threads)
     folder = Path(options.output) if options.output else Path("runs") / scene.name
     from rigidmd.output.folder import check_folder
 

@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -21,14 +22,23 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
-def faults_of(error: ValidationError, model: type[BaseModel], text: str = "") -> list[str]:
-    """One sentence for each complaint of pydantic: line (if the TOML text is given), key, what was expected."""
+def faults_of(
+    error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
+) -> list[str]:
+    """One sentence for each complaint of pydantic: line (if the TOML text is given), key, what was expected.
+
+    overridden : dotted keys whose values come from the command line and stand on no line
+    """
     faults = {}
     for detail in error.errors():
         keys = [key for key in detail["loc"] if not _is_union_branch(key)]
+        if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
+            keys = keys[:-1]  # an entry that a list lacks: the list is what is wrong
         path = ".".join(str(key) for key in keys)
         line = line_of(keys, text)
         where = (f"line {line}: " if line else "") + (path or "scene")
+        if any(f"{path}.".startswith(f"{key}.") for key in overridden):
+            where = f"--set {path}"
         faults.setdefault((where, path), []).append(_sentence(detail, keys, model))
     # A value that may be several things gets one complaint from pydantic for each of them: say them as one. What is
     # wrong inside a value says more than that the whole is wrong.
@@ -51,8 +61,12 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     match detail["type"]:
         case "extra_forbidden":
             return "unknown key" + _suggestion(str(keys[-1]), _known_keys(model, keys[:-1]))
+        case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
+            return f"has {len(value)} entries, needs more"
         case "missing":
             return "is missing"
+        case "too_long":
+            return f"has {context['actual_length']} entries, must not have more than {context['max_length']}"
         case "greater_than":
             return f"is {shown}, must be greater than {context['gt']:g}"
         case "greater_than_equal":
@@ -73,6 +87,8 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
         case "too_short":
             least = context["min_length"]
             return f"has {context['actual_length']} entries, needs at least {least}"
+        case "tuple_type" | "list_type" if isinstance(value, dict):
+            return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
         case "tuple_type" | "list_type":
             return f"is {shown}, must be a list"
         case "model_type" | "model_attributes_type" | "dict_type":

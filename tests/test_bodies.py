@@ -346,10 +346,10 @@ def test_dropped_stone_and_the_same_fall_from_outside():
         "output": {"trajectory": False},
     })  # fmt: skip
 
-    def gravity(pose):
+    def weight(pose):
         return from_vector(turning * pose.time) @ [0, 0, -9.806], np.zeros(3)
 
-    seen = Simulation(outside, applied={"gravity": gravity}).run()
+    seen = Simulation(outside, applied={"weight": weight}).run()
     back = from_vector(-turning * seen["t"][:, None])
     assert np.abs(np.einsum("tij,tj->ti", back, vectors(seen, "", "xyz")) - place).max() < 1e-10
 
@@ -403,7 +403,14 @@ def free_body(inertia, omega, duration, dt, integrator="kahan_li_8", **more):
 
 def turned_alone(inertia, momentum, dt, steps, scheme):
     """L in the body frame (3,) of a free body with any moments after so many steps: a scene refuses what no mass has."""
-    state = State(np.zeros((0, 3)), np.zeros((0, 3)), np.eye(3)[None].copy(), np.array([momentum], float), np.zeros(1))
+    state = State(
+        np.zeros((0, 3)),
+        np.zeros((0, 3)),
+        np.eye(3)[None].copy(),
+        np.array([momentum], float),
+        np.zeros(1),
+        np.zeros(1),
+    )
     engine = Engine(Body(Pinned(1.0), split_rotor(np.array([inertia], float))), {})
     engine.advance(state, SCHEMES[scheme], dt, steps, NoThermostat())
     return state.angular_momentum_body[0]

@@ -29,13 +29,14 @@ def faults(**tables):
         ({"body": {}}, "mass_kg is missing"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "con", "radius_m": 1.0}}}, "did you mean cone?"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "cone", "radius_m": 1.0}}}, "a cone has height_m and radius_m, not radius_m"),
+        ({"start": {"rotation": [[0.9, 0.5, 0], [0.5, 0.866, 0], [0, 0, 1.0]], "project": True}}, "must be below 0.1"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "disk", "radius_m": 1.0}, "inertia_kg_m2": [1.0, 1, 1]}}, "give one of"),
         ({"body": {"points": [{"mass_kg": 1.0, "position_m": [0.0, 0, 0]}], "mass_kg": 2.0}}, "mass_kg would do nothing"),
         ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "this one is not pinned"),
         ({"body": {"mass_kg": 1.0, "pinned": True}}, "nothing to move"),
         ({"start": {"rotation": [[1.0, 0.01, 0], [0, 1, 0], [0, 0, 1]]}}, "|Q^T Q - 1| is 0.01"),
         ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]]}}, "a reflection"),
-        ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]], "project": True}}, "no rotation is near it"),
+        ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]], "project": True}}, "is no rotation with rounded digits"),
         ({"start": {"quaternion_wxyz": [0.0, 0, 0, 0]}}, "quaternion_wxyz is zero"),
         ({"start": {"euler_angles_deg": [0.0, 0, 0], "euler_rates_rad_s": [1.0, 0, 0]}}, "euler_rates_rad_s with theta = 0"),
         ({"start": {"euler_angles_deg": [0.0, 180, 0], "euler_rates_rad_s": [1.0, 0, 0]}}, "with theta = 180"),
@@ -67,6 +68,25 @@ def faults(**tables):
         ({"output": {"axis": [0.0, 0, 0]}}, "axis is zero"),
         ({"gravity": {"accelaration_m_s2": [0.0, 0, 1]}}, "did you mean acceleration_m_s2?"),
         ({"stages": []}, "unknown key"),
+        ({"body": {"mass_kg": 1.0}, "fluid": {"added_mass_kg": [1.0, 1, 1]}}, "a point carries no fluid along"),
+        ({"body": {"mass_kg": 1.0}, "fluid": {"linear_resistance_kg_s": [1.0, 1, 2]}}, "a point has no axes"),
+        ({"body": {"mass_kg": 1.0}, "friction": {"viscous_N_m_s": [1.0, 1, 1]}}, "friction: the body has no inertia"),
+        ({"body": {"points": [{"mass_kg": 1.0, "position_m": [0.0, 0, 0]}]}, "start": {"euler_angles_deg": [0.0, 1, 0]}},
+         "a point does not turn"),
+        ({"body": {"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, "fluid": {"added_mass_kg": [1.0, 2, 3]}},
+         "equal added masses across its axis"),
+        ({"body": TOP | {"centre_of_mass_m": None}, "gravity": {}}, "gravity does nothing to a body pinned at its centre"),
+        ({"body": TOP, "applied": [{"force_N": [1.0, 0, 0]}]}, "does nothing at the pivot"),
+        ({"body": {"mass_kg": 1.0, "pinned": True, "centre_of_mass_m": [0.0, 0, 1]},
+          "changing_inertia": {"times_s": [0.0, 1.0], "inertia_kg_m2": [[1.0, 1, 1], [2.0, 2, 2]]}}, "must be at the pivot"),
+        ({"body": {"mass_kg": 1.0, "pinned": True, "inertia_about": "pivot"}}, "no inertia is given"),
+        ({"friction": {"dry_N_m": [0.1, 0, 0]}, "run": RUN | {"integrator": "dop853"}}, "dry friction jumps"),
+        ({"friction": {"viscous_N_m_s": [0.1, 0, 0]}, "run": RUN | {"integrator": "kahan_li_6"}}, "steps back in time"),
+        ({"start": {"angular_velocity_body_rad_s": [1e200, 0, 0]}}, "must be 0 or between 1e-100 and 1e100"),
+        ({"start": {"euler_angles_deg": [0.0, 20.0]}}, "start.euler_angles_deg: has 2 entries, needs more"),
+        ({"wheels": {"axis": [0.0, 0, 1]}}, "write [[wheels]]"),
+        ({"body": {"mass_kg": 1.0, "inertia_tensor_kg_m2": [[2.0, 0.1, 0], [0.1, 2.5, 0.2], [0, 0.2, 3.0]]},
+          "friction": {"dry_N_m": [0.3, 0.3, 0.3]}}, "which are not principal axes of its inertia"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}},
           "start": {"angular_velocity_body_rad_s": [0.0, 0, 1]}}, "no inertia about an axis about which it is to turn"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}},
@@ -106,3 +126,32 @@ def test_the_energy_of_a_body_is_in_joule(capsys):
     assert "the energy of a body is in J" in capsys.readouterr().err
     assert main(["energy", scene]) == 0
     assert "5435.696790865" in capsys.readouterr().out
+
+
+def test_what_is_no_scene_of_either_kind_says_so(tmp_path, capsys):
+    path = tmp_path / "what.toml"
+    path.write_text("name = 'x'\n")
+    assert main(["check", str(path)]) == 2
+    assert "has neither [body], for a single body, nor [[molecules]]" in capsys.readouterr().err
+    path.write_text("[gravity]\n[run]\nduration_s = 1\ntimestep_s = 0.1\n")
+    assert main(["check", str(path)]) == 2
+    assert "body: is missing" in capsys.readouterr().err
+
+
+def test_an_override_is_blamed_by_its_key_and_threads_are_for_molecules(capsys):
+    scene = str(ROOT / "systems" / "heavy_top_1.toml")
+    assert main(["check", scene, "--set", "run.integrator=verlet"]) == 2
+    assert "--set run.integrator: is 'verlet', must be" in capsys.readouterr().err
+    assert main(["run", scene, "--threads", "2"]) == 2
+    assert "--threads is for molecules" in capsys.readouterr().err
+
+
+def test_bodies_of_points_that_are_symmetric_to_rounding_have_their_own_axes():
+    corners = [[1.0, 0.0, 0.0], [-0.5, 3**0.5 / 2, 0.0], [-0.5, -(3**0.5) / 2, 0.0]]
+    triangle = {"points": [{"mass_kg": 1.0, "position_m": corner} for corner in corners]}
+    system = build_body(Scene.from_dict({"body": triangle, "friction": {"viscous_N_m_s": [1.0, 1.0, 0.5]}, "run": RUN}))
+    assert (system.axes == [[1, 0, 0], [0, 1, 0], [0, 0, 1]]).all()
+    assert system.inertia[0] == system.inertia[1]
+    pendulum = {"mass_kg": 0.3, "pinned": True, "inertia_about": "pivot", "centre_of_mass_m": [0.0, 0.0, 0.7],
+                "inertia_kg_m2": [0.3 * 0.7 * 0.7, 0.3 * 0.7 * 0.7, 0.0]}  # fmt: skip
+    assert build_body(Scene.from_dict({"body": pendulum, "run": RUN})).kind == "linear"

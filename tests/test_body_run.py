@@ -10,7 +10,7 @@ from conftest import BODIES, ROOT
 
 import rigidmd
 from rigidmd.cli import main
-from rigidmd.errors import SimulationError
+from rigidmd.errors import SceneError, SimulationError
 from rigidmd.scene import Scene
 from rigidmd.simulation import Every, Simulation
 
@@ -138,3 +138,39 @@ def test_a_run_that_fails_keeps_the_motion_so_far(tmp_path):
     with pytest.raises(SimulationError, match=r"singular at t = .* too near 0"):
         Simulation(scene, tmp_path / "run").run()
     assert len(read(tmp_path / "run" / "motion.csv")["t"]) >= 1
+
+
+@pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
+def test_resolved_scenes_are_scenes(path, tmp_path):
+    from rigidmd.output.scene_file import write_body_scene
+
+    scene = Scene.read(path)
+    write_body_scene(tmp_path, scene)
+    assert Scene.read(tmp_path / "scene.toml").model_dump() == scene.model_dump()
+
+
+def test_wheels_are_shown(tmp_path):
+    results = Simulation(Scene.read(ROOT / "systems" / "satellite_wheel.toml"), tmp_path / "run").run()
+    assert results["h_body_3"][-1] == pytest.approx(0.4)
+    assert (tmp_path / "run" / "omega.png").is_file()
+    assert repr(results).count("\n") == 0
+
+
+def test_a_run_says_what_is_wrong_with_it():
+    scene = Scene.read(TOP, {"output.trajectory": False, "run.integrator": "velocity_verlet", "run.timestep_s": 0.06})
+    simulation = Simulation(scene)
+    said = simulation.conclusion(simulation.run())
+    assert "timestep_s is too long for this motion" in said
+    assert "no whole number of steps; this run is" in said
+    assert "turns by more than 180° between samples" in said
+
+
+def test_what_a_trajectory_cannot_hold_is_told(tmp_path):
+    stone = {"body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}},
+             "run": {"duration_s": 1.0, "timestep_s": 0.1}, "output": {"figures": False}}  # fmt: skip
+    with pytest.raises(SceneError, match=r"start.position_m is 2e\+05 Å in the trajectory"):
+        Simulation(Scene.from_dict(stone | {"start": {"position_m": [0.0, 0.0, 1000.0]}}), tmp_path / "far")
+    fast = Scene.from_dict(stone | {"start": {"velocity_m_s": [1e7, 0.0, 0.0]}})
+    with pytest.raises(SimulationError, match=r"beyond the 2e\+07 Å that .xtc can hold.* The motion so far"):
+        Simulation(fast, tmp_path / "fast").run()
+    assert (tmp_path / "fast" / "motion.csv").is_file()

@@ -1,5 +1,6 @@
 """Rotations, inertia, the rotor."""
 
+import known
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -8,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from rigidmd.jit import kernel
 from rigidmd.mechanics.inertia import kind_of_body, principal_frame
 from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations
-from rigidmd.mechanics.rotor import split_rotor, turn
+from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
 
 
 @kernel
@@ -127,3 +128,70 @@ def test_linear_and_spherical_bodies_turn_exactly(inertia):
     expected = start[0] @ from_vector(100 * momentum[0] / inertia.max())
     assert q[0] == pytest.approx(expected, abs=1e-11)
     assert orthogonality_error(q) < 1e-12
+
+
+FREE_TOPS = [
+    ([1.0, 1.6, 2.2], [1.0, 0.8, -0.7]),
+    ([2.2, 1.0, 1.6], [1.0, 0.8, -0.7]),
+    ([1.0, 2.0, 3.0], [1e-2, 1.0, 0.0]),  # m = 1 - 4e-4
+    ([1.0, 2.0, 3.0], [1e-8, 1.0, 0.0]),  # m = 1 to rounding: the separatrix
+    ([1.0, 2.0, 3.0], [0.0, 1.0, 0.0]),  # L along an axis
+    ([1.0, 2.0, 3.0], [1.0, 0.0, 0.0]),
+    ([1.0, 2.0, 3.0], [1e-20, 0.0, 1.0]),
+    ([1.0, 1.0 + 1e-12, 2.0], [1.0, 1.0, 1.0]),  # nearly symmetric
+    ([1.0, 1.0 + 1e-12, 1.0 + 2e-12], [1.0, 1.0, 1.0]),  # nearly spherical
+    ([1e-3, 1.0, 1.0005], [1.0, 1.0, 1.0]),  # nearly linear
+    ([1.0, 1.0, 2.0], [1.0, 0.5, 0.7]),
+    ([1e-12, 2e-12, 2.5e-12], [1e9, 2e9, -1e9]),  # in other units
+]
+
+
+@pytest.mark.parametrize(("inertia", "omega"), FREE_TOPS)
+@pytest.mark.parametrize(("h", "steps"), [(0.02, 200), (0.3, 20), (4.0, 1)])
+def test_the_exact_rotor_is_exact(inertia, omega, h, steps):
+    inertia, omega = np.array(inertia), np.array(omega)
+    h = h / np.abs(omega).max()  # so that it is an angle
+    start = random_rotations(np.random.default_rng(5), 1)
+    q, l = start.copy(), (inertia * omega)[None].copy()  # noqa: E741
+    spin(ExactRotor(*split_rotor(inertia[None])), q, l, h, steps)
+    spun, turned = known.free_asymmetric_top(inertia, start[0], omega, np.array([h * steps]))
+    # a rounded L turns a nearly linear body about its axis by so much more
+    allowed = 1e-13 + 4e-15 * inertia.max() / inertia.min()
+    assert np.abs(q[0] - turned[0]).max() < allowed
+    assert np.abs(l[0] / inertia - spun[0]).max() < allowed * np.abs(omega).max()
+    assert orthogonality_error(q) < 1e-14
+    spin(ExactRotor(*split_rotor(inertia[None])), q, l, -h, steps)
+    assert np.abs(q - start).max() < allowed
+
+
+def test_the_exact_rotor_agrees_with_a_general_solver():
+    inertia, omega = np.array([1.0, 1.6, 2.2]), np.array([1.0, 0.8, -0.7])
+    start = random_rotations(np.random.default_rng(6), 1)
+    q, l = start.copy(), (inertia * omega)[None].copy()  # noqa: E741
+    spin(ExactRotor(*split_rotor(inertia[None])), q, l, 2.0, 1)
+    exact_q, exact_l = euler_equations(inertia, start[0], inertia * omega, 2.0)
+    assert np.abs(q[0] - exact_q).max() < 2e-13
+    assert np.abs(l[0] - exact_l).max() < 2e-13
+
+
+def test_the_exact_rotor_keeps_energy_and_momentum_for_a_million_steps():
+    inertia = np.array([[0.6, 1.1, 1.7]])
+    q, l = np.eye(3)[None].copy(), np.array([[3.0, -2.0, 5.0]])  # noqa: E741
+    rotor = ExactRotor(*split_rotor(inertia))
+    assert rotor.symmetry[0] == NONE
+    lab, size, energy = q[0] @ l[0], np.linalg.norm(l), (l**2 / inertia).sum()
+    spin(rotor, q, l, 0.01, 1_000_000)
+    assert abs(np.linalg.norm(l) / size - 1) < 2e-13
+    assert abs((l**2 / inertia).sum() / energy - 1) < 2e-13
+    assert np.abs(q[0] @ l[0] - lab).max() < 5e-13 * size
+    assert orthogonality_error(q) < 5e-13
+
+
+def test_a_body_that_does_not_turn_or_is_no_number_stays_so():
+    rotor = ExactRotor(*split_rotor(np.array([[0.6, 1.1, 1.7]])))
+    q, l = np.eye(3)[None].copy(), np.zeros((1, 3))  # noqa: E741
+    spin(rotor, q, l, 0.01, 3)
+    assert (q == np.eye(3)).all()
+    l[:] = [np.nan, 1.0, 1.0]
+    spin(rotor, q, l, 0.01, 3)
+    assert np.isnan(l).any()

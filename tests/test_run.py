@@ -72,7 +72,7 @@ def test_the_final_state_starts_another_run(tmp_path):
         structure={"file": "final.npz", "velocities": True}, start={},
     )  # fmt: skip
     system = build(scene)
-    for name in State._fields[:-1]:
+    for name in State._fields[:4]:
         assert getattr(first.state, name).tobytes() == getattr(system.state, name).tobytes()
     assert system.state.time == 0  # a run of its own
     assert system.space == first.system.space

@@ -12,15 +12,16 @@ from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.engine import Engine
 from rigidmd.dynamics.odes import SOLVERS, OdeEngine, Solver
 from rigidmd.dynamics.schemes import SCHEMES, Scheme
-from rigidmd.errors import SceneError
+from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.fields import Drive, SteadyForce, Told
 from rigidmd.forces.frame import Inertial, Turning
 from rigidmd.forces.resistance import NoResistance, Resistance
 from rigidmd.forces.space import Unbounded
 from rigidmd.forces.terms import State
-from rigidmd.mechanics.course import Course, integral, is_steady, steady, table, total, value_at, window
+from rigidmd.mechanics.course import Course, during, integral, is_steady, steady, table, total, value_at, window
 from rigidmd.mechanics.flight import Free, Immersed, Pinned
 from rigidmd.mechanics.inertia import Kind, inertia_tensor, kind_of_body, shifted
+from rigidmd.mechanics.rotation import direction
 from rigidmd.mechanics.rotor import DrivenRotor, NoRotor, split_rotor
 from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
 from rigidmd.scene import BodyScene
@@ -30,6 +31,7 @@ from rigidmd.scene.body import Timed
 ROUNDING = 1e-13
 DEFAULT_TOLERANCE = 1e-10
 TRAJECTORY_RADIUS = 10.0  # Å
+LARGEST_IN_GRO = 9e4  # Å: eight columns in nm
 
 
 class Pose(NamedTuple):
@@ -90,18 +92,39 @@ class BodySystem:
         """What moves it."""
         run = self.scene.run
         if run.integrator in SCHEMES:
-            return SCHEMES[run.integrator]
+            return SCHEMES[run.integrator].with_rotor(run.rotor)
         tolerances = (run.relative_tolerance or DEFAULT_TOLERANCE, run.absolute_tolerance or DEFAULT_TOLERANCE)
-        return Solver(run.integrator, run.formulation or "matrix", *tolerances)
+        return Solver(run.integrator, run.formulation or "matrix", run.duration_s, *tolerances)
 
     def engine(self) -> Engine:
-        """A new engine for it, which calls the Python functions that apply forces."""
+        """A new engine for it at time 0, which calls the Python functions that apply forces."""
         kind = OdeEngine if self.scene.run.integrator in SOLVERS else Engine
-        return kind(self.body, self.terms, {name: self._asker(f) for name, f in self.applied.items()})
+        return kind(*self.during(0.0), {name: self._asker(f) for name, f in self.applied.items()})
+
+    def breaks(self) -> list[float]:
+        """Times within the run at which something that follows time as told jumps or bends."""
+        parts = (*self.body, *self.terms.values())
+        times = {float(t) for part in parts for value in part if isinstance(value, Course) for t in value.times}
+        return sorted(t for t in times if 0 < t < self.scene.run.duration_s)
+
+    def during(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
+        """Body and terms with what holds from a time to the next break."""
+        terms = {name: _at(term, time) for name, term in self.terms.items()}
+        return Body(*(_at(part, time) for part in self.body)), terms
 
     def _asker(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
         def ask(time: float, state: State) -> tuple:
-            force, torque = function(self.pose(time, state))
+            told = function(self.pose(time, state))
+            try:
+                force, torque = (np.asarray(part, dtype=float).reshape(3) for part in told)
+            except (TypeError, ValueError):
+                raise SimulationError(
+                    f"t = {time:g} s: an applied function gave {told!r}, must give force and torque of 3 numbers each"
+                ) from None
+            if not self.flies:  # it acts at the centre of mass, which is not the pivot
+                torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
+            if not (np.isfinite(force).all() and np.isfinite(torque).all()):
+                raise SimulationError(f"t = {time:g} s: an applied function gave what is no finite number: {told!r}")
             return force, self.axes.T @ torque
 
         return ask
@@ -184,8 +207,8 @@ class BodySystem:
 def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None = None) -> BodySystem:
     """The system of a scene. Raises SceneError with every fault.
 
-    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass or
-        the pivot, and a torque (3,) in N m along the body's axes
+    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass, and
+        a torque (3,) in N m along the body's axes
     """
     faults: list[str] = []
     mass, tensor, centre, points, names = _inertia(scene)
@@ -194,25 +217,28 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         moments, axes = np.array(scene.changing_inertia.inertia_kg_m2[0]), np.eye(3)
     else:
         moments, axes = _principal(tensor)
-    if not np.array_equal(axes, np.eye(3)):
-        faults += _needs_principal_axes(scene)
+    bare = moments
     moments = moments + added_inertia
     turning = bool(moments.any())
-    if scene.body.pinned and not turning:
-        faults.append("body: a point at the pivot has nothing to move; give it inertia or a centre_of_mass_m")
-    if (scene.wheels or scene.changing_inertia) and not (moments > 0).all():
-        faults.append("wheels and changing_inertia need a body with inertia about every axis")
+    faults += _unfit(scene, centre, bare, moments, axes, added_mass)
     attitude, spin = scene.start.attitude, scene.start.angular_velocity
     own_spin = axes.T @ spin
     idle = (moments == 0) & (np.abs(own_spin) > 1e-12 * np.abs(own_spin).max(initial=0.0))
     if turning and idle.any():
         faults.append("start: the body has no inertia about an axis about which it is to turn")
+    faults += _order_faults(scene, bool(added_mass.any()))
+    taken = {"gravity", "buoyancy", "origin_acceleration", *(f"applied_{k}" for k in range(len(scene.applied)))}
+    faults += [
+        f"applied: {name!r} is the name of a force of the scene; choose another"
+        for name in applied or {}
+        if name in taken
+    ]
     for k, entry in enumerate(scene.applied):
         faults += _unresisted(entry, k, axes, moments, turning)
     if faults:
         raise SceneError(scene.source, faults)
 
-    rotor = _rotor(scene, moments, axes) if turning else NoRotor()
+    rotor = _rotor(scene, moments, added_inertia, axes) if turning else NoRotor()
     frame = _frame(scene)
     if scene.body.pinned:
         flight = Pinned(mass)
@@ -223,7 +249,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     body = Body(flight, rotor, frame, _resistance(scene))
     applied = applied or {}
     terms = _terms(scene, mass, axes, centre, displaced)
-    terms |= {name: Told(np.zeros(1, np.int64), np.zeros(3), np.zeros(3), np.zeros(1)) for name in applied}
+    terms |= {name: Told(np.zeros(1, np.int64), np.zeros(3), np.zeros(3)) for name in applied}
     system = BodySystem(
         scene=scene,
         body=body,
@@ -238,6 +264,16 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         applied=applied,
     )
     system.left_out = _left_out(system)
+    if scene.output.trajectory and system.flies:
+        reach = system.scale * np.abs(system.state.position).max()
+        if not reach < LARGEST_IN_GRO:
+            raise SceneError(
+                scene.source,
+                [
+                    f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold: set "
+                    "output.trajectory_A_per_m to less, or output.trajectory = false"
+                ],
+            )
     return system
 
 
@@ -284,32 +320,99 @@ def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
 
 def _principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Principal moments (3,) and axes (3, 3) as columns, right-handed, each as near to the body's own as can be."""
-    if np.array_equal(tensor, np.diag(np.diag(tensor))):
-        return np.diag(tensor).copy(), np.eye(3)
+    rounding = ROUNDING * np.abs(tensor).max()
+    if (np.abs(tensor - np.diag(np.diag(tensor))) <= rounding).all():
+        moments, axes = np.diag(tensor).copy(), np.eye(3)
+        return _even(moments), axes
     moments, axes = np.linalg.eigh(tensor)
     best = max(permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3)))
     moments, axes = np.maximum(moments, 0.0)[list(best)], axes[:, best]
     axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
     if np.linalg.det(axes) < 0:
         axes[:, np.abs(np.diag(axes)).argmin()] *= -1
-    largest = moments.max()
-    moments[moments < ROUNDING * largest] = 0.0
-    for i, j in ((0, 1), (1, 2), (2, 0)):  # equal to the last bit, which the rotor turns exactly
-        if abs(moments[i] - moments[j]) < ROUNDING * largest:
+    return _even(moments), axes
+
+
+def _even(moments: np.ndarray) -> np.ndarray:
+    """Moments that differ by rounding made equal to the last bit, which the rotor turns exactly; rounded zeros zero."""
+    rounding = ROUNDING * moments.max()
+    moments = np.where(moments < rounding, 0.0, moments)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        if abs(moments[i] - moments[j]) <= rounding:
             moments[[i, j]] = 0.5 * (moments[i] + moments[j])
-    return moments, axes
+    return moments
+
+
+def _at(part: NamedTuple, time: float) -> NamedTuple:
+    """A part of a body with each of its courses as it goes on from a time."""
+    courses = {key: during(value, time) for key, value in part._asdict().items() if isinstance(value, Course)}
+    return part._replace(**courses)
+
+
+def _unfit(scene: BodyScene, centre, bare, moments, axes, added_mass) -> list[str]:
+    """What a scene asks of a body that this body cannot do, or what would do nothing to it."""
+    faults, body, fluid = [], scene.body, scene.fluid
+    turning, principal = bool(moments.any()), np.array_equal(axes, np.eye(3))
+    if not turning:
+        faults += _idle_of_points(scene)
+        if body.pinned:
+            faults.append("body: a point at the pivot has nothing to move; give it inertia or a centre_of_mass_m")
+        if added_mass.any():
+            faults.append("fluid.added_mass_kg: a point carries no fluid along; add the mass to mass_kg of its inertia")
+        for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
+            if fluid is not None and len(set(getattr(fluid, key))) > 1:
+                faults.append(f"fluid.{key}: a point has no axes: give three equal numbers")
+    elif added_mass.any():
+        for k in np.flatnonzero(moments == 0):
+            if added_mass[k - 1] != added_mass[k - 2]:
+                faults.append("fluid.added_mass_kg: a linear body has equal added masses across its axis")
+    if turning and not principal:
+        faults += _needs_principal_axes(scene)
+    if (scene.wheels or scene.changing_inertia) and turning and not (moments > 0).all():
+        faults.append("wheels and changing_inertia need a body with inertia about every axis")
+    if body.pinned:
+        if scene.changing_inertia is not None and centre.any():
+            faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")
+        if scene.gravity is not None and not centre.any() and turning:
+            faults.append("gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m")
+        faults += [
+            f"applied.{k}.force_N does nothing at the pivot; say where it acts with at_m"
+            for k, entry in enumerate(scene.applied)
+            if entry.force_N is not None and not any(entry.at_m or ())
+        ]
+    return faults
+
+
+def _idle_of_points(scene: BodyScene) -> list[str]:
+    """Keys about turning, which a point does not do."""
+    start, none = scene.start, type(scene.start)()
+    named = [f"start.{key}" for key in type(start).model_fields if getattr(start, key) != getattr(none, key)]
+    idle = [key for key in named if key not in ("start.position_m", "start.velocity_m_s")]
+    idle += [key for key in ("friction", "wheels") if getattr(scene, key)]
+    idle += [f"run.{key}" for key in ("formulation", "rotor") if getattr(scene.run, key) is not None]
+    if scene.fluid is not None:
+        turning = (
+            "linear_rotational_resistance_N_m_s",
+            "quadratic_rotational_resistance_N_m_s2",
+            "added_inertia_kg_m2",
+        )
+        idle += [f"fluid.{key}" for key in turning if any(getattr(scene.fluid, key) or ())]
+    if scene.output.axis is not None:
+        idle.append("output.axis")
+    return [f"{key}: the body has no inertia: a point does not turn" for key in idle]
 
 
 def _needs_principal_axes(scene: BodyScene) -> list[str]:
-    """What acts along the body's axes must find them principal."""
+    """What acts along the body's axes must find them principal, unless it is the same along all."""
     faults = []
     for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
         for key in type(section).model_fields if section else ():
             value = getattr(section, key)
-            along_axes = isinstance(value, tuple) and key != "centre_of_buoyancy_m"
-            if along_axes and len(set(value)) > 1:
+            if not isinstance(value, tuple) or key == "centre_of_buoyancy_m":
+                continue
+            if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
                 faults.append(
-                    f"{name}.{key} differs between the body's axes, which are not principal axes of its inertia: "
+                    f"{name}.{key} is told along the body's axes, which are not principal axes of its inertia: "
                     "give the body in its principal axes"
                 )
     return faults
@@ -329,6 +432,34 @@ def _unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: b
     return []
 
 
+def _order_faults(scene: BodyScene, immersed: bool) -> list[str]:
+    """Integrators that would not be what they are for this body."""
+    run, resistance = scene.run, _resistance(scene)
+    braked = not isinstance(resistance, NoResistance)
+    if run.integrator in SOLVERS:
+        if braked and resistance.rotation_dry.any():
+            return [
+                f"run: dry friction jumps where a body stops, which {run.integrator} cannot step over: "
+                "use velocity_verlet"
+            ]
+        return []
+    scheme = SCHEMES[run.integrator].with_rotor(run.rotor)
+    if braked and min(scheme.kicks) < 0:
+        forward = [name for name, other in SCHEMES.items() if min(other.kicks) >= 0]
+        return [
+            f"run: {run.integrator} takes steps back in time, which a resistance does not allow: use one of "
+            f"{', '.join(forward)}"
+        ]
+    why = {"wheels": scene.wheels, "changing_inertia": scene.changing_inertia, "added mass": immersed}
+    split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
+    return [
+        f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be of order 2; "
+        f"use one of {', '.join(split)} with rotor = 'split'"
+        for what, there in why.items()
+        if there and scheme.exact_rotor
+    ]
+
+
 def _carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
     """Added mass (3,), added inertia (3,) and displaced mass."""
     fluid = scene.fluid
@@ -346,19 +477,21 @@ def _carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
     return *added_mass_of_ellipsoid(half, fluid.density_kg_m3), fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod()
 
 
-def _rotor(scene: BodyScene, moments: np.ndarray, axes: np.ndarray):
+def _rotor(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, axes: np.ndarray):
     if not scene.wheels and scene.changing_inertia is None:
         return split_rotor(moments[None])
     changing = scene.changing_inertia
-    inertia = steady(moments) if changing is None else table(changing.times_s, changing.inertia_kg_m2)
+    inertia = steady(moments)
+    if changing is not None:
+        inertia = table(changing.times_s, np.array(changing.inertia_kg_m2) + added_inertia)
     momenta = []
     for wheel in scene.wheels:
-        axis = axes.T @ np.array(wheel.axis) / np.linalg.norm(wheel.axis)
+        axis = axes.T @ direction(wheel.axis)
         motor = wheel.motor_torque_N_m
         values = 0.0 if motor is None else motor
         torque = _course(wheel, np.multiply.outer(values, axis))
         momenta.append(integral(torque, wheel.momentum_kg_m2_s * axis))
-    return DrivenRotor(inertia, total(momenta) if momenta else steady(np.zeros(3)), np.zeros(1))
+    return DrivenRotor(inertia, total(momenta) if momenta else steady(np.zeros(3)))
 
 
 def _course(timed: Timed, values) -> Course:
@@ -391,7 +524,7 @@ def _resistance(scene: BodyScene):
         + np.array(fluid.linear_rotational_resistance_N_m_s if fluid else zero),
         np.array(fluid.quadratic_rotational_resistance_N_m_s2 if fluid else zero),
     )
-    return Resistance(*parts, np.zeros(1)) if any(part.any() for part in parts) else NoResistance()
+    return Resistance(*parts) if any(part.any() for part in parts) else NoResistance()
 
 
 def _terms(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray, displaced: float):
@@ -401,7 +534,8 @@ def _terms(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray, 
         g = np.array(scene.gravity.acceleration_m_s2)
         terms["gravity"] = SteadyForce(mass * g, where)
         if displaced:
-            terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ np.array(scene.fluid.centre_of_buoyancy_m))
+            at = centre if scene.fluid.centre_of_buoyancy_m is None else np.array(scene.fluid.centre_of_buoyancy_m)
+            terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ at)
     if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
         course = _course(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
         terms["origin_acceleration"] = _force(course, steady(np.zeros(3)), where, False)
@@ -426,7 +560,7 @@ def _force(force: Course, torque: Course, point: np.ndarray, follows_body: bool)
     """A force that never changes in the lab has an energy; any other keeps an account of its work."""
     if not follows_body and is_steady(force) and is_steady(torque) and not torque.constant.any():
         return SteadyForce(force.constant[0], point)
-    return Drive(force, torque, point, follows_body, np.zeros(3), np.zeros(3), np.zeros(1))
+    return Drive(force, torque, point, follows_body, np.zeros(3), np.zeros(3))
 
 
 def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> State:
@@ -447,7 +581,7 @@ def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> Sta
         if isinstance(body.flight, Immersed):
             share = body.flight.inertial_mass / body.flight.mass
             velocity = (own_rotation @ (share * (own_rotation.T @ velocity[0])))[None]
-    return State(position, velocity, rotation, momentum, time)
+    return State(position, velocity, rotation, momentum, time, np.zeros(1))
 
 
 def _left_out(system: BodySystem) -> list[str]:

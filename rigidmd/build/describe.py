@@ -7,6 +7,7 @@ import numpy as np
 from rigidmd.build.body import BodySystem, build_body
 from rigidmd.build.system import System, build
 from rigidmd.dynamics.odes import Solver
+from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, Scene
 from rigidmd.scene.molecules import Stage
@@ -34,6 +35,12 @@ def _body(system: BodySystem) -> str:
         lines.append(f"  principal axes (columns, body's axes): {np.array2string(system.axes, precision=6)}")
     if system.centre.any():
         lines.append(f"  centre of mass from the pivot: {' '.join(f'{x:g}' for x in system.centre)} m")
+    if system.turns:
+        pose = system.pose(0.0, system.state)
+        angles = " ".join(f"{x:.6g}" for x in np.degrees(to_euler_angles(pose.rotation)))
+        spin = float(np.linalg.norm(pose.angular_velocity_body))
+        turn = f": a turn in {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
+        lines.append(f"  starts at phi theta psi = {angles} degrees, turning at {spin:.6g} rad/s{turn}")
     parts = [system.body.flight, system.body.rotor, system.body.frame, system.body.resistance]
     lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
     lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
@@ -41,7 +48,8 @@ def _body(system: BodySystem) -> str:
     lines += [f"  {reason}" for reason in system.left_out]
     how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
     lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
-    lines.append(f"a sample every {scene.interval:g} s")
+    every = max(1, round(scene.interval / run.timestep_s))
+    lines.append(f"a sample every {every * run.timestep_s:g} s")
     return "\n".join(lines)
 
 

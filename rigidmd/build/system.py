@@ -118,6 +118,7 @@ def build(scene: MolecularScene) -> System:
         np.ascontiguousarray(arrangement.rotation) if turning else np.zeros((0, 3, 3)),
         np.zeros((n if turning else 0, 3)),
         np.zeros(1),
+        np.zeros(1),
     )
     terms, constants, tail_pressure = _terms(scene, species, model, space, cutoff)
     system = System(

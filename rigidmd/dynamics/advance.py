@@ -7,9 +7,9 @@ from numba import prange
 
 from rigidmd.dynamics.thermostats import apply
 from rigidmd.forces.sites import SERIAL
-from rigidmd.forces.terms import OK, account, load_bodies
+from rigidmd.forces.terms import OK, load_bodies
 from rigidmd.jit import implements, is_a, kernel
-from rigidmd.mechanics.rotor import NoRotor, SplitRotor, turn
+from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn
 
 
 class Model(NamedTuple):
@@ -19,7 +19,7 @@ class Model(NamedTuple):
     mass: np.ndarray  # (species,) u
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
-    rotor: SplitRotor | NoRotor
+    rotor: SplitRotor | ExactRotor | NoRotor
 
 
 class Progress(NamedTuple):
@@ -46,24 +46,22 @@ def advance(model, state, load, terms, thermostat, scheme, dt, origin, steps, pr
     kicks, drifts, moments = scheme
     cursor = progress.cursor
     while cursor[0] < steps:
-        if cursor[1] == 0:
-            lose(model, state, 0.5 * dt)
-            cursor[1] = 1
-        while cursor[1] <= len(kicks):
-            k = cursor[1] - 1
-            if cursor[2] == 0:
-                status = load_bodies(terms, state, load)
-                if status != OK:
-                    return status
-                cursor[2] = 1
-            account(terms, model, state, load, kicks[k] * dt)
-            kick(model, state, load, kicks[k] * dt)
+        while cursor[1] < len(kicks):
+            k = cursor[1]
+            if kicks[k] != 0.0:
+                if cursor[2] == 0:
+                    status = load_bodies(terms, state, load)
+                    if status != OK:
+                        return status
+                    cursor[2] = 1
+                pay(model, terms, state, 0.5 * kicks[k] * dt)
+                kick(model, state, load, kicks[k] * dt)
+                pay(model, terms, state, 0.5 * kicks[k] * dt)
             if k < len(drifts):
                 drift(model, state, drifts[k] * dt)
                 state.time[0] = origin + (cursor[0] + moments[k + 1]) * dt
                 cursor[2] = 0
             cursor[1] += 1
-        lose(model, state, 0.5 * dt)
         apply(thermostat, model, state, dt)
         cursor[1] = 0
         cursor[0] += 1
@@ -80,8 +78,8 @@ def drift(model, state, h):
     raise TypeError("compiled code only")
 
 
-def lose(model, state, h):
-    """What resistance takes, in place."""
+def pay(model, terms, state, h):
+    """Add to `state.work` what driving terms do at the present velocity over h; half before a kick, half after."""
     raise TypeError("compiled code only")
 
 
@@ -115,10 +113,10 @@ def _drift_molecules(model, state, h):
     return drift_molecules
 
 
-@implements(lose)
-def _lose_nothing(model, state, h):
+@implements(pay)
+def _pay_nothing(model, terms, state, h):
     if is_a(model, Model):
-        return lambda model, state, h: None
+        return lambda model, terms, state, h: None
 
 
 @kernel(parallel=True)

@@ -2,38 +2,30 @@
 
 from typing import NamedTuple
 
-from rigidmd.dynamics.advance import drift, kick, lose
-from rigidmd.forces.frame import Inertial, Turning, follow
-from rigidmd.forces.resistance import NoResistance, Resistance, resist
-from rigidmd.jit import implements, is_a
-from rigidmd.mechanics.flight import Free, Immersed, Pinned, carry
-from rigidmd.mechanics.rotor import DrivenRotor, NoRotor, SplitRotor, moments
+from rigidmd.dynamics.advance import drift, kick, pay
+from rigidmd.forces.frame import Inertial, Turning, follow, frame_rate
+from rigidmd.forces.resistance import NoResistance, Resistance, push
+from rigidmd.forces.terms import total_power
+from rigidmd.jit import implements, is_a, kernel
+from rigidmd.mechanics.flight import Free, Immersed, Pinned, along, carry, inertial_mass
+from rigidmd.mechanics.rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments
 
 
 class Body(NamedTuple):
     """What never changes during a run of a single body; SI units. `Model` is the like for molecules."""
 
     flight: Free | Pinned | Immersed
-    rotor: SplitRotor | DrivenRotor | NoRotor
+    rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
     frame: Inertial | Turning = Inertial()
     resistance: NoResistance | Resistance = NoResistance()
 
 
 @implements(kick, inline=True)
 def _kick_body(model, state, load, h):
-    if not is_a(model, Body):
-        return None
-
-    def kick_body(model, state, load, h):
-        for m in range(len(load.force)):
-            for k in range(3):
-                state.velocity[m, k] += h / model.flight.mass * load.force[m, k]
-        for m in range(len(load.torque_body)):
-            for k in range(3):
-                if moments(model.rotor, state.time[0], k)[0] > 0:  # no momentum gathers on an axis without inertia
-                    state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
-
-    return kick_body
+    if is_a(model, Body):
+        return lambda model, state, load, h: push(
+            model.resistance, model.flight, model.rotor, model.frame, state, load, h
+        )
 
 
 @implements(drift, inline=True)
@@ -49,12 +41,54 @@ def _drift_body(model, state, h):
     return drift_body
 
 
-@implements(lose, inline=True)
-def _lose_body(model, state, h):
+@implements(pay, inline=True)
+def _pay_body(model, terms, state, h):
     if not is_a(model, Body):
         return None
+    if not any(getattr(term.instance_class, "drives", False) for term in terms.types):
+        return lambda model, terms, state, h: None
 
-    def lose_body(model, state, h):
-        resist(model.resistance, model.flight, model.rotor, model.frame, state, state.time[0], h)
+    def pay_body(model, terms, state, h):
+        velocity, omega = relative_motion(model, state)
+        state.work[0] += h * total_power(terms, state, velocity, omega)
 
-    return lose_body
+    return pay_body
+
+
+@kernel
+def relative_motion(model, state):
+    """(velocity along the lab's, omega along the body's axes) relative to the frame, as tuples; else 0."""
+    W = frame_rate(model.frame, state.time[0])
+    velocity = (0.0, 0.0, 0.0)
+    omega = (0.0, 0.0, 0.0)
+    if len(state.position):
+        V = state.velocity[0]
+        velocity = (V[0], V[1], V[2])
+        if len(state.rotation):
+            q = state.rotation[0]
+            a = along(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
+            b = along(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
+            c = along(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
+            velocity = (
+                q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
+                q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,
+                q[2, 0] * a + q[2, 1] * b + q[2, 2] * c,
+            )
+        x = state.position[0]
+        velocity = (
+            velocity[0] - W[1] * x[2] + W[2] * x[1],
+            velocity[1] - W[2] * x[0] + W[0] * x[2],
+            velocity[2] - W[0] * x[1] + W[1] * x[0],
+        )
+    if len(state.rotation):
+        q = state.rotation[0]
+        L = state.angular_momentum_body[0]
+        i0, h0 = moments(model.rotor, state.time[0], 0)
+        i1, h1 = moments(model.rotor, state.time[0], 1)
+        i2, h2 = moments(model.rotor, state.time[0], 2)
+        omega = (
+            (L[0] - h0) * i0 - along(q, W, 0),
+            (L[1] - h1) * i1 - along(q, W, 1),
+            (L[2] - h2) * i2 - along(q, W, 2),
+        )
+    return velocity, omega

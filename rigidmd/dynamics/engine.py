@@ -12,6 +12,7 @@ from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import answer
 from rigidmd.forces.pairs import forget_list, with_room
 from rigidmd.forces.terms import ASK, LIST_FULL, NOT_FINITE, TALLY_SIZE, Load, NoForce, State, add_term, no_load
+from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
 
 class Tally(NamedTuple):
@@ -43,11 +44,6 @@ class Engine:
         for term in self._terms:
             forget_list(term)  # a list left by another engine has its pairs in another order, and sums other last bits
         self._applied = applied or {}
-        # Only a body keeps accounts of work: drives, resistance, a driven rotor. They begin with the engine.
-        parts = (*self._terms, *(getattr(model, name, None) for name in ("resistance", "rotor")))
-        self._accounts = [part.work for part in parts if isinstance(getattr(part, "work", None), np.ndarray)]
-        for account in self._accounts:
-            account[:] = 0.0
         self.load: Load | None = None
         self._stale = True
 
@@ -55,6 +51,12 @@ class Engine:
     def terms(self) -> dict[str, NamedTuple]:
         """The terms by name, with the neighbour lists as they are now."""
         return dict(zip(self.names, self._terms, strict=False))
+
+    def change(self, model: Model | Body, terms: dict[str, NamedTuple]) -> None:
+        """Go on with others of the same types: what follows time as told enters its next piece."""
+        self.model = model
+        self._terms = tuple(terms.values()) or (NoForce(),)
+        self.forget()
 
     def forget(self) -> None:
         """Say that positions were changed from outside since the last step."""
@@ -77,15 +79,19 @@ class Engine:
             np.array(scheme.drifts),
             np.array([*np.cumsum((0.0, *scheme.drifts))[:-1], 1.0]),
         )
+        model = self.model_for(scheme)
         while status := advance(
-            self.model, state, self.load, self._terms, thermostat, rows, dt, origin, done + steps, progress
+            model, state, self.load, self._terms, thermostat, rows, dt, origin, done + steps, progress
         ):
             self._answer(status, state)
         self._stale = False
 
-    def work(self) -> float:
-        """Work done on a body so far by all that drives and brakes it: its energy less this is conserved."""
-        return float(sum(account[0] for account in self._accounts))
+    def model_for(self, scheme: Scheme) -> Model | Body:
+        """The model with the rotor that a scheme needs; only an asymmetric body turns differently by an exact one."""
+        rotor = self.model.rotor
+        if scheme.exact_rotor and isinstance(rotor, SplitRotor) and (rotor.symmetry == NONE).any():
+            return self.model._replace(rotor=ExactRotor(*rotor))
+        return self.model
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
@@ -112,7 +118,7 @@ class NotFiniteError(SimulationError):
     """Positions or momenta that are no numbers any more."""
 
     def __init__(self, state: State):
-        moving = [array for array in state[:-1] if len(array)]
+        moving = [array for array in state[:4] if len(array)]
         rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in moving]
         size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
         self.molecule = int(size.argmax())

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
+from rigidmd.dynamics.body import relative_motion
 from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.forces.frame import frame_rate
@@ -39,6 +40,8 @@ SOLVERS = (RK4, DOP853, RADAU)
 SINGULAR = 4  # beyond the codes of forces.terms: Euler angles too near theta = 0 or pi
 #: Half of the digits of phi and psi are gone there: theta itself has an error of 1e-16.
 SMALLEST_SINE = 1e-8
+#: Nearer than this, an axis that moves by its distance in a step may jump over the pole.
+NEAR_A_POLE = 0.1
 
 
 class Solver(NamedTuple):
@@ -46,8 +49,9 @@ class Solver(NamedTuple):
 
     name: str  # RK4, DOP853 or RADAU
     formulation: str  # of FORMULATIONS
+    duration: float = 1.0  # of the whole run
     relative_tolerance: float = 1e-12  # of DOP853 and RADAU
-    absolute_tolerance: float = 1e-12
+    absolute_tolerance: float = 1e-12  # the same, in parts of the sizes that the variables have in this run
 
 
 @kernel
@@ -71,6 +75,7 @@ def read(form, model, state, time, y):
         for k in range(3):
             state.position[m, k] = y[n + k]
             state.velocity[m, k] = y[n + 3 + k]
+    state.work[0] = y[-1]
 
 
 @kernel
@@ -84,71 +89,43 @@ def slopes(form, model, terms, state, load, time, y, dy):
     status = load_bodies(terms, state, load)
     if status != OK:
         return status
+    velocity, omega = relative_motion(model, state)
+    dy[-1] = total_power(terms, state, velocity, omega) + braking(model.resistance, state, load, velocity, omega)
     W = frame_rate(model.frame, time)
     n = form.variables
-    flies = len(state.position) > 0
-    turns = len(state.rotation) > 0
-    v = (0.0, 0.0, 0.0)
-    w = (0.0, 0.0, 0.0)
-    drift = (0.0, 0.0, 0.0)
-    if flies:
-        V = state.velocity[0]
-        v = (V[0], V[1], V[2])
-        if turns:
-            q = state.rotation[0]
-            a = along(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
-            b = along(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
-            c = along(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
-            v = (
-                q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
-                q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,
-                q[2, 0] * a + q[2, 1] * b + q[2, 2] * c,
-            )
-        x = state.position[0]
-        drift = (
-            v[0] - W[1] * x[2] + W[2] * x[1],
-            v[1] - W[2] * x[0] + W[0] * x[2],
-            v[2] - W[0] * x[1] + W[1] * x[0],
-        )
-    if turns:
-        q = state.rotation[0]
-        w = (y[n] - along(q, W, 0), y[n + 1] - along(q, W, 1), y[n + 2] - along(q, W, 2))
-        attitude_rates(form, y, w[0], w[1], w[2], dy)
-    work = total_power(terms, state, drift, w) + braking(model.resistance, state, load, drift, w)
-    if turns:
-        L = state.angular_momentum_body[0]
-        N = load.torque_body[0]
-        q = state.rotation[0]
+    for m in range(len(state.rotation)):
+        attitude_rates(form, y, omega[0], omega[1], omega[2], dy)
+        q = state.rotation[m]
+        L = state.angular_momentum_body[m]
         for k in range(3):
             i = (k + 1) % 3
             j = (k + 2) % 3
             inertia, growth, _, motor = moment_rates(model.rotor, time, k)
-            torque = N[k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
-            if flies:
-                vi, vj = along(q, v, i), along(q, v, j)
-                torque += (inertial_mass(model.flight, i) - inertial_mass(model.flight, j)) * vi * vj
+            torque = load.torque_body[m, k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
+            for b in range(len(state.position)):
+                pi = model.flight.mass * along(q, state.velocity[b], i)
+                pj = model.flight.mass * along(q, state.velocity[b], j)
+                torque += pi * pj * (1 / inertial_mass(model.flight, j) - 1 / inertial_mass(model.flight, i))
             dy[n + k] = torque / inertia if inertia > 0 else 0.0
-            work -= (motor + 0.5 * growth * y[n + k]) * y[n + k]
+            dy[-1] -= (motor + 0.5 * growth * y[n + k]) * y[n + k]
         n += 3
-    if flies:
-        F = load.force[0]
+    for m in range(len(state.position)):
+        V = state.velocity[m]
         for k in range(3):
             i = (k + 1) % 3
             j = (k + 2) % 3
-            dy[n + k] = drift[k]
-            dy[n + 3 + k] = F[k] / model.flight.mass - W[i] * state.velocity[0, j] + W[j] * state.velocity[0, i]
-        n += 6
-    dy[n] = work
+            dy[n + k] = velocity[k]
+            dy[n + 3 + k] = load.force[m, k] / model.flight.mass - W[i] * V[j] + W[j] * V[i]
     return OK
 
 
 @kernel
 def singular(form, y, dy, dt):
-    """Whether theta is nearer to 0 or pi than the axis moves in a step of dt, or too near for rounding."""
+    """Whether theta is within a step of dt of 0 or pi, or so near that phi and psi have lost half of their digits."""
     if form.variables != 3:
         return False
-    s = sin(y[1])
-    return not abs(s) > max(dt * hypot(dy[1], dy[0] * s), SMALLEST_SINE)
+    s = abs(sin(y[1]))
+    return s <= SMALLEST_SINE or (s < NEAR_A_POLE and s <= dt * hypot(dy[1], dy[0] * s))
 
 
 @kernel
@@ -177,29 +154,28 @@ def rk4(form, model, terms, state, load, y, stages, dt, origin, steps, cursor):
 class OdeEngine(Engine):
     """An engine that moves a body by a general solver. The variables live here between calls; the state shows them."""
 
-    _y = np.zeros(1)
-    _integrator = None
+    _y = _integrator = _between = None
 
     def advance(
         self, state: State, solver: Solver, dt: float, steps: int, thermostat: NamedTuple, done: int = 0
     ) -> None:
-        """Move the state by `steps` steps of dt, in place, as `Engine.advance`; the steps of DOP853 and Radau are
-        their own, dt only says where to look. Raises SimulationError."""
+        """Move the state by `steps` steps of dt, in place. DOP853 and Radau choose their own steps in between.
+
+        Raises SimulationError.
+        """
         form = FORMULATIONS[solver.formulation] if len(state.rotation) else NoAttitude()
-        if self._stale:
+        if self._y is None:
             self._y = self._variables(form, state)
-            self._integrator = None
             self.load = no_load(state)
-            self._stale = False
         self._origin = float(state.time[0]) if done == 0 else self._origin
         if solver.name == RK4:
             self._rk4(form, state, dt, steps, done)
         else:
             self._adaptive(form, state, solver, self._origin + (done + steps) * dt)
 
-    def work(self) -> float:
-        """As `Engine.work`."""
-        return float(self._y[-1])
+    def forget(self) -> None:
+        """As `Engine.forget`; the variables stay, the solver begins anew."""
+        self._integrator = self._between = None
 
     def _variables(self, form: Form, state: State) -> np.ndarray:
         omega = []
@@ -208,7 +184,7 @@ class OdeEngine(Engine):
                 inertia, _, carried, _ = moment_rates_of(self.model.rotor, state.time[0], k)
                 omega.append((state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0)
         flight = [state.position.ravel(), state.velocity.ravel()]
-        return np.concatenate([variables_of(form, state.rotation), omega, *flight, [0.0]])
+        return np.concatenate([variables_of(form, state.rotation), omega, *flight, state.work])
 
     def _rk4(self, form: Form, state: State, dt: float, steps: int, done: int) -> None:
         cursor, stages = np.array([done, 0]), np.zeros((5, len(self._y)))
@@ -229,18 +205,18 @@ class OdeEngine(Engine):
             return dy.copy()
 
         if self._integrator is None:
-            if singular(form, self._y, rates(state.time[0], self._y), 0.0):
+            if singular(form, self._y, dy, 0.0):
                 raise SingularError(self._y[1], state.time[0])
             kind = {DOP853: Dop853, RADAU: Radau}[solver.name]
+            absolute = solver.absolute_tolerance * self._sizes(form, state, solver.duration)
             self._integrator = kind(
-                rates, state.time[0], self._y, np.inf, rtol=solver.relative_tolerance, atol=solver.absolute_tolerance
+                rates, state.time[0], self._y, np.inf, rtol=solver.relative_tolerance, atol=absolute
             )
         integrator = self._integrator
         while integrator.t < end:
-            before = integrator.t
             with np.errstate(all="ignore"):
                 problem = integrator.step()
-            if singular(form, integrator.y, rates(integrator.t, integrator.y), integrator.t - before):
+            if singular(form, integrator.y, dy, 0.0):
                 raise SingularError(integrator.y[1], integrator.t)
             if problem or not np.isfinite(integrator.y).all():
                 raise SimulationError(
@@ -248,9 +224,25 @@ class OdeEngine(Engine):
                     f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
                 )
             self._between = integrator.dense_output()
-        if end > self._origin:
+        if self._between is not None:
             self._y = self._between(end)
         read(form, self.model, state, end, self._y)
+
+    def _sizes(self, form: Form, state: State, duration: float) -> np.ndarray:
+        """Sizes of the variables, from the start and from what its forces do in the time of the run."""
+        load, _ = self.evaluate(state)
+        attitude = np.ones(form.variables)
+        parts = [attitude]
+        if len(state.rotation):
+            inertia = max(moment_rates_of(self.model.rotor, state.time[0], k)[0] for k in range(3))
+            torque = np.abs(load.torque_body).max() * duration / inertia
+            parts.append(np.full(3, max(np.abs(self._y[form.variables :][:3]).max(), torque, 1 / duration)))
+        if len(state.position):
+            force = np.abs(load.force).max() * duration / self.model.flight.mass
+            speed = max(np.abs(state.velocity).max(), force)
+            way = max(np.abs(state.position).max(), speed * duration)
+            parts += [np.full(3, way or 1.0), np.full(3, speed or 1.0)]
+        return np.concatenate([*parts, [np.inf]])
 
 
 class SingularError(SimulationError):

@@ -2,61 +2,157 @@
 
 A row says by which fractions of the time step the two flows alternate, kick first. Both flows are symplectic and
 time-reversible, so any palindrome of them is too; its coefficients decide its order.
+
+Compositions of whole Verlet steps keep their order with any rotor, because such a step is symmetric whatever the rotor
+does. Every other row counts on a drift that is the free motion itself: with the split rotor its order would fall to 2.
 """
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 
 class Scheme(NamedTuple):
-    """kick(kicks[0] dt) drift(drifts[0] dt) kick(kicks[1] dt) ... kick(kicks[-1] dt)."""
+    """kick(kicks[0] dt) drift(drifts[0] dt) kick(kicks[1] dt) ... kick(kicks[-1] dt); a kick of 0 costs nothing."""
 
     name: str
     kicks: tuple[float, ...]  # one more than drifts; sum 1
     drifts: tuple[float, ...]  # sum 1
     order: int
+    exact_rotor: bool  # whether its order needs one
     source: str
+
+    def with_rotor(self, rotor: str | None) -> "Scheme":
+        """This scheme on the rotor named ("split" or "exact"); its own where none is."""
+        return self if rotor is None else self._replace(exact_rotor=rotor == "exact")
+
+    @property
+    def force_evaluations(self) -> int:
+        """A step: the last kick of a step and the first of the next share theirs."""
+        return sum(kick != 0 for kick in self.kicks[1:])
 
 
 def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Scheme:
     """Velocity Verlet steps of these lengths one after the other; neighbouring kicks are one."""
     kicks = (steps[0] / 2, *((a + b) / 2 for a, b in pairwise(steps)), steps[-1] / 2)
-    return Scheme(name, kicks, steps, order, source)
+    return Scheme(name, kicks, steps, order, False, source)
 
 
-def palindrome(*half: float) -> tuple[float, ...]:
-    """Step lengths that are mirrored about the middle one, which makes their sum 1."""
+def split(name: str, kicks: tuple[float, ...], drifts: tuple[float, ...], order: int, source: str) -> Scheme:
+    """Kicks and drifts as they are, for an exact rotor."""
+    return Scheme(name, kicks, drifts, order, True, source)
+
+
+def odd(*half: float) -> tuple[float, ...]:
+    """Fractions that are mirrored about a single middle one, which makes their sum 1."""
     return (*half, 1 - 2 * sum(half), *reversed(half))
 
 
-# Compositions of a step that is itself symmetric keep their order with any rotor and any force.
+def even(*half: float) -> tuple[float, ...]:
+    """Fractions that are mirrored about two equal middle ones, which make their sum 1."""
+    half = (*half, 0.5 - sum(half))
+    return (*half, *reversed(half))
+
+
+Rotor = Literal["split", "exact"]
+
+
+def rotor_fault(integrator: str, rotor: Rotor | None) -> str:
+    """Why a scheme cannot go with a rotor; empty if it can."""
+    if rotor == "split" and SCHEMES[integrator].exact_rotor:
+        return f"{integrator} needs rotor = 'exact': with the split rotor it would be of order 2"
+    return ""
+
+
+BLANES_MOAN = "Blanes & Moan 2002, J. Comput. Appl. Math. 142, 313"
+KAHAN_LI = "Kahan & Li 1997, Math. Comp. 66, 1089; Hairer, Lubich & Wanner, section V.3"
+OMELYAN = "Omelyan, Mryglod & Folk 2002, Comput. Phys. Commun. 146, 188"
+
 SCHEMES = {
     scheme.name: scheme
     for scheme in (
-        Scheme(
+        composed(
             "velocity_verlet",
-            kicks=(0.5, 0.5),
-            drifts=(1.0,),
+            (1.0,),
             order=2,
             source="Swope et al. 1982, J. Chem. Phys. 76, 637; for rigid bodies Dullweber et al. 1997",
         ),
+        split(
+            "position_verlet",
+            (0.0, 1.0, 0.0),
+            (0.5, 0.5),
+            order=2,
+            source="Tuckerman, Berne & Martyna 1992, J. Chem. Phys. 97, 1990",
+        ),
+        split(
+            "two_stage",
+            odd(0.1931833275037836),
+            (0.5, 0.5),
+            order=2,
+            source="McLachlan 1995, SIAM J. Sci. Comput. 16, 151; van Zon, Omelyan & Schofield 2008",
+        ),
+        composed(
+            "yoshida_4",
+            odd(1.3512071919596578),
+            order=4,
+            source="Yoshida 1990, Phys. Lett. A 150, 262",
+        ),
         composed(
             "suzuki_4",
-            palindrome(0.4144907717943757, 0.4144907717943757),
+            odd(0.4144907717943757, 0.4144907717943757),
             order=4,
             source="Suzuki 1990, Phys. Lett. A 146, 319",
         ),
+        split(
+            "pefrl",
+            (0.0, *even(0.7123418310626054), 0.0),
+            odd(0.1786178958448091, -0.06626458266981849),
+            order=4,
+            source=OMELYAN,
+        ),
+        split(
+            "vefrl",
+            odd(0.1644986515575760, 1.235692651138917),
+            even(0.52094339103989808),
+            order=4,
+            source=OMELYAN,
+        ),
+        split(
+            "blanes_moan_4",
+            (0.0, *even(0.209515106613362, -0.143851773179818), 0.0),
+            odd(0.0792036964311957, 0.353172906049774, -0.0420650803577195),
+            order=4,
+            source=f"{BLANES_MOAN}, S6",
+        ),
+        split(
+            "srkn_4",
+            odd(0.0829844064174052, 0.396309801498368, -0.0390563049223486),
+            even(0.245298957184271, 0.604872665711080),
+            order=4,
+            source=f"{BLANES_MOAN}, SRKN6b",
+        ),
         composed(
             "kahan_li_6",
-            palindrome(
-                0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230
-            ),
+            odd(0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230),
             order=6,
-            source="Kahan & Li 1997, Math. Comp. 66, 1089, s9odr6a; Hairer, Lubich & Wanner, eq. V.3.11",
+            source=f"{KAHAN_LI}, s9odr6a",
+        ),
+        split(
+            "blanes_moan_6",
+            (0.0, *even(0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175), 0.0),
+            odd(0.0502627644003922, 0.413514300428344, 0.0450798897943977, -0.188054853819569, 0.541960678450780),
+            order=6,
+            source=f"{BLANES_MOAN}, S10",
+        ),
+        split(
+            "srkn_6",
+            even(0.0414649985182624, 0.198128671918067, -0.0400061921041533, 0.0752539843015807, -0.0115113874206879),
+            odd(0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075, 0.357208872795928),
+            order=6,
+            source=f"{BLANES_MOAN}, SRKN11b",
         ),
         composed(
             "kahan_li_8",
-            palindrome(
+            odd(
                 0.13020248308889008088,
                 0.56116298177510838456,
                 -0.38947496264484728641,
@@ -67,7 +163,7 @@ SCHEMES = {
                 0.29501172360931029887,
             ),
             order=8,
-            source="Kahan & Li 1997, Math. Comp. 66, 1089, s17odr8a; Hairer, Lubich & Wanner, eq. V.3.13",
+            source=f"{KAHAN_LI}, s17odr8a",
         ),
     )
 }

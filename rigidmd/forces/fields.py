@@ -4,12 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.frame import frame_rate
-from rigidmd.forces.terms import ASK, OK, add_forces, power, spend
+from rigidmd.forces.terms import ASK, OK, add_forces, power
 from rigidmd.jit import implements, is_a, kernel
-from rigidmd.mechanics.course import Course, piece, value
-from rigidmd.mechanics.flight import along, inertial_mass
-from rigidmd.mechanics.rotor import moments
+from rigidmd.mechanics.course import Course, value
+from rigidmd.mechanics.flight import along
 
 
 class SteadyForce(NamedTuple):
@@ -28,16 +26,18 @@ class Drive(NamedTuple):
     follows_body: bool  # force and torque are given along the body's axes
     force_lab: np.ndarray  # (3,) as last evaluated
     torque_body: np.ndarray  # (3,) as last evaluated, that of the force included
-    work: np.ndarray  # (1,) done on the body so far
+
+    drives = True
 
 
 class Told(NamedTuple):
-    """Force at the centre of mass (or pivot) and torque that a Python function says, asked before every kick."""
+    """Force and torque that a Python function says, asked wherever positions have changed."""
 
     fresh: np.ndarray  # (1,) whether the answer is that for the present moment
     force_lab: np.ndarray  # (3,)
     torque_body: np.ndarray  # (3,)
-    work: np.ndarray  # (1,) done on the body so far
+
+    drives = True
 
 
 @implements(add_forces, inline=True)
@@ -82,10 +82,9 @@ def _add_drive(term, state, load, tally):
         return None
 
     def add_drive(term, state, load, tally):
-        at_force = piece(term.force, state.time[0])
-        at_torque = piece(term.torque, state.time[0])
-        force = (value(term.force, at_force, 0), value(term.force, at_force, 1), value(term.force, at_force, 2))
-        torque = (value(term.torque, at_torque, 0), value(term.torque, at_torque, 1), value(term.torque, at_torque, 2))
+        now = state.time[0]
+        force = (value(term.force, now, 0), value(term.force, now, 1), value(term.force, now, 2))
+        torque = (value(term.torque, now, 0), value(term.torque, now, 1), value(term.torque, now, 2))
         for k in range(3):
             term.force_lab[k] = force[k]
             term.torque_body[k] = torque[k]
@@ -126,42 +125,6 @@ def hand_over(term, load):
         for i in range(3):
             load.torque_body[k, i] += term.torque_body[i]
     return OK
-
-
-@implements(spend)
-def _spend_drive(term, model, state, load, h):
-    if not (is_a(term, Drive) or is_a(term, Told)):
-        return None
-
-    def spend_drive(term, model, state, load, h):
-        # The kick changes the kinetic energy by h F . v with v the mean of before and after: exact for the whole
-        # load, and this term's share of it.
-        turning = frame_rate(model.frame, state.time[0])
-        for k in range(len(load.force)):
-            x = state.position[k]
-            for i in range(3):
-                a = (i + 1) % 3
-                b = (i + 2) % 3
-                dragged = turning[a] * x[b] - turning[b] * x[a]
-                term.work[0] -= h * term.force_lab[i] * dragged
-            if len(state.rotation):
-                q = state.rotation[k]
-                for i in range(3):
-                    p = model.flight.mass * along(q, state.velocity[k], i) + 0.5 * h * along(q, load.force[k], i)
-                    term.work[0] += h * along(q, term.force_lab, i) * p / inertial_mass(model.flight, i)
-            else:
-                for i in range(3):
-                    v = state.velocity[k, i] + 0.5 * h * load.force[k, i] / model.flight.mass
-                    term.work[0] += h * term.force_lab[i] * v
-        for k in range(len(load.torque_body)):
-            q = state.rotation[k]
-            for i in range(3):
-                inverse, carried = moments(model.rotor, state.time[0], i)
-                own = state.angular_momentum_body[k, i] + 0.5 * h * load.torque_body[k, i] - carried
-                dragged = q[0, i] * turning[0] + q[1, i] * turning[1] + q[2, i] * turning[2]
-                term.work[0] += h * term.torque_body[i] * (own * inverse - dragged)
-
-    return spend_drive
 
 
 @implements(power)

@@ -9,7 +9,7 @@ from math import sin, sqrt
 from typing import NamedTuple
 
 from rigidmd.jit import implements, is_a, kernel
-from rigidmd.mechanics.course import Course, piece, value
+from rigidmd.mechanics.course import Course, value
 
 
 class Inertial(NamedTuple):
@@ -35,10 +35,10 @@ def _follow(frame, state, time, h):
         return lambda frame, state, time, h: None
 
     def turn_back(frame, state, time, h):
-        at = piece(frame.angular_velocity, time + 0.5 * h)
-        x = -h * value(frame.angular_velocity, at, 0)
-        y = -h * value(frame.angular_velocity, at, 1)
-        z = -h * value(frame.angular_velocity, at, 2)
+        middle = time + 0.5 * h
+        x = -h * value(frame.angular_velocity, middle, 0)
+        y = -h * value(frame.angular_velocity, middle, 1)
+        z = -h * value(frame.angular_velocity, middle, 2)
         if len(state.position):
             turn_vector(state.position[0], x, y, z)
             turn_vector(state.velocity[0], x, y, z)
@@ -81,11 +81,10 @@ def _frame_rate(frame, time):
         return lambda frame, time: (0.0, 0.0, 0.0)
 
     def rate(frame, time):
-        at = piece(frame.angular_velocity, time)
         return (
-            value(frame.angular_velocity, at, 0),
-            value(frame.angular_velocity, at, 1),
-            value(frame.angular_velocity, at, 2),
+            value(frame.angular_velocity, time, 0),
+            value(frame.angular_velocity, time, 1),
+            value(frame.angular_velocity, time, 2),
         )
 
     return rate

@@ -1,10 +1,11 @@
 """Resistance: bearings, air and fluids that take energy from a single body, along and about its own axes.
 
-The flow of resistance alone, everything else held, is solved exactly on each axis; it acts for half a step before and
-half a step after the rest, which makes the step of order 2 and stable for any strength.
+It acts within the kick: momentum under a constant load and resistance, positions held, follows each axis in closed
+form. So a body in a thick fluid moves at its terminal speed whatever the step, and dry friction holds what it can hold.
+The step is of order 2.
 """
 
-from math import copysign, exp, expm1, pi, sqrt, tan, tanh
+from math import copysign, exp, expm1, log1p, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -18,13 +19,14 @@ from rigidmd.mechanics.rotor import NoRotor, moments
 class NoResistance(NamedTuple):
     """Nothing is lost."""
 
-    work: float = 0.0
+    nothing: float = 0.0
 
 
 class Resistance(NamedTuple):
-    """Force -(linear v + quadratic |v| v) on each body axis, torque -(dry sign(w) + linear w + quadratic |w| w).
+    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), by body axis.
 
-    v and w are relative to the frame. Dry friction is that of a bearing about a body axis under constant load.
+    v and w are relative to the frame, |v| and |w| their whole size, so equal coefficients mean resistance alike in all
+    directions. Dry friction is that of a bearing about a body axis under constant load.
     """
 
     linear: np.ndarray  # (3,)
@@ -32,113 +34,159 @@ class Resistance(NamedTuple):
     rotation_dry: np.ndarray  # (3,)
     rotation_linear: np.ndarray  # (3,)
     rotation_quadratic: np.ndarray  # (3,)
-    work: np.ndarray  # (1,) done on the body so far; not positive
 
 
-def resist(resistance, flight, rotor, frame, state, time, h):
-    """The flow of resistance alone over a time h, in place."""
+def push(resistance, flight, rotor, frame, state, load, h):
+    """Momentum of a single body under a load and resistance for a time h, positions held, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(resist, inline=True)
-def _resist(resistance, flight, rotor, frame, state, time, h):
+@implements(push, inline=True)
+def _push(resistance, flight, rotor, frame, state, load, h):
+    flies, turns = not is_a(flight, Pinned), not is_a(rotor, NoRotor)
     if is_a(resistance, NoResistance):
-        return lambda resistance, flight, rotor, frame, state, time, h: None
-    translates, turns = not is_a(flight, Pinned), not is_a(rotor, NoRotor)
 
-    def slow_down(resistance, flight, rotor, frame, state, time, h):
-        if translates:
-            resistance.work[0] += slow_flight(resistance, flight, rotor, frame, state, time, h)
+        def push_freely(resistance, flight, rotor, frame, state, load, h):
+            for m in range(len(load.force)):
+                for k in range(3):
+                    state.velocity[m, k] += h / flight.mass * load.force[m, k]
+            for m in range(len(load.torque_body)):
+                for k in range(3):
+                    if moments(rotor, state.time[0], k)[0] > 0:  # no momentum gathers on an axis without inertia
+                        state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
+
+        return push_freely
+
+    def push_against(resistance, flight, rotor, frame, state, load, h):
+        if flies:
+            push_flight(resistance, flight, rotor, frame, state, load, h)
         if turns:
-            resistance.work[0] += slow_spin(resistance, rotor, frame, state, time, h)
+            push_spin(resistance, rotor, frame, state, load, h)
 
-    return slow_down
-
-
-@kernel(inline=True)
-def slow_spin(resistance, rotor, frame, state, time, h):
-    """Each L_k as resistance about axis k leaves it; the work done."""
-    turning = frame_rate(frame, time)
-    q = state.rotation[0]
-    work = 0.0
-    for k in range(3):
-        inverse, carried = moments(rotor, time, k)
-        if inverse > 0.0:
-            own = state.angular_momentum_body[0, k] - carried
-            dragged = q[0, k] * turning[0] + q[1, k] * turning[1] + q[2, k] * turning[2]
-            before = own * inverse - dragged
-            after = slowed(
-                before,
-                inverse * resistance.rotation_dry[k],
-                inverse * resistance.rotation_linear[k],
-                inverse * resistance.rotation_quadratic[k],
-                h,
-            )
-            state.angular_momentum_body[0, k] = (after + dragged) / inverse + carried
-            work += 0.5 * (after - before) * (after + before) / inverse
-    return work
-
-
-def slow_flight(resistance, flight, rotor, frame, state, time, h):
-    """Each P_k as resistance along axis k leaves it; the work done."""
-    raise TypeError("compiled code only")
-
-
-@implements(slow_flight, inline=True)
-def _slow_flight(resistance, flight, rotor, frame, state, time, h):
-    turns = not is_a(rotor, NoRotor)
-
-    def slow_flight(resistance, flight, rotor, frame, state, time, h):
-        w = frame_rate(frame, time)
-        x = state.position[0]
-        v = state.velocity[0]
-        dragged = (w[1] * x[2] - w[2] * x[1], w[2] * x[0] - w[0] * x[2], w[0] * x[1] - w[1] * x[0])
-        work = 0.0
-        for k in range(3):
-            mass = inertial_mass(flight, k)
-            if turns:
-                q = state.rotation[0]
-                before = flight.mass * along(q, v, k) / mass - along(q, dragged, k)
-            else:
-                before = v[k] - dragged[k]
-            after = slowed(before, 0.0, resistance.linear[k] / mass, resistance.quadratic[k] / mass, h)
-            work += 0.5 * mass * (after - before) * (after + before)
-            gain = (after - before) * mass / flight.mass
-            if turns:
-                for i in range(3):  # along axis k only: what the other axes see stays as it was
-                    v[i] += state.rotation[0, i, k] * gain
-            else:
-                v[k] += gain
-        return work
-
-    return slow_flight
+    return push_against
 
 
 @kernel
-def slowed(speed, dry, linear, quadratic, h):
-    """Solution after h of s' = -(dry sign(s) + linear s + quadratic |s| s), all rates per unit inertia, none negative.
+def push_spin(resistance, rotor, frame, state, load, h):
+    """L under torque and resistance; |w| is that of the middle of the kick, from a first try with that of its start."""
+    W = frame_rate(frame, state.time[0])
+    q = state.rotation[0]
+    L = state.angular_momentum_body[0]
+    size = 0.0
+    for trial in range(2):
+        squares = 0.0
+        for k in range(3):
+            inverse, carried = moments(rotor, state.time[0], k)
+            before = (L[k] - carried) * inverse - along(q, W, k)
+            if trial == 0:
+                squares += before * before
+            elif inverse > 0.0:
+                linear = inverse * (resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size)
+                push_k, dry = inverse * load.torque_body[0, k], inverse * resistance.rotation_dry[k]
+                middle, _ = pushed(before, push_k, dry, linear, 0.5 * h)
+                squares += middle * middle
+        size = sqrt(squares)
+    for k in range(3):
+        inverse, carried = moments(rotor, state.time[0], k)
+        if inverse > 0.0:
+            dragged = along(q, W, k)
+            before = (L[k] - carried) * inverse - dragged
+            linear = inverse * (resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size)
+            push_k, dry = inverse * load.torque_body[0, k], inverse * resistance.rotation_dry[k]
+            after, turned = pushed(before, push_k, dry, linear, h)
+            L[k] = (after + dragged) / inverse + carried
+            state.work[0] += (0.5 * (after - before) * (after + before) - push_k * turned) / inverse
 
-    A Riccati equation with constant coefficients; dry friction brings it to rest in finite time, the others never.
+
+def push_flight(resistance, flight, rotor, frame, state, load, h):
+    """Velocity (or impulse over mass) under force and resistance; |v| as |w| in `push_spin`."""
+    raise TypeError("compiled code only")
+
+
+@implements(push_flight)
+def _push_flight(resistance, flight, rotor, frame, state, load, h):
+    turns = not is_a(rotor, NoRotor)
+
+    def push_flight(resistance, flight, rotor, frame, state, load, h):
+        W = frame_rate(frame, state.time[0])
+        x = state.position[0]
+        V = state.velocity[0]
+        F = load.force[0]
+        wind = (W[1] * x[2] - W[2] * x[1], W[2] * x[0] - W[0] * x[2], W[0] * x[1] - W[1] * x[0])
+        size = 0.0
+        for trial in range(3):
+            squares = 0.0
+            for k in range(3):
+                mass = inertial_mass(flight, k)
+                if turns:
+                    q = state.rotation[0]
+                    before = flight.mass * along(q, V, k) / mass - along(q, wind, k)
+                    pull = along(q, F, k) / mass
+                else:
+                    before = V[k] - wind[k]
+                    pull = F[k] / mass
+                linear = (resistance.linear[k] + resistance.quadratic[k] * size) / mass
+                if trial == 0:
+                    squares += before * before
+                elif trial == 1:
+                    middle, _ = pushed(before, pull, 0.0, linear, 0.5 * h)
+                    squares += middle * middle
+                else:
+                    after, flown = pushed(before, pull, 0.0, linear, h)
+                    state.work[0] += mass * (0.5 * (after - before) * (after + before) - pull * flown)
+                    gain = (after - before) * mass / flight.mass
+                    if turns:
+                        for i in range(3):  # along axis k only: what the other axes see stays as it was
+                            V[i] += state.rotation[0, i, k] * gain
+                    else:
+                        V[k] += gain
+            size = sqrt(squares)
+
+    return push_flight
+
+
+@kernel
+def pushed(speed, push, dry, linear, h):
+    """(s, integral of s) after h of s' = push - dry sign(s) - linear s, per unit inertia; dry and linear not negative.
+
+    Dry friction brings it to rest in finite time, and holds it there unless the push is stronger.
     """
     s = abs(speed)
+    sign = copysign(1.0, speed)
     if s == 0.0:
-        return 0.0
-    if dry == 0.0:
-        decay = exp(-linear * h)
-        reach = -expm1(-linear * h) / linear if linear > 0.0 else h
-        return speed * decay / (1 + quadratic * s * reach)
-    discriminant = linear * linear - 4 * quadratic * dry
-    root = sqrt(abs(discriminant))
-    if discriminant > 0.0:
-        g = tanh(0.5 * root * h) / root
-    elif discriminant < 0.0:
-        if 0.5 * root * h >= 0.5 * pi:
-            return 0.0
-        g = tan(0.5 * root * h) / root
-    else:
-        g = 0.5 * h
-    left = max(0.0, (s * (1 - linear * g) - 2 * dry * g) / (1 + (linear + 2 * quadratic * s) * g))
-    return copysign(left, speed)
+        if abs(push) <= dry:
+            return 0.0, 0.0
+        sign = copysign(1.0, push)
+    net = sign * push - dry
+    if net < 0.0:
+        rest = log1p(linear * s / -net) / linear if linear > 0.0 else s / -net
+        if rest <= h:  # it stops, and may then be pushed the other way
+            back = max(0.0, abs(push) - dry) if sign * push < 0.0 else 0.0
+            there = eased(linear, rest)
+            after, way = run_up(0.0, back, linear, h - rest)
+            return -sign * after, sign * (s * there[0] + net * there[1] - way)
+    after, way = run_up(s, net, linear, h)
+    return sign * after, sign * way
+
+
+@kernel(inline=True)
+def run_up(s, net, linear, h):
+    """(s, way) of s' = net - linear s."""
+    first, second = eased(linear, h)
+    return s * exp(-linear * h) + net * first, s * first + net * second
+
+
+@kernel(inline=True)
+def eased(linear, h):
+    """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h: h and h²/2 where nothing resists."""
+    x = linear * h
+    if x < 1e-2:  # the difference of nearly equal numbers, by its series
+        return (
+            h * (1 - x / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6 * (1 - x / 7)))))),
+            h * h / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6 * (1 - x / 7))))),
+        )
+    first = -expm1(-x) / linear
+    return first, (h - first) / linear
 
 
 def braking(resistance, state, load, velocity, omega):
@@ -154,25 +202,22 @@ def _braking(resistance, state, load, velocity, omega):
     def brake(resistance, state, load, velocity, omega):
         power = 0.0
         for m in range(len(load.force)):
+            size = sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
             for k in range(3):
-                if len(state.rotation):
-                    q = state.rotation[m]
-                    v = along(q, velocity, k)
-                    f = -(resistance.linear[k] + resistance.quadratic[k] * abs(v)) * v
-                    for i in range(3):
-                        load.force[m, i] += q[i, k] * f
-                else:
-                    v = velocity[k]
-                    f = -(resistance.linear[k] + resistance.quadratic[k] * abs(v)) * v
-                    load.force[m, k] += f
+                v = along(state.rotation[m], velocity, k) if len(state.rotation) else velocity[k]
+                f = -(resistance.linear[k] + resistance.quadratic[k] * size) * v
                 power += f * v
+                if len(state.rotation):
+                    for i in range(3):
+                        load.force[m, i] += state.rotation[m, i, k] * f
+                else:
+                    load.force[m, k] += f
         for m in range(len(load.torque_body)):
+            size = sqrt(omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2)
             for k in range(3):
-                w = omega[k]
-                torque = -(resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * abs(w)) * w
-                torque -= resistance.rotation_dry[k] * np.sign(w)
+                torque = -(resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size) * omega[k]
                 load.torque_body[m, k] += torque
-                power += torque * w
+                power += torque * omega[k]
         return power
 
     return brake

@@ -31,6 +31,7 @@ class State(NamedTuple):
     rotation: np.ndarray  # (n, 3, 3) Q, body to lab
     angular_momentum_body: np.ndarray  # (n, 3)
     time: np.ndarray  # (1,)
+    work: np.ndarray  # (1,) done on a body so far by what drives or brakes it; its energy less this is conserved
 
     def copy(self) -> "State":
         """A state that shares nothing with this one."""
@@ -59,25 +60,15 @@ def add_forces(term, state, load, tally):
     raise TypeError(f"{type(term).__name__} is no term, or this was called outside compiled code")
 
 
-def spend(term, model, state, load, h):
-    """Add to a driving term's `work` what it does in a kick of `load` over h that is about to come."""
-    raise TypeError("compiled code only")
-
-
-@implements(spend)
-def _spend_nothing(term, model, state, load, h):
-    if "work" not in term.instance_class._fields:  # what has an energy, or none, keeps no account
-        return lambda term, model, state, load, h: None
-
-
 def power(term, state, velocity, omega):
-    """Power of a driving term at a body's velocity and angular velocity (lab and body frame, tuples); else 0."""
+    """Power of a term whose class says `drives = True` at a body's velocity and angular velocity (lab and body frame,
+    tuples, relative to the frame); 0 of any other, whose energy says it all."""
     raise TypeError("compiled code only")
 
 
 @implements(power)
 def _no_power(term, state, velocity, omega):
-    if "work" not in term.instance_class._fields:
+    if not getattr(term.instance_class, "drives", False):
         return lambda term, state, velocity, omega: 0.0
 
 
@@ -108,13 +99,6 @@ def load_bodies(terms, state, load):
     for term in literal_unroll(terms):
         status = max(status, add_forces(term, state, load, None))
     return status
-
-
-@kernel(inline=True)
-def account(terms, model, state, load, h):
-    """`spend` of all terms."""
-    for term in literal_unroll(terms):
-        spend(term, model, state, load, h)
 
 
 @kernel

@@ -9,14 +9,17 @@ import numpy as np
 from rigidmd.build.body import BodySystem
 from rigidmd.measure.motion import Motion
 
+#: Beyond this the motion is not that of the scene.
+LARGE_ENERGY_ERROR = 1e-3
+
 
 def summarise_body(
-    system: BodySystem, motion: Motion, preparing: float, wall: float, computing: float, interrupted: bool
+    system: BodySystem, motion: Motion, planned: int, preparing: float, wall: float, computing: float, interrupted: bool
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling), wall (with output), computing (steps)."""
     run = system.scene.run
     end = float(motion["t"][-1])
-    steps = round(end / run.timestep_s)
+    steps = round(end / run.timestep_s) if interrupted else planned
     return {
         "scene": system.scene.name,
         "rigidmd_version": version("rigidmd"),
@@ -47,4 +50,25 @@ def summarise_body(
         if system.turns
         else None,
         "trajectory_A_per_m": system.scale,
+        "notes": _notes(system, motion),
     }
+
+
+def _notes(system: BodySystem, motion: Motion) -> list[str]:
+    """What the reader should know before believing the figures."""
+    run, notes = system.scene.run, []
+    if abs(run.steps * run.timestep_s - run.duration_s) > 1e-9 * run.duration_s:
+        notes.append(
+            f"{run.duration_s:g} s is no whole number of steps; this run is {run.steps * run.timestep_s:g} s long"
+        )
+    if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
+        notes.append(
+            f"the energy is wrong by {error:.1e} of the largest kinetic energy: timestep_s is too long for this motion"
+        )
+    if system.turns:
+        speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
+        if (speed[1:] * np.diff(motion["t"])).max(initial=0.0) > np.pi:
+            notes.append(
+                "the body turns by more than 180° between samples; shorten output.interval_s to follow its angles"
+            )
+    return notes

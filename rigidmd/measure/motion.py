@@ -12,7 +12,7 @@ from rigidmd.forces.resistance import NoResistance
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.course import is_steady
 from rigidmd.mechanics.flight import Immersed, inertial_masses
-from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
+from rigidmd.mechanics.rotation import direction, to_euler_angles, to_quaternion
 from rigidmd.mechanics.rotor import DrivenRotor
 
 
@@ -21,7 +21,6 @@ class Snapshot(NamedTuple):
 
     time: float
     state: State
-    work: float
 
 
 @dataclass
@@ -29,8 +28,10 @@ class Motion:
     """The samples of a run, by column.
 
     columns : arrays (t,), SI units, by the names in motion.csv. Position, velocity, attitude and omega are relative to
-        the frame; L is the angular momentum relative to axes that do not turn, along the frame's (lab) or body's axes
-    invariants : what should stay constant; column NAME_error is its relative error since the start
+        the frame; L is the angular momentum relative to axes that do not turn, that of wheels (h) included, along the
+        frame's (lab) or body's axes; the kinetic energy is that of I omega, without that of wheels about their axes
+    invariants : what should stay constant; column NAME_error is its error since the start, energies relative to the
+        largest kinetic energy, L to the largest |L|
     """
 
     columns: dict[str, np.ndarray]
@@ -50,8 +51,8 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     position, velocity, rotation, omega = system.motion(times, states)
     columns = {"t": times} | _vector(("x", "y", "z"), position) | _vector(("vx", "vy", "vz"), velocity)
     if system.turns:
-        columns |= _rotation_columns(system, states, rotation, omega)
-    columns |= _energies(system, times, states, np.array([s.work for s in snapshots]))
+        columns |= _rotation_columns(system, times, states, rotation, omega)
+    columns |= _energies(system, times, states)
     errors = _errors(system, columns)
     columns |= {f"{name}_error": error for name, error in errors.items()}
     if system.turns:
@@ -64,12 +65,16 @@ def _vector(names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]
     return dict(zip(names, values.T, strict=True))
 
 
-def _rotation_columns(system: BodySystem, states: State, rotation: np.ndarray, omega: np.ndarray) -> dict:
+def _rotation_columns(
+    system: BodySystem, times: np.ndarray, states: State, rotation: np.ndarray, omega: np.ndarray
+) -> dict[str, np.ndarray]:
     n = len(rotation)
     momentum = states.angular_momentum_body.reshape(n, 3) @ system.axes.T
     columns = {f"q{i + 1}{j + 1}": rotation[:, i, j] for i in range(3) for j in range(3)}
     columns |= _vector(("qw", "qx", "qy", "qz"), _continuous(to_quaternion(rotation)))
     columns |= _vector(("phi", "theta", "psi"), to_euler_angles(rotation))
+    if isinstance(system.body.rotor, DrivenRotor):
+        columns |= _vector(("h_body_1", "h_body_2", "h_body_3"), system.moments(times)[1] @ system.axes.T)
     for name, body in (("omega", omega), ("L", momentum)):
         columns |= _vector(tuple(f"{name}_body_{k}" for k in (1, 2, 3)), body)
         columns |= _vector(tuple(f"{name}_lab_{k}" for k in "xyz"), np.einsum("tij,tj->ti", rotation, body))
@@ -82,7 +87,7 @@ def _continuous(quaternions: np.ndarray) -> np.ndarray:
     return quaternions * np.concatenate([[1.0], np.cumprod(np.where(turned < 0, -1.0, 1.0))])[:, None]
 
 
-def _energies(system: BodySystem, times: np.ndarray, states: State, work: np.ndarray) -> dict[str, np.ndarray]:
+def _energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
     """Kinetic energy (less Omega . J in a turning frame), potential, their sum, and the work of what is neither."""
     n = len(times)
     kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
@@ -104,7 +109,7 @@ def _energies(system: BodySystem, times: np.ndarray, states: State, work: np.nda
                 potential -= position @ term.force
             if system.turns:
                 potential -= np.einsum("i,tij,j->t", term.force, rotation, term.point)
-    return {"kinetic": kinetic, "potential": potential, "energy": kinetic + potential, "work": work}
+    return {"kinetic": kinetic, "potential": potential, "energy": kinetic + potential, "work": states.work.reshape(n)}
 
 
 def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -173,10 +178,9 @@ def _relative(error: np.ndarray, scale: float) -> np.ndarray:
 def drawn_axis(system: BodySystem) -> np.ndarray:
     """The body axis (3,) whose path is drawn: the one asked for, towards the centre of mass, that of symmetry, or 3."""
     if system.scene.output.axis is not None:
-        axis = np.array(system.scene.output.axis)
-        return axis / np.linalg.norm(axis)
+        return direction(system.scene.output.axis)
     if system.centre.any():
-        return system.centre / np.linalg.norm(system.centre)
+        return direction(system.centre)
     for k in (2, 0, 1):
         if system.inertia[k - 1] == system.inertia[k - 2] != system.inertia[k]:
             return system.axes[:, k]

@@ -12,7 +12,8 @@ class Course(NamedTuple):
     """Pieces of constant, linear or quadratic change.
 
     Piece i holds from times[i] to times[i + 1]: constant[i] + d slope[i] + d² curvature[i] with d = t - times[i]. The
-    first begins at time 0, where runs begin; the last has no end.
+    first begins at time 0, where runs begin; the last has no end. Compiled code gets one piece at a time (`during`): a
+    run is stepped from break to break, and no step sees a jump or a kink.
     """
 
     times: np.ndarray  # (k,) increasing, the first 0
@@ -64,6 +65,13 @@ def value_at(course: Course, times: np.ndarray) -> np.ndarray:
     return course.constant[i] + d * (course.slope[i] + d * course.curvature[i])
 
 
+def during(course: Course, time: float) -> Course:
+    """The one piece that holds just after a time, for ever."""
+    i, d = _places(course, np.array([time]))
+    constant = course.constant[i] + d * (course.slope[i] + d * course.curvature[i])
+    return Course(np.array([time]), constant, course.slope[i] + 2 * d * course.curvature[i], course.curvature[i])
+
+
 def total(courses: list[Course]) -> Course:
     """The sum of courses."""
     times = np.unique(np.concatenate([course.times for course in courses]))
@@ -82,28 +90,13 @@ def _places(course: Course, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @kernel(inline=True)
-def piece(course, time):
-    """Index of the piece that holds at a time, and the time since it began."""
-    low = 0
-    high = len(course.times)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if course.times[middle] <= time:
-            low = middle
-        else:
-            high = middle
-    return low, time - course.times[low]
+def value(course, time, k):
+    """Component k at a time, by the first piece."""
+    d = time - course.times[0]
+    return course.constant[0, k] + d * (course.slope[0, k] + d * course.curvature[0, k])
 
 
 @kernel(inline=True)
-def value(course, at, k):
-    """Component k at a place (from `piece`)."""
-    i, d = at
-    return course.constant[i, k] + d * (course.slope[i, k] + d * course.curvature[i, k])
-
-
-@kernel(inline=True)
-def rate(course, at, k):
-    """Rate of change of component k at a place (from `piece`)."""
-    i, d = at
-    return course.slope[i, k] + 2 * d * course.curvature[i, k]
+def rate(course, time, k):
+    """Rate of change of component k at a time, by the first piece."""
+    return course.slope[0, k] + 2 * (time - course.times[0]) * course.curvature[0, k]

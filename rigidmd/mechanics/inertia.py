@@ -41,14 +41,14 @@ def shifted(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
     return tensor + inertia_tensor(np.array([mass]), np.array([offset], dtype=float))
 
 
-def impossible(tensor: np.ndarray) -> str:
+def impossible(tensor: np.ndarray, scale: float = 0.0) -> str:
     """Why no distribution of mass has this inertia tensor (3, 3); empty if one has.
 
     Moments are not negative and none is more than the sum of the others. The two sides may differ by rounding, 1e-12
-    of the largest moment.
+    of the largest moment, or of `scale` where the tensor is a difference of larger ones.
     """
     low, middle, high = np.linalg.eigvalsh(tensor)
-    slack = 1e-12 * max(abs(low), abs(high))
+    slack = 1e-12 * max(abs(low), abs(high), scale)
     if low < -slack:
         return f"a principal moment is {low:.6g}, must not be negative"
     if low + middle < high - slack:

@@ -24,6 +24,13 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def direction(vector: np.ndarray) -> np.ndarray:
+    """Unit vector along a vector (k,) that is not zero, however short or long."""
+    vector = np.asarray(vector, dtype=float)
+    vector = vector / np.abs(vector).max()
+    return vector / np.linalg.norm(vector)
+
+
 def to_quaternion(rotation: np.ndarray) -> np.ndarray:
     """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z, the first component that is not 0 positive.
 

@@ -3,13 +3,13 @@
 A rotor is a term: `turn(rotor, ...)` is chosen by its type when compiled, so a scene of points compiles no rotation.
 """
 
-from math import cos, sin, sqrt
+from math import cos, inf, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.jit import implements, is_a, kernel
-from rigidmd.mechanics.course import Course, piece, rate, value
+from rigidmd.mechanics.course import Course, rate, value
 
 
 class SplitRotor(NamedTuple):
@@ -26,7 +26,22 @@ class SplitRotor(NamedTuple):
     symmetry: np.ndarray  # (species,) ROUND, or the axis of symmetry 0, 1, 2, or NONE
 
 
+class ExactRotor(NamedTuple):
+    """The free motion itself, to rounding, for any body and any time step.
+
+    Bodies with two equal moments turn in closed form; any other by the Taylor series of omega and of the quaternion of
+    the turn, whose terms follow from one another (omega' and q' are quadratic) and are summed until they no longer
+    count. Unlike Jacobi's functions it has no limits that need care (m -> 1, L along an axis, moments nearly equal). A
+    turn of 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are taken in parts.
+    """
+
+    inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
+    symmetry: np.ndarray  # (species,) as in SplitRotor
+
+
 NONE, ROUND = -1, 3  # of SplitRotor.symmetry
+MOST_TERMS = 30
+LONGEST_PART = 0.5  # rad: the terms of a part fall off by a factor of 5 and more
 
 
 def split_rotor(inertia: np.ndarray) -> SplitRotor:
@@ -47,12 +62,12 @@ class DrivenRotor(NamedTuple):
 
     h is the angular momentum of all rotors relative to the lab, along the body's axes. L' = L x omega + n then holds
     the terms -h' and -I' omega of Euler's equations, and H = sum (L_k - h_k)²/(2 I_k) still splits into exact plane
-    rotations. I and h are those of the middle of each time interval.
+    rotations. I and h are those of the middle of each time interval; the exact changes of H with them are work done on
+    the body.
     """
 
     inertia: Course
     momentum: Course
-    work: np.ndarray  # (1,) done on the body by what drives h and I so far: the sum of the exact changes of H
 
 
 class NoRotor(NamedTuple):
@@ -73,26 +88,123 @@ def _turn_points(rotor, species, rotation, angular_momentum_body, m, h):
 
 
 @implements(turn, inline=True)
-def _turn_split(rotor, species, rotation, angular_momentum_body, m, h):
-    if not is_a(rotor, SplitRotor):
-        return None
+def _turn_body(rotor, species, rotation, angular_momentum_body, m, h):
+    if is_a(rotor, SplitRotor):
 
-    def turn_split(rotor, species, rotation, angular_momentum_body, m, h):
-        inverse = rotor.inverse_inertia[species]
-        symmetry = rotor.symmetry[species]
-        if symmetry == NONE:
-            turn_by_axes(rotation, angular_momentum_body, m, inverse, (0.0, 0.0, 0.0), h)
-        elif symmetry == ROUND:
-            about_momentum(rotation, angular_momentum_body, m, h * max(inverse[0], inverse[1], inverse[2]))
-        else:
-            # L' = L x I^-1 L and Q' = Q hat(I^-1 L) with I^-1 L = L/I1 + (1/I3 - 1/I1) L3 e3: the two parts commute
-            i = (symmetry + 1) % 3
-            j = (symmetry + 2) % 3
-            about_momentum(rotation, angular_momentum_body, m, h * inverse[i])
-            angle = h * (inverse[symmetry] - inverse[i]) * angular_momentum_body[m, symmetry]
-            about_axis(rotation, angular_momentum_body, m, symmetry, i, j, angle)
+        def turn_split(rotor, species, rotation, angular_momentum_body, m, h):
+            if rotor.symmetry[species] == NONE:
+                inverse = rotor.inverse_inertia[species]
+                turn_by_axes(rotation, angular_momentum_body, m, inverse, (0.0, 0.0, 0.0), h)
+            else:
+                turn_symmetric(rotor, species, rotation, angular_momentum_body, m, h)
 
-    return turn_split
+        return turn_split
+    if is_a(rotor, ExactRotor):
+
+        def turn_exact(rotor, species, rotation, angular_momentum_body, m, h):
+            if rotor.symmetry[species] == NONE:
+                turn_by_series(rotation, angular_momentum_body, m, rotor.inverse_inertia[species], h)
+            else:
+                turn_symmetric(rotor, species, rotation, angular_momentum_body, m, h)
+
+        return turn_exact
+
+
+@kernel(inline=True)
+def turn_symmetric(rotor, species, rotation, angular_momentum_body, m, h):
+    """Free motion of a linear, spherical or symmetric body, in closed form."""
+    inverse = rotor.inverse_inertia[species]
+    symmetry = rotor.symmetry[species]
+    if symmetry == ROUND:
+        about_momentum(rotation, angular_momentum_body, m, h * max(inverse[0], inverse[1], inverse[2]))
+    else:
+        # L' = L x I^-1 L and Q' = Q hat(I^-1 L) with I^-1 L = L/I1 + (1/I3 - 1/I1) L3 e3: the two parts commute
+        i = (symmetry + 1) % 3
+        j = (symmetry + 2) % 3
+        about_momentum(rotation, angular_momentum_body, m, h * inverse[i])
+        angle = h * (inverse[symmetry] - inverse[i]) * angular_momentum_body[m, symmetry]
+        about_axis(rotation, angular_momentum_body, m, symmetry, i, j, angle)
+
+
+@kernel
+def turn_by_series(rotation, angular_momentum_body, m, inverse, h):
+    """Free motion of an asymmetric body by Taylor series of omega and of the quaternion of the turn."""
+    L = angular_momentum_body[m]
+    fastest = abs(L[0] * inverse[0]) + abs(L[1] * inverse[1]) + abs(L[2] * inverse[2])
+    if not 0.0 < fastest * abs(h) < inf:
+        return
+    parts = int(fastest * abs(h) / LONGEST_PART) + 1
+    part = h / parts
+    a0 = part * inverse[0] * (1 / inverse[1] - 1 / inverse[2])
+    a1 = part * inverse[1] * (1 / inverse[2] - 1 / inverse[0])
+    a2 = part * inverse[2] * (1 / inverse[0] - 1 / inverse[1])
+    terms = np.empty((MOST_TERMS + 1, 7))  # omega h^k/k! and q h^k/k! of the k-th derivatives
+    for _ in range(parts):
+        terms[0, 0] = L[0] * inverse[0]
+        terms[0, 1] = L[1] * inverse[1]
+        terms[0, 2] = L[2] * inverse[2]
+        terms[0, 3] = 1.0
+        terms[0, 4:] = 0.0
+        w, x, y, z = 0.0, 0.0, 0.0, 0.0
+        for k in range(MOST_TERMS):
+            g0, g1, g2, q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for j in range(k + 1):
+                v0, v1, v2 = terms[k - j, 0], terms[k - j, 1], terms[k - j, 2]
+                g0 += terms[j, 1] * v2
+                g1 += terms[j, 2] * v0
+                g2 += terms[j, 0] * v1
+                p0, p1, p2, p3 = terms[j, 3], terms[j, 4], terms[j, 5], terms[j, 6]
+                q0 -= p1 * v0 + p2 * v1 + p3 * v2
+                q1 += p0 * v0 + p2 * v2 - p3 * v1
+                q2 += p0 * v1 + p3 * v0 - p1 * v2
+                q3 += p0 * v2 + p1 * v1 - p2 * v0
+            share = 1 / (k + 1)
+            terms[k + 1, 0] = a0 * share * g0
+            terms[k + 1, 1] = a1 * share * g1
+            terms[k + 1, 2] = a2 * share * g2
+            share *= 0.5 * part
+            q0 *= share
+            q1 *= share
+            q2 *= share
+            q3 *= share
+            terms[k + 1, 3] = q0
+            terms[k + 1, 4] = q1
+            terms[k + 1, 5] = q2
+            terms[k + 1, 6] = q3
+            w += q0
+            x += q1
+            y += q2
+            z += q3
+            if abs(q0) + abs(q1) + abs(q2) + abs(q3) < 1e-17:
+                break
+        apply_turn(rotation, angular_momentum_body, m, w, x, y, z)
+
+
+@kernel(inline=True)
+def apply_turn(rotation, angular_momentum_body, m, w, x, y, z):
+    """Q <- Q R, L <- R^T L with R the rotation of the quaternion (1 + w, x, y, z), of any length."""
+    share = 2 / ((1 + w) * (1 + w) + x * x + y * y + z * z)
+    c = share * (1 + w)
+    # R v = v + c u x v + share u x (u x v), written as a change so that its own rounding is small
+    a = angular_momentum_body[m, 0]
+    b = angular_momentum_body[m, 1]
+    d = angular_momentum_body[m, 2]
+    p = y * d - z * b
+    q = z * a - x * d
+    r = x * b - y * a
+    angular_momentum_body[m, 0] = a + (share * (y * r - z * q) - c * p)
+    angular_momentum_body[m, 1] = b + (share * (z * p - x * r) - c * q)
+    angular_momentum_body[m, 2] = d + (share * (x * q - y * p) - c * r)
+    for row in range(3):  # a row of Q R is R^T times the row of Q
+        a = rotation[m, row, 0]
+        b = rotation[m, row, 1]
+        d = rotation[m, row, 2]
+        p = y * d - z * b
+        q = z * a - x * d
+        r = x * b - y * a
+        rotation[m, row, 0] = a + (share * (y * r - z * q) - c * p)
+        rotation[m, row, 1] = b + (share * (z * p - x * r) - c * q)
+        rotation[m, row, 2] = d + (share * (x * q - y * p) - c * r)
 
 
 @kernel(inline=True)
@@ -184,13 +296,15 @@ def _turn_alone(rotor, state, time, h):
         L = state.angular_momentum_body
         before = driven_energy(rotor, L, time)
         middle = time + 0.5 * h
-        at = piece(rotor.inertia, middle)
-        inverse = (1 / value(rotor.inertia, at, 0), 1 / value(rotor.inertia, at, 1), 1 / value(rotor.inertia, at, 2))
-        at = piece(rotor.momentum, middle)
-        offset = (value(rotor.momentum, at, 0), value(rotor.momentum, at, 1), value(rotor.momentum, at, 2))
-        rotor.work[0] += driven_energy(rotor, L, middle) - before
+        inverse = (
+            1 / value(rotor.inertia, middle, 0),
+            1 / value(rotor.inertia, middle, 1),
+            1 / value(rotor.inertia, middle, 2),
+        )
+        offset = (value(rotor.momentum, middle, 0), value(rotor.momentum, middle, 1), value(rotor.momentum, middle, 2))
+        state.work[0] += driven_energy(rotor, L, middle) - before
         turn_by_axes(state.rotation, L, 0, inverse, offset, h)
-        rotor.work[0] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
+        state.work[0] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
 
     return turn_driven
 
@@ -199,11 +313,9 @@ def _turn_alone(rotor, state, time, h):
 def driven_energy(rotor, angular_momentum_body, time):
     """sum (L_k - h_k)²/(2 I_k) at a time."""
     energy = 0.0
-    at_inertia = piece(rotor.inertia, time)
-    at_momentum = piece(rotor.momentum, time)
     for k in range(3):
-        own = angular_momentum_body[0, k] - value(rotor.momentum, at_momentum, k)
-        energy += 0.5 * own * own / value(rotor.inertia, at_inertia, k)
+        own = angular_momentum_body[0, k] - value(rotor.momentum, time, k)
+        energy += 0.5 * own * own / value(rotor.inertia, time, k)
     return energy
 
 
@@ -214,12 +326,12 @@ def moments(rotor, time, k):
 
 @implements(moments, inline=True)
 def _moments(rotor, time, k):
-    if is_a(rotor, SplitRotor):
+    if is_a(rotor, SplitRotor) or is_a(rotor, ExactRotor):
         return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
     if is_a(rotor, DrivenRotor):
         return lambda rotor, time, k: (
-            1 / value(rotor.inertia, piece(rotor.inertia, time), k),
-            value(rotor.momentum, piece(rotor.momentum, time), k),
+            1 / value(rotor.inertia, time, k),
+            value(rotor.momentum, time, k),
         )
     if is_a(rotor, NoRotor):
         return lambda rotor, time, k: (0.0, 0.0)
@@ -235,13 +347,11 @@ def _moment_rates(rotor, time, k):
     if is_a(rotor, DrivenRotor):
 
         def driven(rotor, time, k):
-            a = piece(rotor.inertia, time)
-            b = piece(rotor.momentum, time)
             return (
-                value(rotor.inertia, a, k),
-                rate(rotor.inertia, a, k),
-                value(rotor.momentum, b, k),
-                rate(rotor.momentum, b, k),
+                value(rotor.inertia, time, k),
+                rate(rotor.inertia, time, k),
+                value(rotor.momentum, time, k),
+                rate(rotor.momentum, time, k),
             )
 
         return driven

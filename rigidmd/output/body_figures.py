@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.output.folder import whole_file
+from rigidmd.output.report import COOL, FAINT, INK, WARM
 
-INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
 DASHED = (0, (5, 4))
 LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "$L_z$", "L_3": "$L_3$"}
-FIGURES = ("axis", "angles", "ellipsoids", "path", "invariants")
+FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 UP = np.array([0.0, 0.0, 1.0])
 #: Lines of more points than this are pixels in the SVG; where an error of exactly zero is drawn.
 MOST_POINTS, FLOOR = 10_000, 1e-17
@@ -34,8 +34,11 @@ def draw_motion(
             figures["axis"] = _axis_figure(columns, np.asarray(axis_body, float), down)
         if "phi" in columns:
             figures["angles"] = _angles_figure(columns)
-        if "omega_body_1" in columns and inertia is not None and np.min(inertia) > 0:
-            figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(inertia, float))
+        if "omega_body_1" in columns:
+            if inertia is not None and np.min(inertia) > 0:
+                figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(inertia, float))
+            else:
+                figures["omega"] = _omega_figure(columns)
         if "x" in columns:
             figures["path"] = _path_figure(columns, down)
         figures["invariants"] = _invariants_figure(columns, invariants)
@@ -153,12 +156,22 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     return figure
 
 
+def _omega_figure(columns: dict[str, np.ndarray]):
+    """ω in the body frame against time, of a body for which it lies on no ellipsoids."""
+    omega = [columns[f"omega_body_{i}"] for i in "123"]
+    fastest = max(np.abs(part).max() for part in omega)
+    figure = _new_figure("ω in the body frame", 8, 6.4)
+    labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
+    _draw_series(figure, figure.add_gridspec(3, 1), columns["t"], omega, labels, 1e-9 * fastest, 2 * fastest or 1.0)
+    return figure
+
+
 def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     """The centre of mass: its coordinates against time, its path in a vertical plane and from above."""
     place = np.stack([columns[key] for key in "xyz"], axis=-1)
     span = np.ptp(place, axis=0).max()
     least = 1e-11 * span + 1e-13 * np.abs(place).max()
-    if not span > max(least, 1e-12):
+    if not span > least:
         return None
     up = UP if down is None else -down
     level = place - place.mean(0)

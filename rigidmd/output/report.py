@@ -52,13 +52,15 @@ def body_summary_text(summary: dict) -> str:
         rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
     if summary["theta_range_deg"]:
         low, high = summary["theta_range_deg"]
-        rows.append(("theta", f"from {low:.6f}° to {high:.6f}°"))
+        rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
     for name, error in summary["largest_relative_error"].items():
-        rows.append((f"{name} error", f"at most {error:.1e}, relative"))
+        of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
+        rows.append((f"{name} error", f"at most {error:.1e} of {of}"))
     if summary["largest_orthogonality_error"] is not None:
         rows.append(("orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"))
     lines = [f"\n{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"]
     lines += [f"  {name:<16}{value}" for name, value in rows]
+    lines += [f"\n  note: {note}" for note in summary["notes"]]
     if summary["interrupted"]:
         lines += ["", "  interrupted: the figures are those so far"]
     return "\n".join(lines)

@@ -12,8 +12,11 @@ from MDAnalysis.coordinates.memory import MemoryReader
 
 from rigidmd.build.body import BodySystem
 from rigidmd.build.system import System
+from rigidmd.errors import SimulationError
 from rigidmd.forces.terms import State
 from rigidmd.output.folder import whole_file
+
+LARGEST_IN_XTC = 2e7  # Å: whole thousandths of a nm in 32 bits
 
 
 def universe(system: System | BodySystem, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
@@ -109,6 +112,11 @@ class TrajectoryFile:
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
         set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
+        if self._format == ".xtc" and np.abs(self._universe.trajectory.ts.positions).max() > LARGEST_IN_XTC:
+            raise SimulationError(
+                f"a position is beyond the {LARGEST_IN_XTC:g} Å that .xtc can hold: use .trr or .nc, wrapped positions, or "
+                "less output.trajectory_A_per_m"
+            )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if self._format == ".xyz":

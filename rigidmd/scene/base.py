@@ -80,7 +80,9 @@ class Scene(Section):
         if cls is Scene:
             from rigidmd.scene import BodyScene, MolecularScene
 
-            cls = BodyScene if "body" in data else MolecularScene
+            cls = _kind(data, BodyScene, MolecularScene)
+            if cls is None:
+                raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults = cls.strange_paths(data, folder)
         for key, value in (overrides or {}).items():
             faults += _override(data, key, value)
@@ -88,12 +90,33 @@ class Scene(Section):
         try:
             scene = cls.model_validate(data)
         except ValidationError as error:
-            raise SceneError(source, faults + faults_of(error, cls, text)) from None
+            raise SceneError(source, faults + faults_of(error, cls, text, overrides or {})) from None
         if faults:
             raise SceneError(source, faults)
         scene._source = source
         scene._folder = folder
         return scene
+
+
+def file_name(name: str, endings: tuple[str, ...]) -> str:
+    """A name with one of these endings that leads out of no folder. Raises ValueError."""
+    if not re.fullmatch(r"[\w\-][\w.\-]*", name):
+        raise ValueError(f"is {name!r}, must be a plain file name without a folder")
+    if name.startswith("input_"):
+        raise ValueError(f"is {name!r}; names beginning with input_ are kept for copies of input files")
+    if not name.endswith(endings):
+        raise ValueError(f"is {name!r}, must end in one of {' '.join(endings)}")
+    return name
+
+
+def _kind(data: dict, body: type[Scene], molecules: type[Scene]) -> type[Scene] | None:
+    """The kind of scene that has these tables, or the only one that knows any of them."""
+    for kind, marker in ((body, "body"), (molecules, "molecules")):
+        if marker in data:
+            return kind
+    own = {kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields)) for kind in (body, molecules)}
+    best = max(own, key=own.get)
+    return best if own[best] > 0 else None
 
 
 def _override(data: dict, key: str, value: Any) -> list[str]:

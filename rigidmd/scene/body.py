@@ -3,6 +3,7 @@
 The equations hold no constant of nature, so numbers in any other consistent units serve as well.
 """
 
+from collections.abc import Iterator
 from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal
@@ -10,10 +11,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.odes import FORMULATIONS, SOLVERS
+from rigidmd.dynamics.schemes import SCHEMES, Rotor, rotor_fault
 from rigidmd.mechanics.inertia import impossible, shifted
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
+    direction,
     from_attitude_matrix,
     from_euler_angles,
     from_quaternion,
@@ -22,8 +25,7 @@ from rigidmd.mechanics.rotation import (
     orthogonality_error,
 )
 from rigidmd.mechanics.solids import NUMBERS, SOLIDS
-from rigidmd.scene.base import Scene
-from rigidmd.scene.molecules import _file_name
+from rigidmd.scene.base import Scene, file_name
 from rigidmd.validation import Flag, NonNegative, Number, Positive, Section, Vector, line_of
 
 Matrix = tuple[Vector, Vector, Vector]
@@ -32,9 +34,9 @@ NonNegativeVector = tuple[NonNegative, NonNegative, NonNegative]
 PositiveVector = tuple[Positive, Positive, Positive]
 Times = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
 
-SOLVERS = ("rk4", "dop853", "radau")
 #: A rotation matrix given with fewer than about nine digits is refused unless it is to be projected.
 LARGEST_ORTHOGONALITY_ERROR = 1e-9
+FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
 
 
@@ -73,6 +75,7 @@ class PointMass(Section):
     """A point of a body made of points."""
 
     mass_kg: Positive
+    """Mass"""
     position_m: Vector
     """Body axes, from any origin; from the pivot where the body is pinned"""
 
@@ -112,6 +115,8 @@ class BodyTable(Section):
         if self.points is not None and self.centre_of_mass_m is not None:
             faults.append("centre_of_mass_m would do nothing: it follows from the points")
         if self.inertia_about == "pivot":
+            if not ways:
+                faults.append("inertia_about = 'pivot', but no inertia is given")
             if not self.pinned:
                 faults.append("inertia_about = 'pivot', but the body is not pinned")
             if ways and ways[0] in ("solid", "points"):
@@ -131,8 +136,8 @@ class BodyTable(Section):
         if self.inertia_about == "pivot":
             if why := impossible(tensor):
                 return [f"no body has this inertia: {why}"]
-            tensor = shifted(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
-            if why := impossible(tensor):
+            at_centre = shifted(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
+            if why := impossible(at_centre, np.abs(tensor).max()):
                 return [f"no body of this mass has this inertia about its pivot: about its centre of mass {why}"]
             return []
         why = impossible(tensor)
@@ -187,8 +192,11 @@ class BodyStart(Section):
         if matrix is not None:
             error = orthogonality_error(np.array([matrix]))
             sense = np.linalg.det(matrix)
-            if self.project and sense <= 0:
-                faults.append(f"the matrix has determinant {sense:.3g}: no rotation is near it")
+            if self.project and (sense <= 0 or error > FURTHEST_FROM_ROTATION):
+                faults.append(
+                    f"the matrix is no rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is {error:.2g}"
+                    f", must be below {FURTHEST_FROM_ROTATION:g}"
+                )
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
                 what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"
                 faults.append(
@@ -217,7 +225,7 @@ class BodyStart(Section):
         if self.yaw_pitch_roll_deg is not None:
             return from_yaw_pitch_roll(np.radians(self.yaw_pitch_roll_deg))
         if self.quaternion_wxyz is not None:
-            return from_quaternion(self.quaternion_wxyz)
+            return from_quaternion(direction(self.quaternion_wxyz))
         if self.rotation is not None:
             return nearest_rotation(np.array(self.rotation))
         if self.attitude_matrix is not None:
@@ -290,7 +298,9 @@ class Applied(Timed):
     axes: Literal["lab", "body"] = "lab"
     """Along which axes they are given: they stay fixed in the lab, or turn with the body"""
     force_N: Vector | tuple[Vector, ...] | None = None
+    """Force"""
     torque_N_m: Vector | tuple[Vector, ...] | None = None
+    """Torque, besides that of the force"""
     at_m: Vector | None = None
     """Where the force acts, body axes, from the centre of mass or the pivot; there when not given"""
 
@@ -330,8 +340,8 @@ class Fluid(Section):
     """Of the fluid: displaced and added mass of a sphere or ellipsoid follow"""
     displaced_mass_kg: NonNegative | None = None
     """Mass of the fluid displaced: buoyancy is its weight"""
-    centre_of_buoyancy_m: Vector = (0.0, 0.0, 0.0)
-    """Where buoyancy acts, body axes, from the centre of mass or the pivot"""
+    centre_of_buoyancy_m: Vector | None = None
+    """Where buoyancy acts, body axes, from the centre of mass or the pivot; the centre of mass when not given"""
     added_mass_kg: NonNegativeVector | None = None
     """Mass of fluid carried along each axis"""
     added_inertia_kg_m2: NonNegativeVector | None = None
@@ -387,7 +397,10 @@ class Wheel(Timed):
 
 
 class ChangingInertia(Timed):
-    """Principal moments that follow time as told, along the same axes; mass and centre of mass stay."""
+    """Principal moments that follow time as told, along the same axes; mass and centre of mass stay.
+
+    About the centre of mass, which is also the pivot of a body that is pinned.
+    """
 
     inertia_kg_m2: tuple[PositiveVector, ...]
     """Principal moments at each time"""
@@ -411,19 +424,27 @@ class Run(Section):
     """How long, and how."""
 
     duration_s: Positive
+    """How long"""
     timestep_s: Positive
+    """Time step; of dop853 and radau, which choose their own, where they are looked at"""
     integrator: Literal[(*SCHEMES, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
     """A scheme of flows, or a general solver of the textbook's equations: rk4, dop853, radau"""
-    formulation: Literal["matrix", "quaternion", "euler_angles"] | None = None
+    rotor: Rotor | None = None
+    """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
+    formulation: Literal[tuple(FORMULATIONS)] | None = None  # type: ignore[valid-type]
     """Variables of the attitude under rk4, dop853 and radau; matrix when not given"""
     relative_tolerance: Annotated[float, Strict(), Field(ge=1e-13, lt=1)] | None = None
     """Of dop853 and radau; 1e-10 when not given"""
     absolute_tolerance: Positive | None = None
-    """Of dop853 and radau; 1e-10 when not given"""
+    """Of dop853 and radau, in parts of the size that each variable has in the run; 1e-10 when not given"""
 
     @model_validator(mode="after")
     def _nothing_idle(self):
         faults = []
+        if self.rotor is not None and self.integrator in SOLVERS:
+            faults.append(f"rotor would do nothing with {self.integrator}")
+        elif fault := self.rotor and rotor_fault(self.integrator, self.rotor):
+            faults.append(fault)
         if self.formulation is not None and self.integrator not in SOLVERS:
             faults.append(f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}")
         tolerances = [key for key in ("relative_tolerance", "absolute_tolerance") if getattr(self, key) is not None]
@@ -464,12 +485,12 @@ class BodyOutput(Section):
     @field_validator("trajectory")
     @classmethod
     def _trajectory_name(cls, name):
-        return name if name is False else _file_name(name, (".xtc", ".trr", ".nc", ".xyz", ".pdb"))
+        return name if name is False else file_name(name, (".xtc", ".trr", ".nc", ".xyz", ".pdb"))
 
     @field_validator("topology")
     @classmethod
     def _topology_name(cls, name: str):
-        return _file_name(name, (".gro", ".pdb"))
+        return file_name(name, (".gro", ".pdb"))
 
     @model_validator(mode="after")
     def _apart(self):
@@ -503,9 +524,11 @@ class BodyScene(Scene):
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
         """Faults between tables that may have faults of their own."""
+        found = [
+            (keys, f"is {x:g}, must be 0 or between 1e-100 and 1e100") for keys, x in _numbers(data) if not _fits(x)
+        ]
         tables = {key: value for key, value in data.items() if isinstance(value, dict)}
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))
-        found = []
         if body.get("pinned") is True:
             found += [
                 (["start", key], "the body is pinned at a point and cannot be moved: leave it out")
@@ -515,19 +538,15 @@ class BodyScene(Scene):
             found += [
                 (["fluid", key], "the body is pinned at a point: no force of translation acts on it")
                 for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
-                if key in fluid
+                if isinstance(fluid.get(key), list | tuple) and any(fluid[key])
             ]
-        ways = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2", "pinned")
-        if not any(key in body for key in ways) and "changing_inertia" not in data:
-            idle = [["start", key] for key in start if key not in ("position_m", "velocity_m_s")]
-            idle += [[key] for key in ("friction", "wheels") if key in data]
-            found += [(keys, "the body has no inertia: a point does not turn") for keys in idle]
-        if "changing_inertia" in data and any(key in body for key in ways[:4]):
-            key = next(key for key in ways[:4] if key in body)
+        ways = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
+        if "changing_inertia" in data and any(key in body for key in ways):
+            key = next(key for key in ways if key in body)
             found.append((["body", key], "changing_inertia says the inertia: leave out one of them"))
         if "fluid" in data and "frame" in data:
             found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
-        return [f"{_line(keys, text)}{'.'.join(keys)}: {fault}" for keys, fault in found]
+        return [f"{_line(keys, text)}{'.'.join(map(str, keys))}: {fault}" for keys, fault in found]
 
     @model_validator(mode="after")
     def _whole(self):
@@ -542,7 +561,11 @@ class BodyScene(Scene):
                     for key in ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
                     if getattr(fluid, key) is not None
                 ]
-            if any(fluid.centre_of_buoyancy_m) and fluid.displaced_mass_kg is None and fluid.density_kg_m3 is None:
+            if (
+                fluid.centre_of_buoyancy_m is not None
+                and fluid.displaced_mass_kg is None
+                and fluid.density_kg_m3 is None
+            ):
                 faults.append("fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or density_kg_m3")
             if (fluid.displaced_mass_kg or fluid.density_kg_m3) and self.gravity is None:
                 faults.append("fluid: buoyancy needs [gravity]")
@@ -556,3 +579,17 @@ class BodyScene(Scene):
 def _line(keys: list[str], text: str) -> str:
     line = line_of(keys, text)
     return f"line {line}: " if line else ""
+
+
+def _numbers(data: Any, keys: tuple = ()) -> Iterator[tuple[list, float]]:
+    """Every number of nested tables and lists, with its path."""
+    if isinstance(data, dict | list | tuple):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from _numbers(value, (*keys, key))
+    elif isinstance(data, float):
+        yield [str(key) if not isinstance(key, int) else key for key in keys], data
+
+
+def _fits(x: float) -> bool:
+    """Whether squares and products of a number stay numbers; what is no finite number is told elsewhere."""
+    return not np.isfinite(x) or x == 0 or 1e-100 <= abs(x) <= 1e100

@@ -1,15 +1,14 @@
 """The scene of molecules: species, box, forces, stages."""
 
-import re
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.schemes import SCHEMES, Rotor, Scheme, rotor_fault
 from rigidmd.molecules import Site, SiteName, available_models
-from rigidmd.scene.base import Scene
+from rigidmd.scene.base import Scene, file_name
 from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
 
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
@@ -154,6 +153,8 @@ class Stage(Section):
     """Time constant of the thermostat"""
     integrator: Literal[tuple(SCHEMES)] = "velocity_verlet"  # type: ignore[valid-type]
     """Scheme of kicks and drifts"""
+    rotor: Rotor | None = None
+    """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
 
     @model_validator(mode="after")
     def _makes_sense(self):
@@ -164,6 +165,8 @@ class Stage(Section):
             thermal = ("temperature_K", "thermostat", "thermostat_time_ps")
             if idle := [key for key in thermal if getattr(self, key) != fields[key].default]:
                 raise ValueError(f"{', '.join(idle)} would do nothing in an nve stage")
+        if fault := rotor_fault(self.integrator, self.rotor):
+            raise ValueError(fault)
         if not self.duration_ps * 1000 / self.timestep_fs < MOST_STEPS:
             raise ValueError(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
         if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
@@ -174,6 +177,11 @@ class Stage(Section):
     def steps(self) -> int:
         """Number of steps: the duration in steps, rounded."""
         return round(self.duration_ps * 1000 / self.timestep_fs)
+
+    @property
+    def scheme(self) -> Scheme:
+        """The integrator with its rotor."""
+        return SCHEMES[self.integrator].with_rotor(self.rotor)
 
     @property
     def label(self) -> str:
@@ -202,12 +210,12 @@ class Output(Section):
     @field_validator("trajectory")
     @classmethod
     def _trajectory_name(cls, name):
-        return name if name is False else _file_name(name, TRAJECTORY_FORMATS)
+        return name if name is False else file_name(name, TRAJECTORY_FORMATS)
 
     @field_validator("topology")
     @classmethod
     def _topology_name(cls, name: str):
-        return _file_name(name, TOPOLOGY_FORMATS)
+        return file_name(name, TOPOLOGY_FORMATS)
 
     @model_validator(mode="after")
     def _holds_velocities(self):
@@ -219,16 +227,6 @@ class Output(Section):
         if self.topology == self.trajectory:
             raise ValueError(f"topology and trajectory are both {self.topology}; name them apart")
         return self
-
-
-def _file_name(name: str, endings: tuple[str, ...]) -> str:
-    if not re.fullmatch(r"[\w\-][\w.\-]*", name):
-        raise ValueError(f"is {name!r}, must be a plain file name without a folder")
-    if name.startswith("input_"):
-        raise ValueError(f"is {name!r}; names beginning with input_ are kept for copies of input files")
-    if not name.endswith(endings):
-        raise ValueError(f"is {name!r}, must end in one of {' '.join(endings)}")
-    return name
 
 
 class MolecularScene(Scene):

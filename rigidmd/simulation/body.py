@@ -2,6 +2,8 @@
 
 import contextlib
 from collections.abc import Callable
+from itertools import pairwise
+from math import ceil
 
 import numpy as np
 
@@ -23,8 +25,9 @@ MOTION_FILE = "motion.csv"
 class BodySimulation(Simulation):
     """A scene of a single body, ready to run. Besides the parameters of `Simulation`:
 
-    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass or
-        the pivot, and a torque (3,) in N m along the body's axes; asked before every kick
+    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass, and
+        a torque (3,) in N m along the body's axes. It is asked once wherever the body has moved; what depends on the
+        velocity is held for a step, which makes that step of order 1
     """
 
     time_unit = "s"
@@ -49,12 +52,27 @@ class BodySimulation(Simulation):
         self._say("compiling (kept on disk: the next run starts at once)")
         self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0, NoThermostat())
         self._reset()
+        self._stretches = self._phases()
 
     def _phases(self) -> list[Phase]:
-        return [Phase(self.scene.run.timestep_s, self.scene.run.steps)]
+        """From break to break of what follows time as told, in steps that end there, none longer than the scene's."""
+        run = self.scene.run
+        phases, steps = [], 0
+        for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
+            exact = (end - begin) / run.timestep_s
+            whole = round(exact)
+            if abs(exact - whole) > 1e-9 * max(1.0, exact):
+                whole = ceil(exact)
+            phases.append(Phase((end - begin) / whole if whole != exact else run.timestep_s, whole, steps))
+            steps += whole
+        return phases
 
     def _advance(self, k: int, steps: int, done: int) -> None:
-        self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, steps, NoThermostat(), done)
+        phase = self._stretches[k]
+        if k > 0 and done == 0:
+            self.state.time[0] = self.system.breaks()[k - 1]
+            self.engine.change(*self.system.during(float(self.state.time[0])))
+        self.engine.advance(self.state, self.system.method, phase.dt, steps, NoThermostat(), done)
 
     def _file_names(self) -> list[str]:
         from rigidmd.output.body_figures import FIGURES
@@ -68,7 +86,7 @@ class BodySimulation(Simulation):
         self._snapshots = []
 
         def sample(moment: Moment) -> None:
-            self._snapshots.append(Snapshot(moment.time, self.state.copy(), self.engine.work()))
+            self._snapshots.append(Snapshot(moment.time, self.state.copy()))
 
         interval = self.scene.interval
         return [Every(interval, sample), *(Every(interval, write) for write in self._writers(stack, results))]
@@ -99,7 +117,10 @@ class BodySimulation(Simulation):
 
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
         results.samples = motion(self.system, self._snapshots)
-        results.summary = summarise_body(self.system, results.samples, prepared, wall, computing[0], self._interrupted)
+        results.summary = summarise_body(
+            self.system, results.samples, sum(p.steps for p in self._stretches), prepared, wall, sum(computing),
+            self._interrupted,
+        )  # fmt: skip
         if self.folder is None:
             return
         from rigidmd.output.body_figures import draw_motion
@@ -164,7 +185,7 @@ class BodySimulation(Simulation):
         """Energies of the start in J, force in N along the lab's axes, torque in N m along the body's."""
         self._prepare()
         load, _ = self.engine.evaluate(self.state)
-        seen = motion(self.system, [Snapshot(0.0, self.state, 0.0)])
+        seen = motion(self.system, [Snapshot(0.0, self.state)])
         torque = load.torque_body @ self.system.axes.T
         return {
             "unit": "J",

@@ -25,6 +25,7 @@ class Phase(NamedTuple):
 
     dt: float  # ps, or s for a single body
     steps: int
+    counted: int = 0  # steps before it from which observers count their intervals
 
 
 class Moment:
@@ -80,6 +81,12 @@ class Results:
     interrupted: bool = False
     _frames: tuple[list[float], list[np.ndarray]] = ((), ())
 
+    def __repr__(self) -> str:
+        state = "interrupted, " if self.interrupted else ""
+        return (
+            f"<Results of {self.system.scene.name}: {state}{len(self.files)} files; results[column], .summary, .state>"
+        )
+
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of the samples as an array, by name: results["energy"]."""
         return self.samples[column]
@@ -107,6 +114,7 @@ class Simulation(ABC):
     force : replace an earlier run in that folder
     observers : `Every` objects of your own, called between steps
     say : called with a sentence when something begins that takes a moment (compiling, relieving)
+    applied : of a single body, forces by Python functions: see `BodySimulation`
     """
 
     time_unit = ""
@@ -217,7 +225,8 @@ class Simulation(ABC):
                 intervals = [max(1, round(observer.interval / phase.dt)) for observer in observers]
                 seconds, done = 0.0, 0
                 while done < phase.steps and not self._interrupted:
-                    to = min([phase.steps, *((done // interval + 1) * interval for interval in intervals)])
+                    ahead = [interval - (phase.counted + done) % interval for interval in intervals]
+                    to = min(phase.steps, done + min(ahead))
                     began = clock.perf_counter()
                     self._advance(k, to - done, done)
                     seconds += clock.perf_counter() - began
@@ -226,7 +235,7 @@ class Simulation(ABC):
                     bar.update(phase.dt * (to - done))
                     done = to
                     last = done == phase.steps or self._interrupted
-                    due = [done % interval == 0 for interval in intervals]
+                    due = [(phase.counted + done) % interval == 0 for interval in intervals]
                     due[0] = due[0] or last
                     self._show(observers, Moment(self, step + done, time + done * phase.dt, k), due)
                 computing.append(seconds)

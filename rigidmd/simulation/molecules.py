@@ -10,7 +10,6 @@ import numpy as np
 from rigidmd.build.relief import Relief, relieve
 from rigidmd.build.system import build
 from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure.observables import Observation, observe
@@ -89,7 +88,7 @@ class MolecularSimulation(Simulation):
                         ],
                     )
         for k in range(len(self.scene.stages)):
-            self.engine.advance(self.state, SCHEMES["velocity_verlet"], 0.0, 0, self._thermostat(k))
+            self.engine.advance(self.state, self.scene.stages[k].scheme, 0.0, 0, self._thermostat(k))
         self.engine.forget()
         self._relief = relief
         self._thermostats = [self._thermostat(k) for k in range(len(self.scene.stages))]
@@ -118,7 +117,7 @@ class MolecularSimulation(Simulation):
     def _advance(self, k: int, steps: int, done: int) -> None:
         stage = self.scene.stages[k]
         dt = stage.timestep_fs * FEMTOSECOND
-        self.engine.advance(self.state, SCHEMES[stage.integrator], dt, steps, self._thermostats[k], done)
+        self.engine.advance(self.state, stage.scheme, dt, steps, self._thermostats[k], done)
 
     def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
         results.samples = Samples()

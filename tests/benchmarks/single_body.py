@@ -74,7 +74,7 @@ def main():
     def compiled(tolerance):
         engine, state = OdeEngine(system.body, system.terms), start.copy()
         began = time.perf_counter()
-        engine.advance(state, Solver("dop853", "matrix", tolerance, tolerance), end, 1, NoThermostat())
+        engine.advance(state, Solver("dop853", "matrix", end, tolerance, tolerance), end, 1, NoThermostat())
         return time.perf_counter() - began, state.rotation[0]
 
     cases = [(name, n, lambda name=name, n=n: flows(name, n)) for name, ns in STEPS.items() for n in ns]
