@@ -1,4 +1,4 @@
-"""rigidmd: molecular dynamics of rigid molecules.
+"""rigidmd: molecular dynamics of rigid molecules, and the motion of single rigid bodies.
 
 import rigidmd
 

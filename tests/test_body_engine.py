@@ -275,8 +275,8 @@ def test_a_push_against_resistance_is_solved_exactly(dry, linear, push, h):
         if dry and abs(push) <= dry and h == 1e6:
             assert after == 0  # and holds it
         if h <= 1 and (speed == 0 or speed > 1e-9):
-            expected = np.array([speed, 0.0])
-            for _ in range(2):  # until it stops, if it does, and on from there
+            expected, left = np.array([speed, 0.0]), h
+            while left > 0:  # until it stops, if it does, and on from there
                 sense = np.sign(expected[0]) or (np.sign(push) if abs(push) > dry else 0.0)
                 drive = 0.0 if sense == 0 else push - dry * sense
 
@@ -287,13 +287,9 @@ def test_a_push_against_resistance_is_solved_exactly(dry, linear, push, h):
                     return y[0] * sense + 1e-300
 
                 stops.terminal, stops.direction = True, -1
-                left = h if _ == 0 else h - solved.t[-1]
-                if left <= 0:
-                    break
                 solved = solve_ivp(rate, (0, left), expected, method="DOP853", rtol=1e-12, atol=1e-15, events=stops)
                 expected = solved.y[:, -1] * [solved.status == 0, 1]
-                if solved.status == 0:
-                    break
+                left = 0.0 if solved.status == 0 else left - solved.t[-1]
             assert after == pytest.approx(expected[0], rel=1e-9, abs=1e-12)
             assert way == pytest.approx(expected[1], rel=1e-9, abs=1e-12)
 

@@ -270,8 +270,8 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
             raise SceneError(
                 scene.source,
                 [
-                    f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold: set "
-                    "output.trajectory_A_per_m to less, or output.trajectory = false"
+                    f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold: "
+                    "set output.trajectory_A_per_m to less, or output.trajectory = false"
                 ],
             )
     return system

@@ -114,8 +114,8 @@ class TrajectoryFile:
         set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
         if self._format == ".xtc" and np.abs(self._universe.trajectory.ts.positions).max() > LARGEST_IN_XTC:
             raise SimulationError(
-                f"a position is beyond the {LARGEST_IN_XTC:g} Å that .xtc can hold: use .trr or .nc, wrapped positions, or "
-                "less output.trajectory_A_per_m"
+                f"a position is beyond the {LARGEST_IN_XTC:g} Å that .xtc can hold: use .trr or .nc, wrapped "
+                "positions, or less output.trajectory_A_per_m"
             )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -194,8 +194,8 @@ class BodyStart(Section):
             sense = np.linalg.det(matrix)
             if self.project and (sense <= 0 or error > FURTHEST_FROM_ROTATION):
                 faults.append(
-                    f"the matrix is no rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is {error:.2g}"
-                    f", must be below {FURTHEST_FROM_ROTATION:g}"
+                    f"the matrix is no rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is "
+                    f"{error:.2g}, must be below {FURTHEST_FROM_ROTATION:g}"
                 )
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
                 what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"

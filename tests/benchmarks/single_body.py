@@ -35,6 +35,8 @@ STEPS = {  # a nutation
     "suzuki_4": (10, 15, 30, 60, 120, 250, 500, 1000),
     "kahan_li_6": (6, 8, 11, 16, 25, 40, 60, 100, 160),
     "kahan_li_8": (4, 6, 9, 12, 16, 22, 32, 45),
+    "srkn_4": (6, 10, 16, 25, 40, 70, 120, 200, 350),
+    "srkn_6": (4, 6, 8, 11, 16, 22, 32, 45, 64),
 }
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13)
 PYTHON, COMPILED = "DOP853, slopes in Python", "DOP853 through this engine"
@@ -148,7 +150,11 @@ def draw(rows):
     figure = Figure(figsize=(7.5, 5), layout="constrained")
     axis = figure.subplots()
     colors = dict(
-        zip([*STEPS, PYTHON, COMPILED], ["#8fb4cf", "#5a93bb", "#2b6f9e", "#123d5c", "#c8553d", "#e2a08f"], strict=True)
+        zip(
+            [*STEPS, PYTHON, COMPILED],
+            ["#8fb4cf", "#5a93bb", "#2b6f9e", "#123d5c", "#9bbf9f", "#4f8a5b", "#c8553d", "#e2a08f"],
+            strict=True,
+        )
     )
     for name, color in colors.items():
         errors, spent = zip(*[(error, spent) for method, _, spent, error in rows if method == name], strict=True)
