@@ -103,15 +103,16 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
 def _angles_figure(columns: dict[str, np.ndarray]):
     """The Euler angles against time: φ and ψ counted on through whole turns, θ with a span that means something."""
     time, theta = columns["t"], np.degrees(columns["theta"])
-    angles = [np.degrees(np.unwrap(columns["phi"])), theta, np.degrees(np.unwrap(columns["psi"]))]
+    phi, psi = _apart(columns)
+    angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = _new_figure("Euler angles (3-1-3)", 8, 6.4)
     labels, cells = ("φ (°)", "θ (°)", "ψ (°)"), figure.add_gridspec(3, 1)
-    panels = _draw_series(figure, cells, time, angles, labels, 1e-6, 1.0, (COOL, WARM, COOL))
+    panels = _draw_series(figure, cells, time, angles, labels, 1e-5, 1.0, (COOL, WARM, COOL))
     panels[1].set_title(_range(theta), **NOTE)
     for panel, angle in zip(panels[::2], angles[::2], strict=True):
         first, last = np.round(angle[[0, -1]], 6) + 0.0
         turns = f"from {first:.6g}° to {last:.6g}°: {(last - first) / 360:+.4g} turns"
-        panel.set_title(turns if np.ptp(angle) > 1e-6 else _range(angle), **NOTE)
+        panel.set_title(turns if np.ptp(angle) > 1e-5 else _range(angle), **NOTE)
     speed = np.sqrt(sum(columns[f"omega_body_{i}"] ** 2 for i in "123")) if "omega_body_1" in columns else 0 * time
     note = ""
     if (speed[1:] * np.diff(time)).max() > np.pi:
@@ -121,6 +122,15 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     if note:
         figure.supxlabel(note, fontsize=9, color=WARM, x=0.01, ha="left")
     return figure
+
+
+def _apart(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """φ and ψ; where θ is 0 or 180° and only their sum or difference means something, φ as at the next sample."""
+    phi, psi, theta = (columns[key].copy() for key in ("phi", "psi", "theta"))
+    for k in np.flatnonzero(np.sin(theta[:-1]) < 1e-12)[::-1]:
+        psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(theta[k]))
+        phi[k] = phi[k + 1]
+    return phi, psi
 
 
 def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
@@ -352,7 +362,7 @@ def _thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tupl
 def _range(degrees: np.ndarray) -> str:
     """A range of degrees in words, digits enough to tell its ends apart."""
     low, high = degrees.min(), degrees.max()
-    if high - low < 1e-6:
+    if high - low < 1e-5:
         return f"{round(low, 6) + 0.0:.8g}°, constant{f' to {high - low:.0e}°' if high > low else ''}"
     digits = int(np.clip(2 - np.floor(np.log10(high - low)), 1, 8))
     return f"from {low:.{digits}f}° to {high:.{digits}f}°"

@@ -131,13 +131,13 @@ class Simulation(ABC):
         scene: Scene,
         folder: str | Path | None = None,
         force: bool = False,
-        observers: tuple[Every, ...] | list[Every] = (),
+        observers: Every | tuple[Every, ...] | list[Every] = (),
         say: Callable[[str], None] = lambda sentence: None,
     ):
         self.scene = scene
         self.folder = None if folder is None else Path(folder)
         self._force = force
-        self._observers = list(observers)
+        self._observers = [observers] if isinstance(observers, Every) else list(observers)
         self._say = say
         self._interrupted = False
 

@@ -163,7 +163,7 @@ def draw(rows):
     axis.set_ylabel("error of Q after 20 nutations")
     axis.set_title("a heavy top: error against run time", loc="left", fontsize=11)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, fontsize=8)
+    axis.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.4, 0.0))
     figure.savefig(RESULTS / "single_body.png", dpi=150)
 
 
