@@ -74,6 +74,21 @@ def _parser() -> argparse.ArgumentParser:
     )
     _scene_arguments(check)
 
+    precision = _command(
+        commands,
+        "precision",
+        _precision,
+        "measure error against run time of integrators and time steps",
+        "rigidmd precision systems/heavy_top_3.toml --integrators velocity_verlet,srkn_6",
+    )
+    _scene_arguments(precision)
+    precision.add_argument("--integrators", metavar="A,B,...", help="integrators (default: those that suit the scene)")
+    precision.add_argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body")
+    precision.add_argument("--span", type=float, metavar="T", help="how long each runs (default: 0.1 ps; a body's run)")
+    precision.add_argument("--repeats", type=int, default=3, metavar="N", help="repeats of the timing (default: 3)")
+    precision.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-precision)")
+    precision.add_argument("--force", action="store_true", help="replace earlier results in that folder")
+
     _command(commands, "models", _models, "list the molecules that come with rigidmd", "rigidmd models")
     _command(
         commands,
@@ -202,6 +217,36 @@ def _check(options: argparse.Namespace) -> int:
     from rigidmd.build.describe import describe
 
     print(describe(_read_scene(options)))
+    return 0
+
+
+def _precision(options: argparse.Namespace) -> int:
+    import shlex
+
+    from tqdm import tqdm
+
+    from rigidmd.errors import SceneError
+    from rigidmd.output.folder import check_folder, make_folder
+    from rigidmd.output.precision_report import FILES, advice, table_text, write_precision
+    from rigidmd.simulation.precision import precision
+
+    scene = _read_scene(options)
+    folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-precision"
+    check_folder(folder, options.force)
+    integrators = options.integrators.split(",") if options.integrators else None
+    try:
+        timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
+    except ValueError:
+        raise SceneError("--timesteps", [f"{options.timesteps!r} is no list of numbers, for example 1,2,4"]) from None
+    _say("compiling, and running the reference")
+    with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
+        found = precision(
+            scene, integrators, timesteps, options.span, options.repeats, lambda share: bar.update(share - bar.n)
+        )
+    print(table_text(found), "", *advice(found), sep="\n")
+    make_folder(folder, options.force, FILES)
+    written = write_precision(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
 
 
