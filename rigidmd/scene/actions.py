@@ -1,0 +1,193 @@
+"""What acts on a single body, as tables of its scene: fields, forces, friction, fluids, frames, wheels. SI units."""
+
+from itertools import pairwise
+from math import inf
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from rigidmd.mechanics.inertia import impossible
+from rigidmd.validation import NonNegative, Number, Positive, Section, Vector
+
+NonNegativeVector = tuple[NonNegative, NonNegative, NonNegative]
+PositiveVector = tuple[Positive, Positive, Positive]
+Times = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
+
+
+class Gravity(Section):
+    """A uniform field."""
+
+    acceleration_m_s2: Vector = (0.0, 0.0, -9.81)
+    """Along the lab's (or frame's) axes"""
+
+
+class Timed(Section):
+    """What may be constant, in a window of time, or a table of values that straight lines join."""
+
+    times_s: Times | None = None
+    """Times of the values, increasing; then each quantity is a list of as many values"""
+    from_s: NonNegative | None = None
+    """When it begins"""
+    to_s: NonNegative | None = None
+    """When it ends"""
+
+    @field_validator("times_s")
+    @classmethod
+    def _increase(cls, times):
+        for k, (a, b) in enumerate(pairwise(times or ())):
+            if not b > a:
+                raise ValueError(f"must increase: entry {k + 1} is {b:g} after {a:g}")
+        return times
+
+    def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
+        """What is wrong between the times and these quantities; a single value is of type `entry`."""
+        faults = []
+        if self.times_s is not None and (self.from_s is not None or self.to_s is not None):
+            faults.append("from_s and to_s would do nothing beside times_s")
+        if not (self.to_s is None or self.to_s > (self.from_s or 0)):
+            faults.append(f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}")
+        for key, value in values.items():
+            if value is None:
+                continue
+            many = isinstance(value, tuple) and (entry is float or isinstance(value[0], tuple))
+            if self.times_s is None and many:
+                faults.append(f"{key} is a list of values: times_s is missing")
+            elif self.times_s is not None and not many:
+                faults.append(f"{key} is one value: with times_s it must be a list of {len(self.times_s)}")
+            elif many and len(value) != len(self.times_s):
+                faults.append(f"{key} has {len(value)} values for {len(self.times_s)} times")
+        return faults
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """When it begins and ends."""
+        return self.from_s or 0.0, inf if self.to_s is None else self.to_s
+
+
+class Applied(Timed):
+    """A force and a torque from outside."""
+
+    axes: Literal["lab", "body"] = "lab"
+    """Along which axes they are given: they stay fixed in the lab, or turn with the body"""
+    force_N: Vector | tuple[Vector, ...] | None = None
+    """Force"""
+    torque_N_m: Vector | tuple[Vector, ...] | None = None
+    """Torque, besides that of the force"""
+    at_m: Vector | None = None
+    """Where the force acts, body axes, from the centre of mass or the pivot; there when not given"""
+
+    @model_validator(mode="after")
+    def _does_something(self):
+        faults = self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
+        if self.force_N is None and self.torque_N_m is None:
+            faults.append("needs force_N or torque_N_m")
+        if self.at_m is not None and self.force_N is None:
+            faults.append("at_m would do nothing without force_N")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class Friction(Section):
+    """Friction of bearings, about the body's axes, relative to the frame."""
+
+    viscous_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity, about each axis"""
+    dry_N_m: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque against any turning, about each axis"""
+
+
+class Fluid(Section):
+    """A fluid at rest around the body: resistance, buoyancy, the fluid it carries along. Along the body's axes."""
+
+    linear_resistance_kg_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Force per velocity"""
+    quadratic_resistance_kg_m: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Force per velocity squared"""
+    linear_rotational_resistance_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity"""
+    quadratic_rotational_resistance_N_m_s2: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity squared"""
+    density_kg_m3: Positive | None = None
+    """Of the fluid: displaced and added mass of a sphere or ellipsoid follow"""
+    displaced_mass_kg: NonNegative | None = None
+    """Mass of the fluid displaced: buoyancy is its weight"""
+    centre_of_buoyancy_m: Vector | None = None
+    """Where buoyancy acts, body axes, from the centre of mass or the pivot; the centre of mass when not given"""
+    added_mass_kg: NonNegativeVector | None = None
+    """Mass of fluid carried along each axis"""
+    added_inertia_kg_m2: NonNegativeVector | None = None
+    """Inertia of fluid carried about each axis"""
+
+
+class Frame(Timed):
+    """Axes that turn and an origin that is accelerated; motion is told relative to them."""
+
+    angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
+    """Of the frame, along its own axes"""
+    angular_acceleration_rad_s2: Vector | None = None
+    """Of the frame, along its own axes, constant from the start"""
+    origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
+    """Of the frame's origin, along the frame's axes; a field against it acts on the body"""
+
+    @model_validator(mode="after")
+    def _does_something(self):
+        timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
+        faults = self.timing_faults(timed, tuple)
+        if self.from_s is not None or self.to_s is not None:
+            faults.append("from_s and to_s mean nothing here; use times_s")
+        if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
+            faults.append("angular_acceleration_rad_s2 and times_s contradict each other")
+        if not any(timed.values()) and self.angular_acceleration_rad_s2 is None:
+            faults.append("needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class Wheel(Timed):
+    """A rotor on an axis fixed in the body, whose inertia holds all of the wheel but its own about that axis."""
+
+    axis: Vector
+    """Its axis, body axes; only the direction counts"""
+    momentum_kg_m2_s: Number = 0.0
+    """Its angular momentum along the axis at the start, relative to the lab"""
+    motor_torque_N_m: Number | tuple[Number, ...] | None = None
+    """Torque of its motor on the wheel; the body feels the opposite"""
+
+    @model_validator(mode="after")
+    def _turns(self):
+        faults = self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
+        if not any(self.axis):
+            faults.append("axis is zero, which is no direction")
+        idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
+        if self.motor_torque_N_m is None and idle:
+            faults.append(f"{', '.join(idle)} would do nothing without motor_torque_N_m")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+class ChangingInertia(Timed):
+    """Principal moments that follow time as told, along the same axes; mass and centre of mass stay.
+
+    About the centre of mass, which is also the pivot of a body that is pinned.
+    """
+
+    inertia_kg_m2: tuple[PositiveVector, ...]
+    """Principal moments at each time"""
+
+    @model_validator(mode="after")
+    def _is_a_table(self):
+        faults = self.timing_faults({"inertia_kg_m2": self.inertia_kg_m2}, tuple)
+        if self.times_s is None:
+            faults = ["times_s is missing"]
+        if self.from_s is not None or self.to_s is not None:
+            faults.append("from_s and to_s mean nothing here; use times_s")
+        for k, moments in enumerate(self.inertia_kg_m2):
+            if why := impossible(np.diag(moments)):
+                faults.append(f"no body has the inertia of entry {k}: {why}")
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
