@@ -94,6 +94,13 @@ def test_only_what_keeps_its_order_is_tried():
         precision(wheel, ["rk5"])
 
 
+def test_steps_suit_what_is_fast_in_a_body():
+    compass = precision(Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1)
+    # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's turning
+    assert not any(trial.diverged for trial in compass.trials[-3:])
+    assert compass.trials[-1].rotation_error < 1e-6
+
+
 def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     folder = tmp_path / "p"
     command = ["precision", str(TOP), "--integrators", "velocity_verlet,srkn_6", "--timesteps", "0.002,0.001",

@@ -22,6 +22,8 @@ LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 SPAN_PS = 0.1
 #: What a spinning body turns in a force evaluation on the middle of the ladder.
 RADIANS = 0.1
+#: The same of a body at rest, in steps of its scene, which are taken to be fine.
+AT_REST = 8.0
 
 
 def precision(
@@ -130,6 +132,10 @@ def _of_body(scene: BodyScene, span: float | None) -> tuple[Subject, float]:
         integrators=list(fits),
         reference=reference,
     )
-    speed = max((float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3) if system.turns), default=0.0)
+    speed = 0.0
+    if system.turns:  # of the body, and of the nutation that its wheels would give it
+        inertia, carried = system.moments(np.zeros(1))
+        spin = max(abs(float(seen[f"omega_body_{k}"][0])) for k in (1, 2, 3))
+        speed = max(spin, float(np.abs(carried).max() / inertia.max()))
     own = SCHEMES[run.integrator].force_evaluations if run.integrator in SCHEMES else 1
-    return subject, RADIANS / speed if speed else run.timestep_s / own
+    return subject, RADIANS / speed if speed else AT_REST * run.timestep_s / own
