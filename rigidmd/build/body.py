@@ -101,7 +101,8 @@ class BodySystem:
         """Times within the run at which something that follows time as told jumps or bends."""
         parts = (*self.body, *self.terms.values())
         times = {float(t) for part in parts for value in part if isinstance(value, Course) for t in value.times}
-        return sorted(t for t in times if 0 < t < self.scene.run.duration_s)
+        run = self.scene.run
+        return sorted(t for t in times if 0 < t < run.steps * run.timestep_s)
 
     def during(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
         """Body and terms with what holds from a time to the next break."""

@@ -2,10 +2,12 @@
 
 import numpy as np
 
-from rigidmd.build.body_parts import resistance_of
+from rigidmd.build.body_parts import frame_of, resistance_of
 from rigidmd.dynamics.odes import SOLVERS
 from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.forces.frame import Turning
 from rigidmd.forces.resistance import NoResistance
+from rigidmd.mechanics.course import keeps_direction
 from rigidmd.scene import BodyScene
 
 
@@ -20,7 +22,7 @@ def unfit(
         if body.pinned:
             faults.append("body: a point at the pivot has nothing to move; give it inertia or a centre_of_mass_m")
         if added_mass.any():
-            faults.append("fluid.added_mass_kg: a point carries no fluid along; add the mass to mass_kg of its inertia")
+            faults.append("fluid.added_mass_kg: a point carries no fluid along; leave it out")
         for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
             if fluid is not None and len(set(getattr(fluid, key))) > 1:
                 faults.append(f"fluid.{key}: a point has no axes: give three equal numbers")
@@ -112,7 +114,14 @@ def order_faults(scene: BodyScene, immersed: bool) -> list[str]:
             f"run: {run.integrator} takes steps back in time, which a resistance does not allow: use one of "
             f"{', '.join(forward)}"
         ]
-    why = {"wheels": scene.wheels, "changing_inertia": scene.changing_inertia, "added mass": immersed}
+    frame = frame_of(scene)
+    wandering = isinstance(frame, Turning) and not keeps_direction(frame.angular_velocity)
+    why = {
+        "wheels": scene.wheels,
+        "changing_inertia": scene.changing_inertia,
+        "added mass": immersed,
+        "a frame that changes its axis": wandering,
+    }
     split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
     return [
         f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be of order 2; "

@@ -7,6 +7,7 @@ import numpy as np
 from rigidmd.build.body import BodySystem, build_body
 from rigidmd.build.system import System, build
 from rigidmd.dynamics.odes import Solver
+from rigidmd.dynamics.schemes import Scheme
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, Scene
@@ -41,7 +42,10 @@ def _body(system: BodySystem) -> str:
         spin = float(np.linalg.norm(pose.angular_velocity_body))
         turn = f": a turn in {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
         lines.append(f"  starts at phi theta psi = {angles} degrees, turning at {spin:.6g} rad/s{turn}")
-    parts = [system.body.flight, system.body.rotor, system.body.frame, system.body.resistance]
+    body = system.body
+    if isinstance(system.method, Scheme):
+        body = system.engine().model_for(system.method)
+    parts = [body.flight, body.rotor, body.frame, body.resistance]
     lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
     lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
     lines.append("left out:")

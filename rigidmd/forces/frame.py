@@ -5,11 +5,12 @@ a plain rotation of position, velocity and Q; Coriolis, centrifugal and Euler fo
 The acceleration of the origin is a uniform field.
 """
 
-from math import sin, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.course import Course, value
+from rigidmd.mechanics.rotor import sine_and_versine, turned
 
 
 class Inertial(NamedTuple):
@@ -19,7 +20,10 @@ class Inertial(NamedTuple):
 
 
 class Turning(NamedTuple):
-    """Axes that turn. Exact for a constant rate, and for a changing one about a fixed direction; else of order 2."""
+    """Axes that turn. Exact for a constant rate, and for one that changes linearly about a fixed direction.
+
+    Else each drift is of order 2 and symmetric: compositions of such steps keep their order, other schemes fall to 2.
+    """
 
     angular_velocity: Course  # along the frame's own axes
 
@@ -55,19 +59,10 @@ def turn_vector(vector, x, y, z):
     angle = sqrt(x * x + y * y + z * z)
     if angle == 0.0:
         return
-    s = sin(angle) / angle
-    half = sin(0.5 * angle) / angle
-    versine = 2 * half * half
-    a = vector[0]
-    b = vector[1]
-    c = vector[2]
-    # v + s u x v + versine u x (u x v): what a small turn changes is computed by itself and keeps its digits
-    p = y * c - z * b
-    q = z * a - x * c
-    r = x * b - y * a
-    vector[0] = a + s * p + versine * (y * r - z * q)
-    vector[1] = b + s * q + versine * (z * p - x * r)
-    vector[2] = c + s * r + versine * (x * q - y * p)
+    s, versine = sine_and_versine(angle)
+    vector[0], vector[1], vector[2] = turned(
+        vector[0], vector[1], vector[2], x / angle, y / angle, z / angle, s, versine
+    )
 
 
 def frame_rate(frame, time):

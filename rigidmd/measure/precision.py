@@ -29,7 +29,7 @@ class Subject:
     """What is moved: a start, and how to measure it.
 
     energy(engine, state) : the conserved energy. energy_unit : one unit of the reported energy error, in words, with a
-    note on it; energy_size : that unit in the units of `energy`. kinetic : kinetic energy of the start, by which
+    note on it; energy_size : that unit in the units of `energy`. kinetic : a kinetic energy by which
     divergence is judged. rotor : what the scene asks for.
     """
 

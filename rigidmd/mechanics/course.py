@@ -59,6 +59,14 @@ def is_steady(course: Course) -> bool:
     return not (course.slope.any() or course.curvature.any() or np.ptp(course.constant, axis=0).any())
 
 
+def keeps_direction(course: Course) -> bool:
+    """Whether it changes linearly along one line through zero, from break to break."""
+    parts = np.concatenate([course.constant, course.slope])
+    longest = parts[np.linalg.norm(parts, axis=1).argmax()]
+    off = np.abs(np.cross(parts, longest)).max()
+    return not course.curvature.any() and bool(off <= 1e-12 * (longest @ longest))
+
+
 def value_at(course: Course, times: np.ndarray) -> np.ndarray:
     """Values (t, 3) at times (t,)."""
     i, d = _places(course, times)

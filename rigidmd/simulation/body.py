@@ -63,7 +63,8 @@ class BodySimulation(Simulation):
             whole = round(exact)
             if abs(exact - whole) > 1e-9 * max(1.0, exact):
                 whole = ceil(exact)
-            phases.append(Phase((end - begin) / whole if whole != exact else run.timestep_s, whole, steps))
+            # two breaks that are one to rounding leave nothing between them
+            phases.append(Phase((end - begin) / whole if whole not in (0, exact) else run.timestep_s, whole, steps))
             steps += whole
         return phases
 
