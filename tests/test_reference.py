@@ -28,7 +28,7 @@ def points(positions, edge, **law):
     kind = np.zeros(n, np.int64)
     made = lennard_jones(kind, np.ones(1), np.ones(1), **law)
     term = pair_forces(made, Orthorhombic(edge, edge, edge), sites, 0.3)
-    model = Model(kind, np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)), NoRotor())
+    model = Model(kind, np.ones(1), np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)), NoRotor())
     state = State(positions, np.zeros((n, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(1), np.zeros(1))
     return made, Engine(model, {"lj": term}), state
 

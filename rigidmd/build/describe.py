@@ -64,10 +64,8 @@ def _molecules(system: System) -> str:
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
         charge = f", net charge {m.charge:+g} e" if m.charge else ""
-        lines.append(
-            f"  {count} {m.name}: {m.kind}, {len(m.masses)} sites, {m.mass:.4f} u, {m.degrees_of_freedom} degrees of "
-            f"freedom each{charge}"
-        )
+        freely = "frozen" if system.model.inverse_mass[k] == 0 else f"{m.degrees_of_freedom} degrees of freedom each"
+        lines.append(f"  {count} {m.name}: {m.kind}, {len(m.masses)} sites, {m.mass:.4f} u, {freely}{charge}")
     lines.append(
         f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
     )

@@ -13,7 +13,10 @@ AT_REST = 1e-9
 
 
 class Freedom(NamedTuple):
-    """Degrees of freedom; the three of the total momentum, which is zero and stays so, are not counted."""
+    """Degrees of freedom; the three of the total momentum, which is zero and stays so, are not counted.
+
+    Among frozen molecules the total momentum is not kept, and all count.
+    """
 
     translation: int
     rotation: int
@@ -27,11 +30,23 @@ class Freedom(NamedTuple):
 def freedom_of(model: Model) -> Freedom:
     """Degrees of freedom of all molecules together."""
     turning = (model.inertia > 0).sum(axis=1)
-    return Freedom(max(0, 3 * len(model.species) - 3), int(turning[model.species].sum()))
+    moving = int(mobile(model).sum())
+    free = 3 * moving - (3 if moving == len(model.species) else 0)
+    return Freedom(free, int(turning[model.species].sum()))
+
+
+def mobile(model: Model) -> np.ndarray:
+    """Whether each molecule (n,) moves, or is frozen."""
+    return model.inverse_mass[model.species] > 0
 
 
 def remove_momentum(model: Model, velocity: np.ndarray) -> bool:
-    """Give every molecule the same push so that the total momentum is zero, in place; False if it was already."""
+    """Give every molecule the same push so that the total momentum is zero, in place; False if it was already.
+
+    Frozen molecules hold the others: then there is nothing to remove.
+    """
+    if not mobile(model).all():
+        return False
     mass = model.mass[model.species]
     momentum = mass @ velocity
     if np.abs(momentum).max() <= AT_REST * np.abs(mass[:, None] * velocity).sum():
@@ -41,11 +56,13 @@ def remove_momentum(model: Model, velocity: np.ndarray) -> bool:
 
 
 def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:
-    """Maxwell-Boltzmann momenta, in place: zero total momentum; T_trans and T_rot exactly `temperature` (K)."""
+    """Maxwell-Boltzmann momenta, in place: zero total momentum where nothing is frozen; T_trans and T_rot exactly
+    `temperature` (K)."""
     thermal = BOLTZMANN * temperature
     mass = model.mass[model.species]
     freedom = freedom_of(model)
-    state.velocity[:] = rng.standard_normal(state.velocity.shape) * np.sqrt(thermal / mass)[:, None]
+    spread = np.sqrt(thermal * model.inverse_mass[model.species])
+    state.velocity[:] = rng.standard_normal(state.velocity.shape) * spread[:, None]
     remove_momentum(model, state.velocity)
     kinetic = 0.5 * mass @ (state.velocity**2).sum(axis=1)
     state.velocity[:] *= (

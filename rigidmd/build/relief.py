@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.build.momenta import mobile
 from rigidmd.dynamics.engine import Engine
 from rigidmd.forces.terms import Load, State
 from rigidmd.mechanics.rotation import from_vector
@@ -27,7 +28,7 @@ def excess(engine: Engine, load: Load, thermal: float, dt: float) -> float:
     """
     model = engine.model
     with np.errstate(divide="ignore", invalid="ignore"):
-        push = np.abs(load.force).max(axis=1) * dt / np.sqrt(model.mass[model.species] * thermal)
+        push = np.abs(load.force).max(axis=1) * dt * np.sqrt(model.inverse_mass[model.species] / thermal)
         turn = np.abs(load.torque_body) * dt / np.sqrt(model.inertia[model.species] * thermal)[: len(load.torque_body)]
     turn = np.where((model.inertia[model.species] > 0)[: len(turn)], turn, 0.0)
     return float(max(push.max(initial=0.0), turn.max(initial=0.0)))
@@ -47,11 +48,12 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
     energy = sum(tally.energy for tally in tallies.values())
     length = LONGEST_MOVE * scale
     arm = np.where(radius > 0, radius, 1.0)[engine.model.species][: len(state.rotation), None]
-    mobile = (engine.model.inertia > 0)[engine.model.species][: len(state.rotation)]
+    free = mobile(engine.model)
+    turning = (engine.model.inertia > 0)[engine.model.species][: len(state.rotation)]
     for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
         # Each molecule along its own force, none further than `length`: overlaps do not slow down everybody else.
-        push = load.force / np.abs(load.force).max()
-        turn = load.torque_body * mobile / arm / np.abs(load.force).max()
+        push = load.force * free[:, None] / np.abs(load.force[free]).max()
+        turn = load.torque_body * turning / arm / np.abs(load.force[free]).max()
         reach = np.linalg.norm(push, axis=1)
         reach[: len(turn)] = np.maximum(reach[: len(turn)], np.linalg.norm(turn, axis=1))
         share = length / np.sqrt(reach.max() * np.maximum(reach, 1e-3 * reach.max()))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.lattice import lattice
-from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, remove_momentum
+from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
 from rigidmd.build.structure import Arrangement, read_geometry, read_structure
 from rigidmd.dynamics.advance import Model
 from rigidmd.errors import Faults, SceneError, StructureError
@@ -22,7 +22,7 @@ from rigidmd.mechanics.rotor import NoRotor, split_rotor
 from rigidmd.molecules import Molecule, Site, load_model, molecule, read_molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import Molecules
-from rigidmd.units import COULOMB, GRAM_PER_CM3
+from rigidmd.units import COULOMB, GRAM_PER_CM3, KJ_PER_MOL
 
 DEFAULT_CUTOFF = 9.0  # Å
 #: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
@@ -109,8 +109,11 @@ def build(scene: MolecularScene) -> System:
     arrangement = _arrange(scene, species)
     space = Orthorhombic(*arrangement.edges) if arrangement.edges else Unbounded()
     cutoff = _cutoff(scene, space, species)
-    model = _model(species, arrangement.species)
-    turning = model.inertia.any()
+    frozen = np.array([entry.frozen for entry in scene.molecules])
+    if frozen[arrangement.species].all():
+        raise SceneError(scene.source, ["molecules: all are frozen; nothing would move"])
+    model = _model(species, arrangement.species, frozen)
+    turning = any(m.inertia.any() for m in species)
     n = len(arrangement.species)
     state = State(
         np.ascontiguousarray(arrangement.position, dtype=float),
@@ -264,11 +267,18 @@ def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> flo
     return cutoff
 
 
-def _model(species: list[Molecule], index: np.ndarray) -> Model:
-    inertia = np.array([m.inertia for m in species])
+def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:
+    inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
     mass = np.array([m.mass for m in species])
-    return Model(index.astype(np.int64), mass, inertia, rotor.inverse_inertia, rotor if inertia.any() else NoRotor())
+    return Model(
+        index.astype(np.int64),
+        mass,
+        np.where(frozen, 0.0, 1 / mass),
+        inertia,
+        rotor.inverse_inertia,
+        rotor if inertia.any() else NoRotor(),
+    )
 
 
 def _sites(species: list[Molecule], index: np.ndarray) -> Sites:
@@ -297,29 +307,72 @@ def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.nda
     return BodySites(first, member, np.ascontiguousarray(offset))
 
 
+def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
+    """Sites (s,) by what they do not act on: their own molecule, and frozen ones on all that is frozen."""
+    return np.where(frozen[sites.molecule], len(frozen), sites.molecule)
+
+
+def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
+    """For each species (pairs, 2, sites): whether an entry of forces.pairs means the site by its first, second name.
+
+    Raises SceneError.
+    """
+    found = [np.zeros((len(scene.forces.pairs), 2, len(m.site_names)), bool) for m in species]
+    faults = []
+    for n, entry in enumerate(scene.forces.pairs):
+        for side, text in enumerate(entry.sites):
+            owner, _, name = text.rpartition(".")
+            of = [k for k, m in enumerate(species) if owner in ("", m.name)]
+            for names in ("site_names", "elements"):
+                for k in of:
+                    found[k][n, side] = [own == name for own in getattr(species[k], names)]
+                if any(found[k][n, side].any() for k in of):
+                    break
+            else:
+                known = dict.fromkeys(f"{m.name}.{own}" for m in species for own in m.site_names)
+                faults.append(f"forces.pairs.{n}.sites: no site is {text!r}; there are {', '.join(known)}")
+    if faults:
+        raise SceneError(scene.source, faults)
+    return found
+
+
 def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float):
     """Terms by name, constant energies by name, tail pressure."""
     forces = scene.forces
     index = model.species
     start = forces.switch_start_A or max(0.9 * cutoff, cutoff - 1.0)
     terms, constants, tail_pressure = {}, {}, 0.0
-    chosen = [np.flatnonzero(m.epsilon > 0) for m in species]
+    named = _named_pairs(scene, species)
+    chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
+    frozen = model.inverse_mass == 0
     if any(len(c) for c in chosen):
-        pairs = [[(m.sigma[i], m.epsilon[i]) for i in c] for m, c in zip(species, chosen, strict=True)]
+        pairs = [
+            [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
+            for k, (m, c) in enumerate(zip(species, chosen, strict=True))
+        ]
         kinds = sorted({pair for of_species in pairs for pair in of_species})
         kind = np.concatenate([[kinds.index(pair) for pair in pairs[k]] for k in index]).astype(np.int64)
-        sigma, epsilon = np.array(kinds).T
-        law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing)
+        sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
+        special = {
+            (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
+            for n, entry in enumerate(forces.pairs)
+            for i, (_, _, one) in enumerate(kinds)
+            for j, (_, _, other) in enumerate(kinds)
+            if one[2 * n] and other[2 * n + 1]
+        }
+        law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
         if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
             raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
-        terms["lennard_jones"] = pair_forces(law, space, _taking_part(species, index, chosen), forces.skin_A)
+        sites = _taking_part(species, index, chosen)
+        terms["lennard_jones"] = pair_forces(law, space, sites, forces.skin_A, _groups(sites, frozen[index]))
         if forces.tail_correction:
             constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if forces.electrostatics != "none" and any(len(c) for c in chosen):
         charge = np.concatenate([species[k].charges[chosen[k]] for k in index])
         law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
-        terms["coulomb"] = pair_forces(law, space, _taking_part(species, index, chosen), forces.skin_A)
+        sites = _taking_part(species, index, chosen)
+        terms["coulomb"] = pair_forces(law, space, sites, forces.skin_A, _groups(sites, frozen[index]))
         if cutoff < inf:
             constants["reaction_field_self"] = sum(
                 int((index == k).sum())
@@ -354,6 +407,8 @@ def _set_momenta(system: System, arrangement: Arrangement) -> None:
     if scene.structure is not None and scene.structure.velocities:
         state.velocity[:] = arrangement.velocity
         state.angular_momentum_body[:] = arrangement.angular_momentum_body[: len(state.angular_momentum_body)]
+        state.velocity[~mobile(system.model)] = 0.0
+        state.angular_momentum_body[system.model.inertia[system.model.species][: len(state.rotation)] == 0] = 0.0
         if remove_momentum(system.model, state.velocity):
             system.notes.append("the total momentum of the file's velocities was taken out")
         return
@@ -379,10 +434,11 @@ def _overlaps(system: System) -> list[str]:
     which = np.concatenate([np.arange(start[k], start[k + 1]) for k in system.model.species])
     diameter = sigma[which]
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
+    free = mobile(system.model)
     tree = cKDTree(positions, boxsize=np.array(system.space) if boxed else None)
     for i, j in sorted(tree.query_pairs(max(OVERLAP * sigma.max(), inside))):
         a, b = system.sites.molecule[[i, j]]
-        if a == b:
+        if a == b or not (free[a] or free[b]):
             continue
         step = positions[i] - positions[j]
         if boxed:

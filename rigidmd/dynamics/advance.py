@@ -17,6 +17,7 @@ class Model(NamedTuple):
 
     species: np.ndarray  # (n,) species of each molecule
     mass: np.ndarray  # (species,) u
+    inverse_mass: np.ndarray  # (species,) 0 of what is frozen: nothing moves it
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
@@ -91,9 +92,9 @@ def _kick_molecules(model, state, load, h):
     def kick_molecules(model, state, load, h):
         if len(state.position) <= SERIAL:
             for m in range(len(state.position)):
-                _kick_molecule(model.species[m], model.mass, model.inverse_inertia, state, load, m, h)
+                _kick_molecule(model.species[m], model.inverse_mass, model.inverse_inertia, state, load, m, h)
         else:
-            _kick_threaded(model.species, model.mass, model.inverse_inertia, state, load, h)
+            _kick_threaded(model.species, model.inverse_mass, model.inverse_inertia, state, load, h)
 
     return kick_molecules
 
@@ -120,9 +121,9 @@ def _pay_nothing(model, terms, state, h):
 
 
 @kernel(parallel=True)
-def _kick_threaded(species, mass, inverse_inertia, state, load, h):
+def _kick_threaded(species, inverse_mass, inverse_inertia, state, load, h):
     for m in prange(len(state.position)):
-        _kick_molecule(species[m], mass, inverse_inertia, state, load, m, h)
+        _kick_molecule(species[m], inverse_mass, inverse_inertia, state, load, m, h)
 
 
 @kernel(parallel=True)
@@ -132,8 +133,8 @@ def _drift_threaded(rotor, species, state, h):
 
 
 @kernel(inline=True)
-def _kick_molecule(species, mass, inverse_inertia, state, load, m, h):
-    share = h / mass[species]
+def _kick_molecule(species, inverse_mass, inverse_inertia, state, load, m, h):
+    share = h * inverse_mass[species]
     for k in range(3):
         state.velocity[m, k] += share * load.force[m, k]
     if m < len(state.angular_momentum_body):

@@ -34,11 +34,18 @@ def lennard_jones(
     name: Name = "plain",
     start: float = 0.0,
     mixing: Mixing = "lorentz-berthelot",
+    special: dict[tuple[int, int], tuple[float, float]] | None = None,
 ) -> LennardJones:
-    """The law for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps²."""
+    """The law for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps².
+
+    special : (kind, kind) -> (sigma, epsilon) in place of the mixing rule, for both orders of the kinds
+    """
     shape = shape_of(name, cutoff, start)
     sigma_ij = (sigma[:, None] + sigma) / 2 if mixing == "lorentz-berthelot" else np.sqrt(sigma[:, None] * sigma)
     epsilon_ij = np.sqrt(epsilon[:, None] * epsilon)
+    for (i, j), (own_sigma, own_epsilon) in (special or {}).items():
+        sigma_ij[[i, j], [j, i]] = own_sigma
+        epsilon_ij[[i, j], [j, i]] = own_epsilon
     return LennardJones(
         *shape,
         ending(name, shape, _inverse_power(12)),

@@ -25,11 +25,11 @@ LOST = 1e12  # list radii from the origin: there a float64 has no digits left fo
 
 
 class PairList(NamedTuple):
-    """Pairs of sites of different molecules closer than `radius` when the list was built."""
+    """Pairs of sites of different groups closer than `radius` when the list was built."""
 
     radius: float  # cut-off + skin, Å
     skin: float  # Å
-    molecule: np.ndarray  # (s,) pairs inside one molecule are left out
+    group: np.ndarray  # (s,) molecule, one number for all that is frozen; pairs inside a group are left out
     bounds: np.ndarray  # (blocks + 1,) block b holds rows of sites bounds[b] ... bounds[b + 1] - 1
     start: np.ndarray  # (s,) row of site i: partner[b, start[i]:stop[i]]
     stop: np.ndarray  # (s,)
@@ -39,9 +39,9 @@ class PairList(NamedTuple):
     counters: np.ndarray  # (2,) usable (0 or 1); builds so far
 
 
-def empty_list(space: Space, molecule: np.ndarray, cutoff: float, skin: float) -> PairList:
+def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float) -> PairList:
     """A list that will be built at its first use, with room for about what a uniform density needs."""
-    s = len(molecule)
+    s = len(group)
     blocks = max(1, min(BLOCKS, s // SITES_PER_BLOCK))
     bounds = np.linspace(0, s, blocks + 1).astype(np.int64)
     radius = cutoff + skin if cutoff < inf else inf
@@ -50,7 +50,7 @@ def empty_list(space: Space, molecule: np.ndarray, cutoff: float, skin: float) -
     return PairList(
         radius=radius,
         skin=skin,
-        molecule=molecule,
+        group=group,
         bounds=bounds,
         start=np.zeros(s, np.int64),
         stop=np.zeros(s, np.int64),
@@ -177,7 +177,7 @@ def _fill_block(pairs, space, position, cell, cell_start, order, shape, reach, b
                     c = (x * shape[1] + y) * shape[2] + z
                     for slot in range(cell_start[c], cell_start[c + 1]):
                         j = order[slot]
-                        if (j > i) != ((i + j) % 2 == 1) or pairs.molecule[i] == pairs.molecule[j]:
+                        if (j > i) != ((i + j) % 2 == 1) or pairs.group[i] == pairs.group[j]:
                             continue
                         dx, dy, dz = nearest_image(
                             space,

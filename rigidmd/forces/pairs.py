@@ -29,10 +29,15 @@ class PairForces(NamedTuple):
     tallies: np.ndarray  # (blocks, 10)
 
 
-def pair_forces(law: NamedTuple, space: Space, sites: BodySites | CentralSites, skin: float) -> PairForces:
-    """The term for a law with a `cutoff`; its neighbour list is built at the first use."""
+def pair_forces(
+    law: NamedTuple, space: Space, sites: BodySites | CentralSites, skin: float, group: np.ndarray | None = None
+) -> PairForces:
+    """The term for a law with a `cutoff`; its neighbour list is built at the first use.
+
+    group (s,) : sites of one group do not act on one another; the sites' molecules when not given
+    """
     s = len(sites.molecule)
-    pairs = empty_list(space, sites.molecule, law.cutoff, skin)
+    pairs = empty_list(space, sites.molecule if group is None else group, law.cutoff, skin)
     blocks = len(pairs.needed)
     return PairForces(
         law, space, sites, pairs, np.zeros((s, 3)), np.zeros((blocks, s, 3)), np.zeros((blocks, TALLY_SIZE))

@@ -71,6 +71,8 @@ class Molecules(Section):
     """Residue names by which structure files may call this species"""
     count: Count | None = None
     """How many; needed unless there is a structure file"""
+    frozen: Flag = False
+    """They stay put and act on the others; not on one another, so the potential energy lacks that constant"""
 
     @field_validator("model")
     @classmethod
@@ -98,6 +100,17 @@ class Molecules(Section):
         return self
 
 
+class UnlikePair(Section):
+    """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
+
+    sites: tuple[str, str]
+    """The two kinds: a site's name, else an element; `SPECIES.NAME` for those of one species"""
+    sigma_A: Positive
+    """Lennard-Jones diameter"""
+    epsilon_kJ_mol: NonNegative
+    """Lennard-Jones well depth"""
+
+
 class Forces(Section):
     """What acts between sites of different molecules."""
 
@@ -109,6 +122,8 @@ class Forces(Section):
     """Where force_switch and switch begin; 1 Å before the cut-off, or at 0.9 of it if that is longer"""
     mixing: Literal["lorentz-berthelot", "geometric"] = "lorentz-berthelot"
     """Lennard-Jones parameters between unlike sites"""
+    pairs: tuple[UnlikePair, ...] = ()
+    """Parameters of particular pairs, in place of the mixing rule"""
     tail_correction: Flag = False
     """Add the energy and pressure of Lennard-Jones beyond the cut-off"""
     electrostatics: Literal["reaction_field", "none"] = "reaction_field"
@@ -276,6 +291,8 @@ class MolecularScene(Scene):
             faults.append("start.temperature_K would do nothing: the velocities are read from the structure file")
         if self.start.temperature_K == 0 and self.stages[0].ensemble == "nvt":
             faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot warm what is at rest")
+        if self.forces.tail_correction and any(species.frozen for species in self.molecules):
+            faults.append("forces.tail_correction is that of a liquid all around; with frozen molecules leave it out")
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")
