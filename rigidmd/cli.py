@@ -86,6 +86,10 @@ def _parser() -> argparse.ArgumentParser:
     precision.add_argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body")
     precision.add_argument("--span", type=float, metavar="T", help="how long each runs (default: 0.1 ps; a body's run)")
     precision.add_argument("--repeats", type=int, default=3, metavar="N", help="repeats of the timing (default: 3)")
+    precision.add_argument(
+        "--averages", type=float, metavar="PS",
+        help="of molecules: also average temperatures, energy and pressure over so many ps with every step",
+    )  # fmt: skip
     precision.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-precision)")
     precision.add_argument("--force", action="store_true", help="replace earlier results in that folder")
 
@@ -241,7 +245,13 @@ def _precision(options: argparse.Namespace) -> int:
     _say("compiling, and running the reference")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         found = precision(
-            scene, integrators, timesteps, options.span, options.repeats, lambda share: bar.update(share - bar.n)
+            scene,
+            integrators,
+            timesteps,
+            options.span,
+            options.repeats,
+            options.averages,
+            lambda share: bar.update(share - bar.n),
         )
     print(table_text(found), "", *advice(found), sep="\n")
     make_folder(folder, options.force, FILES)

@@ -98,6 +98,8 @@ def test_schemes_are_palindromes_and_run_backwards(dimer, name):
     assert sum(scheme.drifts) == pytest.approx(1, abs=1e-14)
     assert scheme.kicks == scheme.kicks[::-1]
     assert scheme.drifts == scheme.drifts[::-1]
+    assert scheme.gradients == scheme.gradients[::-1]
+    assert not any(scheme.gradients[:1])  # a step leaves the plain load to the next
     there = run(engine, state, 0.001, 100, scheme=scheme)
     there.velocity[:] *= -1
     there.angular_momentum_body[:] *= -1

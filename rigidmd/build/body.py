@@ -222,7 +222,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     idle = (moments == 0) & (np.abs(own_spin) > 1e-12 * np.abs(own_spin).max(initial=0.0))
     if turning and idle.any():
         faults.append("start: the body has no inertia about an axis about which it is to turn")
-    faults += order_faults(scene, bool(added_mass.any()))
+    faults += order_faults(scene, bool(added_mass.any()), bool(applied))
     taken = {"gravity", "buoyancy", "origin_acceleration", *(f"applied_{k}" for k in range(len(scene.applied)))}
     faults += [
         f"applied: {name!r} is the name of a force of the scene; choose another"

@@ -96,8 +96,8 @@ def unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bo
     return []
 
 
-def order_faults(scene: BodyScene, immersed: bool) -> list[str]:
-    """Integrators that would not be what they are for this body."""
+def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
+    """Integrators that would not be what they are for this body. has_functions : Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
     braked = not isinstance(resistance, NoResistance)
     if run.integrator in SOLVERS:
@@ -113,6 +113,12 @@ def order_faults(scene: BodyScene, immersed: bool) -> list[str]:
         return [
             f"run: {run.integrator} takes steps back in time, which a resistance does not allow: use one of "
             f"{', '.join(forward)}"
+        ]
+    if scheme.gradients and (braked or scene.applied or has_functions):
+        plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.gradients]
+        return [
+            f"run: {run.integrator} asks for the gradient of the forces, which resistance and applied forces do not "
+            f"have; use one of {', '.join(plain)}"
         ]
     frame = frame_of(scene)
     wandering = isinstance(frame, Turning) and not keeps_direction(frame.angular_velocity)

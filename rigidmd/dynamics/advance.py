@@ -5,11 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.dynamics.thermostats import apply
 from rigidmd.forces.sites import SERIAL
 from rigidmd.forces.terms import OK, load_bodies
 from rigidmd.jit import implements, is_a, kernel
-from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn
+from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn, turn_along
 
 
 class Model(NamedTuple):
@@ -26,7 +27,8 @@ class Model(NamedTuple):
 class Progress(NamedTuple):
     """How far `advance` has come, so that it can stop for more memory and go on at the same place."""
 
-    cursor: np.ndarray  # (3,) steps done; stages done in this step; whether `load` is that of the present positions
+    cursor: np.ndarray  # (3,) steps done; stages done in this step; whether `load` is that of the present positions (1)
+    # or that with the gradient (2)
 
 
 def new_progress(steps: int, fresh: bool) -> Progress:
@@ -35,26 +37,34 @@ def new_progress(steps: int, fresh: bool) -> Progress:
 
 
 @kernel
-def advance(model, state, load, terms, thermostat, scheme, dt, origin, steps, progress):
+def advance(model, state, load, terms, thermostat, scheme, probe, dt, origin, steps, progress):
     """Step until `steps` steps of dt have been taken since time `origin`, counted in progress.cursor[0].
 
-    scheme : kicks, drifts and the moments (fractions of dt) at which the kicks act.
+    scheme : kicks, drifts, the moments (fractions of dt) at which the kicks act, and their gradients (fractions of
+    dt²). probe : room for gradients; None compiles none.
 
     The scheme is walked as kick, drift, kick, ..., kick; forces are evaluated before a kick where positions have
     changed since, so the last evaluation of a step serves the next one. A status code: when it is not OK, state and
     progress are such that calling again continues without a trace.
     """
-    kicks, drifts, moments = scheme
+    kicks, drifts, moments, gradients = scheme
     cursor = progress.cursor
     while cursor[0] < steps:
         while cursor[1] < len(kicks):
             k = cursor[1]
             if kicks[k] != 0.0:
-                if cursor[2] == 0:
-                    status = load_bodies(terms, state, load)
-                    if status != OK:
-                        return status
-                    cursor[2] = 1
+                if probe is None:
+                    if cursor[2] == 0:
+                        status = load_bodies(terms, state, load)
+                        if status != OK:
+                            return status
+                        cursor[2] = 1
+                else:
+                    while cursor[2] < (1 if gradients[k] == 0.0 else 2):
+                        status = evaluate(model, state, load, terms, probe, gradients[k] * dt * dt, cursor[2] == 1)
+                        if status != OK:
+                            return status
+                        cursor[2] += 1
                 pay(model, terms, state, 0.5 * kicks[k] * dt)
                 kick(model, state, load, kicks[k] * dt)
                 pay(model, terms, state, 0.5 * kicks[k] * dt)
@@ -112,6 +122,38 @@ def _drift_molecules(model, state, h):
             _drift_threaded(model.rotor, model.species, state, h)
 
     return drift_molecules
+
+
+@implements(displace)
+def _displace_molecules(model, state, load, tau):
+    if not is_a(model, Model):
+        return None
+
+    def displace_molecules(model, state, load, tau):
+        for m in range(len(state.position)):
+            share = tau * model.inverse_mass[model.species[m]]
+            for k in range(3):
+                state.position[m, k] += share * load.force[m, k]
+        for m in range(len(state.rotation)):
+            inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
+            turn_along(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
+
+    return displace_molecules
+
+
+@implements(add_gyration)
+def _add_gyration_of_molecules(model, load, tau, gain):
+    if not is_a(model, Model):
+        return None
+
+    def add_gyration_of_molecules(model, load, tau, gain):
+        for m in range(len(load.torque_body)):
+            inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
+            for k in range(3):
+                i, j = (k + 1) % 3, (k + 2) % 3
+                gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]
+
+    return add_gyration_of_molecules
 
 
 @implements(pay)

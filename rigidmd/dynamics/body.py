@@ -3,12 +3,13 @@
 from typing import NamedTuple
 
 from rigidmd.dynamics.advance import drift, kick, pay
+from rigidmd.dynamics.gradient import add_gyration, displace
 from rigidmd.forces.frame import Inertial, Turning, follow, frame_rate
 from rigidmd.forces.resistance import NoResistance, Resistance, push
 from rigidmd.forces.terms import total_power
 from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.flight import Free, Immersed, Pinned, along, carry, inertial_mass
-from rigidmd.mechanics.rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments
+from rigidmd.mechanics.rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, turn_along
 
 
 class Body(NamedTuple):
@@ -39,6 +40,45 @@ def _drift_body(model, state, h):
         follow(model.frame, state, time, h)
 
     return drift_body
+
+
+@implements(displace, inline=True)
+def _displace_body(model, state, load, tau):
+    if not is_a(model, Body):
+        return None
+
+    def displace_body(model, state, load, tau):
+        for k in range(len(load.force)):
+            for i in range(3):
+                state.position[k, i] += tau / model.flight.mass * load.force[k, i]
+        for k in range(len(load.torque_body)):
+            n, time = load.torque_body[k], state.time[0]
+            turn_along(
+                state.rotation[k],
+                tau * moments(model.rotor, time, 0)[0] * n[0],
+                tau * moments(model.rotor, time, 1)[0] * n[1],
+                tau * moments(model.rotor, time, 2)[0] * n[2],
+            )
+
+    return displace_body
+
+
+@implements(add_gyration, inline=True)
+def _add_gyration_of_body(model, load, tau, gain):
+    if not is_a(model, Body):
+        return None
+
+    def add_gyration_of_body(model, load, tau, gain):
+        for b in range(len(load.torque_body)):
+            n = load.torque_body[b]
+            i0 = moments(model.rotor, 0.0, 0)[0]
+            i1 = moments(model.rotor, 0.0, 1)[0]
+            i2 = moments(model.rotor, 0.0, 2)[0]
+            gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
+            gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
+            gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
+
+    return add_gyration_of_body
 
 
 @implements(pay, inline=True)

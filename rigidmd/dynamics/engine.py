@@ -7,6 +7,7 @@ import numpy as np
 
 from rigidmd.dynamics.advance import Model, advance, new_progress
 from rigidmd.dynamics.body import Body
+from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import answer
@@ -45,6 +46,7 @@ class Engine:
             forget_list(term)  # a list left by another engine has its pairs in another order, and sums other last bits
         self._applied = applied or {}
         self.load: Load | None = None
+        self._probe: Probe | None = None
         self._stale = True
 
     @property
@@ -78,10 +80,14 @@ class Engine:
             np.array(scheme.kicks),
             np.array(scheme.drifts),
             np.array([*np.cumsum((0.0, *scheme.drifts))[:-1], 1.0]),
+            np.array(scheme.gradients) if scheme.gradients else None,
         )
+        if scheme.gradients and self._probe is None:
+            self._probe = probe_for(state)
+        probe = self._probe if scheme.gradients else None
         model = self.model_for(scheme)
         while status := advance(
-            model, state, self.load, self._terms, thermostat, rows, dt, origin, done + steps, progress
+            model, state, self.load, self._terms, thermostat, rows, probe, dt, origin, done + steps, progress
         ):
             self._answer(status, state)
         self._stale = False

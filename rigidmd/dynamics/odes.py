@@ -155,6 +155,12 @@ class OdeEngine(Engine):
     """An engine that moves a body by a general solver. The variables live here between calls; the state shows them."""
 
     _y = _integrator = _between = None
+    own_steps = 0  # that DOP853 or Radau has taken
+
+    @property
+    def evaluations(self) -> int:
+        """Of the slopes, by DOP853 or Radau, since it last began."""
+        return self._integrator.nfev
 
     def advance(
         self, state: State, solver: Solver, dt: float, steps: int, thermostat: NamedTuple, done: int = 0
@@ -216,6 +222,7 @@ class OdeEngine(Engine):
         while integrator.t < end:
             with np.errstate(all="ignore"):
                 problem = integrator.step()
+            self.own_steps += 1
             if singular(form, integrator.y, dy, 0.0):
                 raise SingularError(integrator.y[1], integrator.t)
             if problem or not np.isfinite(integrator.y).all():

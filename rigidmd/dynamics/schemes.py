@@ -20,6 +20,7 @@ class Scheme(NamedTuple):
     order: int
     exact_rotor: bool  # whether its order needs one
     source: str
+    gradients: tuple[float, ...] = ()  # tau/dt² of each kick (dynamics.gradient); none where empty
 
     def with_rotor(self, rotor: str | None) -> "Scheme":
         """This scheme on the rotor named ("split" or "exact"); its own where none is."""
@@ -27,8 +28,8 @@ class Scheme(NamedTuple):
 
     @property
     def force_evaluations(self) -> int:
-        """A step: the last kick of a step and the first of the next share theirs."""
-        return sum(kick != 0 for kick in self.kicks[1:])
+        """A step: the last kick of a step and the first of the next share theirs; a gradient takes one more."""
+        return sum(kick != 0 for kick in self.kicks[1:]) + sum(tau != 0 for tau in self.gradients)
 
 
 def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Scheme:
@@ -130,6 +131,20 @@ SCHEMES = {
             order=4,
             source=f"{BLANES_MOAN}, SRKN6b",
         ),
+        split(
+            "takahashi_imada",
+            (0.0, 1.0, 0.0),
+            (0.5, 0.5),
+            order=2,
+            source="Takahashi & Imada 1984, J. Phys. Soc. Jpn. 53, 3765; of order 4 but for a change of variables",
+        )._replace(gradients=(0.0, 1 / 12, 0.0)),
+        split(
+            "chin_4a",
+            odd(1 / 6),
+            (0.5, 0.5),
+            order=4,
+            source="Chin 1997, Phys. Lett. A 226, 344, scheme A",
+        )._replace(gradients=(0.0, 1 / 24, 0.0)),
         composed(
             "kahan_li_6",
             odd(0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230),

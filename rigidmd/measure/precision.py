@@ -1,7 +1,8 @@
 """Error against run time: the same start moved by every integrator at several steps, each measured.
 
 What is compared is what a user pays and gets: seconds of computing and force evaluations for a stretch of time, against
-the error of the trajectory at its end and that of the energy on the way.
+the error of the trajectory at its end, that of the energy and of all else that is conserved on the way, and, of liquids
+on request, the bias of what they are simulated for: temperatures, potential energy, pressure.
 """
 
 import time as clock
@@ -9,33 +10,62 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.dynamics.engine import Engine, NotFiniteError
-from rigidmd.dynamics.schemes import SCHEMES, Scheme
+from rigidmd.dynamics.odes import RK4, OdeEngine, Solver
+from rigidmd.dynamics.schemes import Scheme
 from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.errors import SimulationError
 from rigidmd.forces.terms import State
 from rigidmd.measure.drift import slope
+from rigidmd.measure.observables import Observation
+from rigidmd.measure.summary import mean
+from rigidmd.mechanics.rotation import orthogonality_error
+from rigidmd.units import KJ_PER_MOL
 
 #: Looks at the energy in a span.
 LOOKS = 40
 #: An energy that is wrong by this much of the kinetic energy is no result of a step that is merely inaccurate.
 DIVERGED = 0.5
+#: Averages are taken from looks this far apart, ps: about as long as the kinetic energy of water remembers itself.
+LOOK_PS = 0.02
+#: Of general solvers that choose their own steps.
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+
+
+class Method(NamedTuple):
+    """A way to move the subject."""
+
+    engine: Callable[[], Engine]
+    how: Scheme | Solver
+
+    @property
+    def chooses_steps(self) -> bool:
+        """Whether it is given a tolerance, not a time step."""
+        return isinstance(self.how, Solver) and self.how.name != RK4
+
+    @property
+    def force_evaluations(self) -> int:
+        """In a step, of what is given its steps."""
+        return 4 if isinstance(self.how, Solver) else self.how.force_evaluations
 
 
 @dataclass
 class Subject:
     """What is moved: a start, and how to measure it.
 
-    energy(engine, state) : the conserved energy. energy_unit : one unit of the reported energy error, in words, with a
-    note on it; energy_size : that unit in the units of `energy`. kinetic : a kinetic energy by which
-    divergence is judged. rotor : what the scene asks for.
+    methods : by name. energy(engine, state) : the conserved energy. energy_unit : one unit of the reported error of the
+    energy, in words, with a note on it; energy_size : that unit in the units of `energy`. kinetic : a kinetic energy by
+    which divergence is judged. kept(state) : relative errors of all else that is conserved. observe(engine, state,
+    step) : of molecules in a box, what averages are taken of; None of others. reference : the method of the reference.
     """
 
     name: str
     state: State
-    engine: Callable[[], Engine]
+    methods: dict[str, Method]
     energy: Callable[[Engine, State], float]
     energy_unit: str
     energy_note: str
@@ -45,9 +75,10 @@ class Subject:
     time_unit: str  # fs or s, of time steps
     time_size: float  # of that unit, in the units of the span
     length_unit: str
-    rotor: str | None
-    integrators: list[str]
-    reference: str  # the integrator of the reference
+    reference: str
+    kept: Callable[[State], dict[str, float]]
+    observe: Callable[[Engine, State, float], Observation] | None = None
+    molecules: int = 1
 
 
 @dataclass
@@ -55,7 +86,7 @@ class Trial:
     """One integrator at one step."""
 
     integrator: str
-    timestep: float  # in the subject's unit
+    timestep: float  # in the subject's unit; the mean one of what chooses its steps
     steps: int
     forces: int  # evaluations in the span
     seconds: list[float] = field(default_factory=list)  # of computing in the span, one for each repeat
@@ -65,7 +96,15 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality: float = np.nan
-    diverged: bool = False
+    kept: dict[str, float] = field(default_factory=dict)  # largest relative errors of what else is conserved
+    tolerance: float | None = None  # of what chooses its steps
+    fault: str = ""  # why it did not get to the end, or to nothing that means anything
+    averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
+
+    @property
+    def diverged(self) -> bool:
+        """Whether it has no results."""
+        return bool(self.fault)
 
     @property
     def time(self) -> float:
@@ -86,6 +125,12 @@ class Precision:
     trials: list[Trial]
     reference_steps: int
     reference_error: float  # of the reference's own end, from half as many steps
+    sampled: float | None = None  # ps of which averages were taken
+
+    @property
+    def most_exact(self) -> Trial:
+        """The trial with the smallest energy error, against whose averages those of the others are held."""
+        return min((t for t in self.trials if t.averages), key=lambda t: t.energy_rms)
 
     def stable_step(self, integrator: str) -> float | None:
         """The longest step tried that did not diverge."""
@@ -119,57 +164,76 @@ class Precision:
         return None
 
 
-def scheme_of(subject: Subject, integrator: str) -> Scheme:
-    """The scheme on the rotor that the scene asks for, where it can have that."""
-    scheme = SCHEMES[integrator]
-    return scheme if scheme.exact_rotor else scheme.with_rotor(subject.rotor)
-
-
 def measure(
-    subject: Subject, trials: list[Trial], repeats: int, say: Callable[[float], None] = lambda share: None
+    subject: Subject,
+    trials: list[Trial],
+    repeats: int,
+    averages: float | None = None,
+    say: Callable[[float], None] = lambda share: None,
 ) -> Precision:
-    """Run all trials `repeats` times, alternating, and the reference; say(share done) in between."""
-    most = max(trial.forces for trial in trials)
-    scheme = SCHEMES[subject.reference]
-    steps = 2 * -(-2 * most // scheme.force_evaluations)
-    exact = _end(subject, scheme, steps)
-    own_error = _gap(exact, _end(subject, scheme, steps // 2))
-    result = Precision(subject, trials, steps, max(gap for gap in own_error if not np.isnan(gap)))
+    """Run all trials `repeats` times, alternating, and the reference; say(share done) in between.
+
+    averages : ps over which every trial is sampled besides; none when not given
+    """
+    most = max((trial.forces for trial in trials), default=0) or LOOKS * LOOKS
+    reference = subject.methods[subject.reference]
+    steps = 2 * -(-2 * most // reference.force_evaluations)
+    exact = _end(subject, reference, steps)
+    own_error = _gap(exact, _end(subject, reference, steps // 2))
+    result = Precision(subject, trials, steps, max(gap for gap in own_error if not np.isnan(gap)), averages)
     for trial in trials:  # compiled, and looked at
         _observe(subject, trial, exact)
-    share, whole = 0, sum(trial.forces for trial in trials if not trial.diverged) * repeats
+    good = [trial for trial in trials if not trial.diverged]
+    span = subject.span
+    share, whole = 0.0, sum(trial.forces * (repeats + (averages or 0.0) / span) for trial in good)
     for _ in range(repeats):
-        for trial in trials:
-            if not trial.diverged:
-                engine, state = subject.engine(), subject.state.copy()
-                _advance(subject, engine, state, trial, 0)
-                began = clock.perf_counter()
-                _advance(subject, engine, state, trial, trial.steps)
-                trial.seconds.append(clock.perf_counter() - began)
-                share += trial.forces
-                say(share / whole)
+        for trial in good:
+            engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
+            _advance(subject, engine, state, trial, 0)
+            began = clock.perf_counter()
+            _advance(subject, engine, state, trial, trial.steps)
+            trial.seconds.append(clock.perf_counter() - began)
+            share += trial.forces
+            say(share / whole)
+    for trial in good if averages else ():
+        _average(subject, trial, averages)
+        share += trial.forces * averages / span
+        say(share / whole)
     return result
 
 
 def plan(subject: Subject, steps: dict[str, list[float]]) -> list[Trial]:
-    """Trials of integrators at time steps (in the subject's unit), fitted a whole number of times into the span."""
+    """Trials of integrators at time steps (in the subject's unit), fitted a whole number of times into the span.
+
+    What chooses its steps is given tolerances instead.
+    """
     trials = {}
     for integrator, timesteps in steps.items():
-        evaluations = SCHEMES[integrator].force_evaluations
+        method = subject.methods[integrator]
+        if method.chooses_steps:
+            for tolerance in TOLERANCES:
+                step = subject.span / LOOKS / subject.time_size
+                trials[integrator, tolerance] = Trial(integrator, step, LOOKS, 0, tolerance=tolerance)
+            continue
         for timestep in timesteps:
             n = max(1, round(subject.span / (timestep * subject.time_size)))
-            trials[integrator, n] = Trial(integrator, subject.span / n / subject.time_size, n, n * evaluations)
+            step = subject.span / n / subject.time_size
+            trials[integrator, n] = Trial(integrator, step, n, n * method.force_evaluations)
     return list(trials.values())
 
 
 def _advance(subject: Subject, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
-    dt = trial.timestep * subject.time_size
-    engine.advance(state, scheme_of(subject, trial.integrator), dt, steps, NoThermostat(), done)
+    method = subject.methods[trial.integrator]
+    how, dt = method.how, trial.timestep * subject.time_size
+    if method.chooses_steps:
+        how = how._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
+        dt = subject.span / trial.steps
+    engine.advance(state, how, dt, steps, NoThermostat(), done)
 
 
-def _end(subject: Subject, scheme: Scheme, steps: int) -> State:
-    engine, state = subject.engine(), subject.state.copy()
-    engine.advance(state, scheme, subject.span / steps, steps, NoThermostat())
+def _end(subject: Subject, method: Method, steps: int) -> State:
+    engine, state = method.engine(), subject.state.copy()
+    engine.advance(state, method.how, subject.span / steps, steps, NoThermostat())
     return state
 
 
@@ -181,7 +245,7 @@ def _gap(a: State, b: State) -> tuple[float, float]:
 
 def _observe(subject: Subject, trial: Trial, exact: State) -> None:
     """One run with looks at the energy; all of the trial but its seconds."""
-    engine, state = subject.engine(), subject.state.copy()
+    engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
     first = subject.energy(engine, state)
     times, energies = [0.0], [0.0]
     every, done = max(1, trial.steps // LOOKS), 0
@@ -192,16 +256,53 @@ def _observe(subject: Subject, trial: Trial, exact: State) -> None:
             energy = subject.energy(engine, state) - first
         except NotFiniteError:
             energy = np.inf
+        except SimulationError as error:
+            trial.fault = str(error)
+            return
         if not abs(energy) < DIVERGED * subject.kinetic:
-            trial.diverged = True
+            trial.fault = "diverges"
             return
         done += now
         times.append(done / trial.steps)
         energies.append(energy / subject.energy_size)
+        for name, error in subject.kept(state).items():
+            trial.kept[name] = max(abs(error), trial.kept.get(name, 0.0))
     trial.energy_rms = float(np.sqrt(np.mean(np.square(energies[1:]))))
     line = slope(times, energies)
     trial.energy_drift, trial.energy_drift_error = float(line.value), float(line.error)
     trial.rotation_error, trial.position_error = _gap(state, exact)
     if len(state.rotation):
-        gap = np.swapaxes(state.rotation, -1, -2) @ state.rotation - np.eye(3)
-        trial.orthogonality = float(np.abs(gap).max())
+        trial.orthogonality = orthogonality_error(state.rotation)
+    if isinstance(engine, OdeEngine) and trial.tolerance is not None:
+        trial.forces = engine.evaluations
+        trial.timestep = subject.span / engine.own_steps / subject.time_size
+
+
+def _average(subject: Subject, trial: Trial, length: float) -> None:
+    """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and without bias."""
+    engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
+    dt = trial.timestep * subject.time_size
+    verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
+    every = max(1, round(LOOK_PS / dt))
+    seen: list[Observation] = []
+    for k in range(max(2, round(length / dt / every))):
+        try:
+            _advance(subject, engine, state, trial, every, k * every)
+        except SimulationError:
+            return
+        seen.append(subject.observe(engine, state, verlet_step))
+
+    def series(name: str) -> np.ndarray:
+        return np.array([getattr(observation, name) for observation in seen])
+
+    found = {"potential": series("potential") / KJ_PER_MOL / subject.molecules, "pressure": series("pressure_bar")}
+    for name, key in (("T_trans", "translation"), ("T_rot", "rotation")):
+        on, unbiased = series(f"temperature_{key}"), series(f"temperature_{key}_unbiased")
+        # the one on the steps and the one between them, of which the unbiased is (one + twice the other)/3
+        found |= {name: on, f"{name} half-step": 1.5 * unbiased - 0.5 * on, f"{name} unbiased": unbiased}
+    for kind in ("", " half-step", " unbiased"):
+        found[f"T_rot - T_trans{kind}"] = found[f"T_rot{kind}"] - found[f"T_trans{kind}"]
+    for name, values in found.items():
+        average, error = mean(values)
+        if average is not None:
+            trial.averages[name] = average, error

@@ -19,6 +19,8 @@ class Sample(NamedTuple):
     temperature: float  # K
     temperature_translation: float
     temperature_rotation: float
+    temperature_translation_unbiased: float  # NaN with any integrator but velocity Verlet
+    temperature_rotation_unbiased: float
     pressure_bar: float
     conserved: float  # energy less the heat of the thermostat, u Å²/ps²
     drift: float  # of the conserved energy since the stage began, u Å²/ps²

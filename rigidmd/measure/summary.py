@@ -77,7 +77,7 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
     steps = own[-1].step - (before or own)[0].step
     speed = steps / computing if computing > 0 else None
     line = slope([s.time for s in before + own], [0.0] * len(before) + [s.drift for s in own])
-    mean_t, error_t = _mean([s.temperature for s in own])
+    mean_t, error_t = mean([s.temperature for s in own])
     kinetic = np.array([s.kinetic for s in own])
     spread = float(kinetic.std())
     per_molecule = line.value * 1000 / KJ_PER_MOL / n
@@ -96,11 +96,13 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
         "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
         "temperature_K": mean_t,
         "temperature_error_K": error_t,
-        "temperature_translation_K": _mean([s.temperature_translation for s in own])[0],
-        "temperature_rotation_K": _mean([s.temperature_rotation for s in own])[0],
+        "temperature_translation_K": mean([s.temperature_translation for s in own])[0],
+        "temperature_rotation_K": mean([s.temperature_rotation for s in own])[0],
+        "temperature_translation_unbiased_K": mean([s.temperature_translation_unbiased for s in own])[0],
+        "temperature_rotation_unbiased_K": mean([s.temperature_rotation_unbiased for s in own])[0],
         "potential_kJ_mol_per_molecule": float(np.mean([s.potential for s in own])) / KJ_PER_MOL / n,
-        "pressure_bar": _mean([s.pressure_bar for s in own])[0],
-        "pressure_error_bar": _mean([s.pressure_bar for s in own])[1],
+        "pressure_bar": mean([s.pressure_bar for s in own])[0],
+        "pressure_error_bar": mean([s.pressure_bar for s in own])[1],
         "drift_kJ_mol_ns_per_molecule": _known(per_molecule),
         "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / KJ_PER_MOL / n),
         "drift_kT_ns_per_degree_of_freedom": per_kt and _known(per_kt),
@@ -116,7 +118,7 @@ def _known(value: float) -> float | None:
     return None if isnan(value) else float(value)
 
 
-def _mean(values: list[float]) -> tuple[float | None, float | None]:
+def mean(values: list[float]) -> tuple[float | None, float | None]:
     """Mean and its standard error, with neighbouring samples' likeness counted; None where there is no value."""
     array = np.array(values, dtype=float)
     if np.isnan(array).any():

@@ -268,11 +268,17 @@ def about_momentum(rotation, angular_momentum_body, m, share):
     x = angular_momentum_body[m, 0]
     y = angular_momentum_body[m, 1]
     z = angular_momentum_body[m, 2]
-    size = sqrt(x * x + y * y + z * z)
-    if size == 0.0:
+    turn_along(rotation[m], share * x, share * y, share * z)
+
+
+@kernel(inline=True)
+def turn_along(rotation, x, y, z):
+    """Q <- Q R, with R the rotation by the vector (x, y, z), in the body frame."""
+    angle = sqrt(x * x + y * y + z * z)
+    if angle == 0.0:
         return
-    s, versine = sine_and_versine(share * size)
-    turn_rows(rotation[m], x / size, y / size, z / size, -s, versine)
+    s, versine = sine_and_versine(angle)
+    turn_rows(rotation, x / angle, y / angle, z / angle, -s, versine)
 
 
 def turn_alone(rotor, state, time, h):

@@ -3,16 +3,18 @@
 import base64
 import csv
 import html
+from math import hypot
 from pathlib import Path
 
 import numpy as np
 
 from rigidmd.measure.precision import Precision, Trial
 from rigidmd.output.folder import whole_file
-from rigidmd.output.report import FAINT, INK
+from rigidmd.output.report import FAINT, INK, signed
 
-FILES = ("precision.csv", "precision.png", "precision.html")
+FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
 COLORS = ("#2b6f9e", "#8fb4cf", "#c8553d", "#e2a08f", "#4f8a5b", "#9bbf9f", "#7a5ca3", "#b8862d", INK, FAINT)
+ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
 
 def headers(found: Precision) -> list[str]:
@@ -21,26 +23,82 @@ def headers(found: Precision) -> list[str]:
     per = "ps" if s.time_unit == "fs" else "s"
     return [
         "integrator", f"step ({s.time_unit})", f"forces per {per}", f"seconds per {per}", "spread (%)", "error of Q",
-        f"error of X ({s.length_unit})", "energy rms", "energy drift in the span", "±", "orthogonality",
+        f"error of X ({s.length_unit})", "energy rms", "energy drift in the span", "±",
+        *(f"error of {name}" for name in _kept(found)), "orthogonality",
     ]  # fmt: skip
+
+
+def _kept(found: Precision) -> list[str]:
+    """What else is conserved."""
+    return list(dict.fromkeys(name for trial in found.trials for name in trial.kept))
 
 
 def row(found: Precision, trial: Trial) -> list:
     """A line of the table."""
-    span = found.subject.span
+    span, kept = found.subject.span, _kept(found)
     if trial.diverged:
-        return [trial.integrator, trial.timestep, trial.forces / span, "diverges", *[None] * 7]
+        return [trial.integrator, trial.timestep, trial.forces / span, "fails", *[None] * (7 + len(kept))]
     spread = 100 * (max(trial.seconds) - min(trial.seconds)) / trial.time
     values = [
         trial.integrator, trial.timestep, trial.forces / span, trial.time / span, spread, trial.rotation_error,
-        trial.position_error, trial.energy_rms, trial.energy_drift, trial.energy_drift_error, trial.orthogonality,
+        trial.position_error, trial.energy_rms, trial.energy_drift, trial.energy_drift_error,
+        *(trial.kept.get(name) for name in kept), trial.orthogonality,
     ]  # fmt: skip
     return [None if isinstance(x, float) and np.isnan(x) else x for x in values]
 
 
+def average_headers(found: Precision) -> list[str]:
+    """Column titles of the averages."""
+    titles = ["integrator", "step (fs)"]
+    for name in ("T_trans", "T_rot", "T_rot - T_trans"):
+        for words in ESTIMATORS.values():
+            titles += [f"{name} {words} (K)", "±"]
+    return [*titles, "potential (kJ/mol)", "±", "bias", "±", "pressure (bar)", "±", "bias", "±"]
+
+
+def average_row(found: Precision, trial: Trial) -> list:
+    """A line of the averages; biases are against the trial with the smallest energy error."""
+    seen, best = trial.averages, found.most_exact.averages
+    values = [trial.integrator, trial.timestep]
+    for name in ("T_trans", "T_rot", "T_rot - T_trans"):
+        for kind in ESTIMATORS:
+            values += seen.get(name + kind, (None, None))
+    for name in ("potential", "pressure"):
+        value, error = seen[name]
+        values += [value, error]
+        values += [None, None] if trial is found.most_exact else [value - best[name][0], hypot(error, best[name][1])]
+    return values
+
+
 def table_text(found: Precision) -> str:
-    """The table as a person reads it."""
-    lines = [[_short(cell) for cell in line] for line in (headers(found), *(row(found, t) for t in found.trials))]
+    """The tables as a person reads them."""
+    text = _columns([headers(found), *(row(found, t) for t in found.trials)])
+    if found.sampled and (sampled := [t for t in found.trials if t.averages]):
+        rows = [_brief_headers(), *(_brief_row(found, t) for t in sampled)]
+        text += f"\n\naverages over {found.sampled:g} ps\n" + _columns(rows)
+    return text
+
+
+def _brief_headers() -> list[str]:
+    of = [f"T_rot - T_trans {words} (K)" for words in ESTIMATORS.values()]
+    return ["integrator", "step (fs)", "T_trans (K)", *of, "bias of U (kJ/mol)", "bias of P (bar)"]
+
+
+def _brief_row(found: Precision, trial: Trial) -> list[str]:
+    """The averages that tell one step from another."""
+    seen, best = trial.averages, found.most_exact.averages
+    cells = [trial.integrator, f"{trial.timestep:.3g}", signed(*seen["T_trans"]).lstrip("+")]
+    gaps = [seen.get(f"T_rot - T_trans{kind}") for kind in ESTIMATORS]
+    cells += [gap and signed(*gap) for gap in gaps]
+    for name in ("potential", "pressure"):
+        (value, error), (right, its_error) = seen[name], best[name]
+        cells.append("(held against)" if trial is found.most_exact else signed(value - right, hypot(error, its_error)))
+    return cells
+
+
+def _columns(rows: list[list]) -> str:
+    """Rows as text in columns; those without any value are left out."""
+    lines = [[_short(cell) for cell in line] for line in rows]
     kept = [k for k in range(len(lines[0])) if any(line[k] not in ("", "-") for line in lines[1:])]
     widths = [max(len(line[k]) for line in lines) for k in kept]
     text = ["  ".join(line[k].ljust(w) if k == 0 else line[k].rjust(w) for k, w in zip(kept, widths, strict=True))
@@ -64,14 +122,30 @@ def advice(found: Precision) -> list[str]:
         f"reference: {s.reference} in {found.reference_steps} steps, its own error about {found.reference_error:.0e}",
     ]
     for name in dict.fromkeys(t.integrator for t in found.trials):
-        own = [t for t in found.trials if t.integrator == name]
-        if any(t.diverged for t in own):
+        faults = [t.fault for t in found.trials if t.integrator == name and t.fault]
+        if "diverges" in faults:
             step = found.stable_step(name)
             lines.append(f"{name} diverges" + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried"))
+        lines += [f"{name}: {fault}" for fault in dict.fromkeys(faults) if fault != "diverges"][:1]
+    if found.sampled:
+        lines += _temperature_words(found)
     lines += _cheapest(found, "energy_rms", "an energy error", s.energy_unit)
     what = "Q" if any(not np.isnan(t.rotation_error) for t in found.trials) else "X"
     lines += _cheapest(found, "trajectory_error", f"an error of {what}", "" if what == "Q" else s.length_unit)
     return lines
+
+
+def _temperature_words(found: Precision) -> list[str]:
+    """What the longest step of velocity Verlet does to the temperatures."""
+    name = "T_rot - T_trans"
+    verlet = [t for t in found.trials if f"{name} unbiased" in t.averages]
+    if not verlet:
+        return []
+    longest = max(verlet, key=lambda t: t.timestep)
+    on, unbiased = (signed(*longest.averages[name + kind]) for kind in ("", " unbiased"))
+    return [
+        f"velocity_verlet at {longest.timestep:.3g} fs: T_rot - T_trans is {on} K on the steps, {unbiased} unbiased"
+    ]
 
 
 def _cheapest(found: Precision, error: str, what: str, unit: str) -> list[str]:
@@ -99,10 +173,17 @@ def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(headers(found))
         writer.writerows(row(found, trial) for trial in found.trials)
+    written = list(FILES[:3])
+    if sampled := [trial for trial in found.trials if trial.averages]:
+        written.append(FILES[3])
+        with whole_file(folder / FILES[3]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(average_headers(found))
+            writer.writerows(average_row(found, trial) for trial in sampled)
     draw(folder / FILES[1], found)
     with whole_file(folder / FILES[2]) as temporary:
         temporary.write_text(page(found, (folder / FILES[1]).read_bytes(), command), encoding="utf-8")
-    return [folder / name for name in FILES]
+    return [folder / name for name in written]
 
 
 def draw(path: Path, found: Precision) -> None:
@@ -143,11 +224,10 @@ def draw(path: Path, found: Precision) -> None:
 
 def page(found: Precision, picture: bytes, command: str) -> str:
     """A page that needs no other file."""
-    cells = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(_short(cell))}</td>" for cell in row(found, trial)) + "</tr>\n"
-        for trial in found.trials
-    )
-    head = "".join(f"<th>{html.escape(title)}</th>" for title in headers(found))
+    tables = _html_table(headers(found), [row(found, trial) for trial in found.trials])
+    if sampled := [trial for trial in found.trials if trial.averages]:
+        tables += f"<h2>Averages over {found.sampled:g} ps</h2>\n"
+        tables += _html_table(_brief_headers(), [_brief_row(found, trial) for trial in sampled])
     words = "".join(f"<li>{html.escape(line)}</li>\n" for line in advice(found))
     name = html.escape(found.subject.name)
     return f"""<!doctype html>
@@ -159,7 +239,13 @@ td:first-child,th:first-child{{text-align:left}}tr:nth-child(even){{background:#
 <ul>
 {words}</ul>
 <img alt="log error against log run time" src="data:image/png;base64,{base64.b64encode(picture).decode()}">
-<table><tr>{head}</tr>
-{cells}</table>
-<p><code>{html.escape(command)}</code></p></html>
+{tables}<p><code>{html.escape(command)}</code></p></html>
 """
+
+
+def _html_table(titles: list[str], rows: list[list]) -> str:
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(_short(cell))}</td>" for cell in line) + "</tr>\n" for line in rows
+    )
+    return f"<table><tr>{head}</tr>\n{body}</table>\n"

@@ -76,24 +76,20 @@ def _stage_title(stage: dict) -> str:
 def _stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows = []
     if stage["temperature_K"] is not None:
-        parts = [
-            f"{name} {stage[key]:.2f}"
-            for name, key in (("T_trans", "temperature_translation_K"), ("T_rot", "temperature_rotation_K"))
-            if stage[key] is not None
-        ]
-        rows.append(
-            ("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({', '.join(parts)})")
-        )
+        parts = _temperatures(stage, "K")
+        rows.append(("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({parts})"))
+        if parts := _temperatures(stage, "unbiased_K"):
+            rows.append(("", f"{parts} without what the step itself takes from the velocities"))
     rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
     if stage["pressure_bar"] is not None:
         rows.append(("pressure", f"{stage['pressure_bar']:.0f} ± {stage['pressure_error_bar']:.0f} bar"))
     if stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
         value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
-        rows.append(("drift", f"{_signed(value, error)} kJ/mol/ns per molecule ({what})"))
+        rows.append(("drift", f"{signed(value, error)} kJ/mol/ns per molecule ({what})"))
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
-            rows.append(("", f"{_signed(value, error)} kT/ns per degree of freedom"))
+            rows.append(("", f"{signed(value, error)} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
             rows.append(
                 ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in all")
@@ -104,7 +100,15 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
     return rows
 
 
-def _signed(value: float, error: float) -> str:
+def _temperatures(stage: dict, ending: str) -> str:
+    values = (
+        ("T_trans", stage[f"temperature_translation_{ending}"]),
+        ("T_rot", stage[f"temperature_rotation_{ending}"]),
+    )
+    return ", ".join(f"{name} {value:.2f}" for name, value in values if value is not None)
+
+
+def signed(value: float, error: float) -> str:
     """value ± error, both to two digits of the error."""
     digits = max(0, 1 - floor(log10(error))) if error > 0 else 3
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
@@ -128,7 +132,7 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
         fitted = (samples["drift"][own] / scale).mean() + gradient / 1000 * (time[own] - time[own].mean())
         drift.plot(time[own], fitted, color=WARM, lw=1.4)
         drift.set_title(
-            f"{last['name']}: drift {_signed(gradient, error)} kJ/mol/ns per molecule",
+            f"{last['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from math import nan
 from typing import NamedTuple
 
 import numba
@@ -38,7 +39,9 @@ class MolecularSimulation(Simulation):
 
     def observe(self, moment: Moment) -> Observation:
         """Energies, temperatures, pressure."""
-        return observe(self.system, self.engine, self.state)
+        stage = self.scene.stages[moment.stage]
+        step = stage.timestep_fs * FEMTOSECOND if stage.integrator == "velocity_verlet" else nan
+        return observe(self.system, self.engine, self.state, step)
 
     def _reset(self) -> None:
         self.engine = Engine(self.system.model, self.system.terms)
@@ -145,6 +148,8 @@ class MolecularSimulation(Simulation):
                     seen.temperature,
                     seen.temperature_translation,
                     seen.temperature_rotation,
+                    seen.temperature_translation_unbiased,
+                    seen.temperature_rotation_unbiased,
                     seen.pressure_bar,
                     conserved,
                     conserved - origin[moment.stage],
