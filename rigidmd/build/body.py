@@ -87,6 +87,8 @@ class BodySystem:
     def method(self) -> Scheme | Solver:
         """What moves it."""
         run = self.scene.run
+        if run.is_open:
+            return SCHEMES["velocity_verlet"]
         if run.integrator in SCHEMES:
             return SCHEMES[run.integrator].with_rotor(run.rotor)
         tolerances = (run.relative_tolerance or DEFAULT_TOLERANCE, run.absolute_tolerance or DEFAULT_TOLERANCE)

@@ -100,6 +100,8 @@ def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[
     """Integrators that would not be what they are for this body. has_functions : Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
     braked = not isinstance(resistance, NoResistance)
+    if run.is_open:
+        return []
     if run.integrator in SOLVERS:
         if braked and resistance.rotation_dry.any():
             return [

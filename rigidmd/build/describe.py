@@ -17,7 +17,12 @@ from rigidmd.units import FEMTOSECOND
 
 def describe(scene: Scene) -> str:
     """What a scene would do, in words. Raises as building it does."""
-    return _body(build_body(scene)) if isinstance(scene, BodyScene) else _molecules(build(scene))
+    if not isinstance(scene, BodyScene):
+        return _molecules(build(scene))
+    text = _body(build_body(scene))
+    if scene.run.is_open:
+        text += "\nthe integrator is chosen before the run, and its step, at most this one"
+    return text
 
 
 def _body(system: BodySystem) -> str:
@@ -95,6 +100,11 @@ def _molecules(system: System) -> str:
 def _stage(stage: Stage) -> str:
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
     text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
+    if stage.is_open:
+        asked = f"{stage.energy_error_kT:g} kT" if stage.energy_error_kT else f"{stage.trajectory_error:g} of Q or X"
+        text = (
+            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {asked}"
+        )
     if stage.ensemble == "nvt":
         text += f", {stage.temperature_K:g} K by {stage.thermostat.replace('_', ' ')}, {stage.thermostat_time_ps:g} ps"
     return text

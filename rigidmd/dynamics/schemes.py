@@ -55,11 +55,23 @@ def even(*half: float) -> tuple[float, ...]:
 
 
 Rotor = Literal["split", "exact"]
+AUTO = "auto"  # in place of a name: the cheapest for an accuracy, found by a pilot run
+
+
+def auto_faults(integrator: str, asked: dict[str, float | None], idle: list[str]) -> list[str]:
+    """What is wrong between an integrator, the errors asked for (key -> value), and keys that a pilot decides."""
+    given = [key for key, value in asked.items() if value is not None]
+    if integrator != AUTO:
+        return [f"{', '.join(given)} would do nothing without integrator = 'auto'"] if given else []
+    faults = [f"{', '.join(idle)} would do nothing with integrator = 'auto', which chooses it"] if idle else []
+    if len(given) != 1:
+        faults.append(f"integrator = 'auto' needs one of {', '.join(asked)}")
+    return faults
 
 
 def rotor_fault(integrator: str, rotor: Rotor | None) -> str:
     """Why a scheme cannot go with a rotor; empty if it can."""
-    if rotor == "split" and SCHEMES[integrator].exact_rotor:
+    if rotor == "split" and integrator != AUTO and SCHEMES[integrator].exact_rotor:
         return f"{integrator} needs rotor = 'exact': with the split rotor it would be of order 2"
     return ""
 

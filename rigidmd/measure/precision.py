@@ -178,11 +178,11 @@ def measure(
     most = max((trial.forces for trial in trials), default=0) or LOOKS * LOOKS
     reference = subject.methods[subject.reference]
     steps = 2 * -(-2 * most // reference.force_evaluations)
-    exact = _end(subject, reference, steps)
-    own_error = _gap(exact, _end(subject, reference, steps // 2))
+    exact = end_of(subject, reference, steps)
+    own_error = gap(exact, end_of(subject, reference, steps // 2))
     result = Precision(subject, trials, steps, max(gap for gap in own_error if not np.isnan(gap)), averages)
     for trial in trials:  # compiled, and looked at
-        _observe(subject, trial, exact)
+        look(subject, trial, exact)
     good = [trial for trial in trials if not trial.diverged]
     span = subject.span
     share, whole = 0.0, sum(trial.forces * (repeats + (averages or 0.0) / span) for trial in good)
@@ -231,20 +231,21 @@ def _advance(subject: Subject, engine: Engine, state: State, trial: Trial, steps
     engine.advance(state, how, dt, steps, NoThermostat(), done)
 
 
-def _end(subject: Subject, method: Method, steps: int) -> State:
+def end_of(subject: Subject, method: Method, steps: int) -> State:
+    """The end of the span in so many steps."""
     engine, state = method.engine(), subject.state.copy()
     engine.advance(state, method.how, subject.span / steps, steps, NoThermostat())
     return state
 
 
-def _gap(a: State, b: State) -> tuple[float, float]:
+def gap(a: State, b: State) -> tuple[float, float]:
     """Largest differences of rotations and positions; NaN of what a state does not have."""
     pairs = ((a.rotation, b.rotation), (a.position, b.position))
     return tuple(float(np.abs(x - y).max()) if len(x) else np.nan for x, y in pairs)
 
 
-def _observe(subject: Subject, trial: Trial, exact: State) -> None:
-    """One run with looks at the energy; all of the trial but its seconds."""
+def look(subject: Subject, trial: Trial, exact: State | None) -> None:
+    """One run with looks at what is conserved; all of the trial but its seconds. Its end is held against `exact`."""
     engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
     first = subject.energy(engine, state)
     times, energies = [0.0], [0.0]
@@ -270,7 +271,8 @@ def _observe(subject: Subject, trial: Trial, exact: State) -> None:
     trial.energy_rms = float(np.sqrt(np.mean(np.square(energies[1:]))))
     line = slope(times, energies)
     trial.energy_drift, trial.energy_drift_error = float(line.value), float(line.error)
-    trial.rotation_error, trial.position_error = _gap(state, exact)
+    if exact is not None:
+        trial.rotation_error, trial.position_error = gap(state, exact)
     if len(state.rotation):
         trial.orthogonality = orthogonality_error(state.rotation)
     if isinstance(engine, OdeEngine) and trial.tolerance is not None:

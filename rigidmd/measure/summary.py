@@ -25,11 +25,15 @@ def summarise(
     wall: float,
     computing: list[float],
     interrupted: bool,
+    choices: dict[int, str],
 ) -> dict:
-    """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps)."""
+    """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
+
+    choices : of stages that left their integrator open, what was chosen and why
+    """
     scene = system.scene
     stages = [
-        _stage(system, samples.rows, k, computing[k])
+        _stage(system, samples.rows, k, computing[k]) | {"choice": choices.get(k)}
         for k in range(len(computing))
         if any(sample.stage == k for sample in samples.rows)
     ]

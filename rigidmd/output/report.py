@@ -74,7 +74,7 @@ def _stage_title(stage: dict) -> str:
 
 
 def _stage_rows(stage: dict) -> list[tuple[str, str]]:
-    rows = []
+    rows = [("integrator", stage["choice"])] if stage["choice"] else []
     if stage["temperature_K"] is not None:
         parts = _temperatures(stage, "K")
         rows.append(("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({parts})"))

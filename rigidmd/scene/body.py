@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.dynamics.odes import FORMULATIONS, SOLVERS
-from rigidmd.dynamics.schemes import SCHEMES, Rotor, rotor_fault
+from rigidmd.dynamics.schemes import AUTO, SCHEMES, Rotor, auto_faults, rotor_fault
 from rigidmd.mechanics.inertia import impossible, shifted
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
@@ -254,9 +254,14 @@ class Run(Section):
     duration_s: Positive
     """How long"""
     timestep_s: Positive
-    """Time step; of dop853 and radau, which choose their own, where they are looked at"""
-    integrator: Literal[(*SCHEMES, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
-    """A scheme of flows, or a general solver of the textbook's equations: rk4, dop853, radau"""
+    """Time step; of dop853 and radau, which choose their own, where they are looked at; with auto, the longest"""
+    integrator: Literal[(*SCHEMES, AUTO, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
+    """A scheme of flows; auto: the one, and its step, that keep the error asked for with the fewest forces; or a
+    general solver of the textbook's equations: rk4, dop853, radau"""
+    energy_error: Positive | None = None
+    """With auto: rms error of the energy, as a fraction of the largest kinetic energy"""
+    trajectory_error: Positive | None = None
+    """With auto: largest error of Q (of X in m, of a point) at the end"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
     formulation: Literal[tuple(FORMULATIONS)] | None = None  # type: ignore[valid-type]
@@ -278,6 +283,8 @@ class Run(Section):
         tolerances = [key for key in ("relative_tolerance", "absolute_tolerance") if getattr(self, key) is not None]
         if tolerances and self.integrator not in ("dop853", "radau"):
             faults.append(f"{', '.join(tolerances)} would do nothing with {self.integrator}")
+        asked = {"energy_error": self.energy_error, "trajectory_error": self.trajectory_error}
+        faults += auto_faults(self.integrator, asked, ["rotor"] if self.rotor is not None else [])
         if not self.duration_s / self.timestep_s < MOST_STEPS:
             faults.append(f"duration_s / timestep_s is more than {MOST_STEPS:g} steps")
         elif self.duration_s < 0.5 * self.timestep_s:
@@ -285,6 +292,11 @@ class Run(Section):
         if faults:
             raise ValueError("; ".join(faults))
         return self
+
+    @property
+    def is_open(self) -> bool:
+        """Whether integrator and step are still to be chosen."""
+        return self.integrator == AUTO
 
     @property
     def steps(self) -> int:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.dynamics.schemes import SCHEMES, Rotor, Scheme, rotor_fault
+from rigidmd.dynamics.schemes import AUTO, SCHEMES, Rotor, Scheme, auto_faults, rotor_fault
 from rigidmd.molecules import Site, SiteName, available_models
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
@@ -166,8 +166,12 @@ class Stage(Section):
     """velocity_rescaling is the stochastic one of Bussi et al."""
     thermostat_time_ps: Positive = 0.1
     """Time constant of the thermostat"""
-    integrator: Literal[tuple(SCHEMES)] = "velocity_verlet"  # type: ignore[valid-type]
-    """Scheme of kicks and drifts"""
+    integrator: Literal[(*SCHEMES, AUTO)] = "velocity_verlet"  # type: ignore[valid-type]
+    """Scheme of kicks and drifts; auto: the one, and its step, that keep the error asked for with the fewest forces"""
+    energy_error_kT: Positive | None = None
+    """With auto: rms error of the energy, in kT per degree of freedom"""
+    trajectory_error: Positive | None = None
+    """With auto: largest error of Q (of X in Å, of points) at the end of the pilot run, ten radians of libration"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
 
@@ -182,6 +186,12 @@ class Stage(Section):
                 raise ValueError(f"{', '.join(idle)} would do nothing in an nve stage")
         if fault := rotor_fault(self.integrator, self.rotor):
             raise ValueError(fault)
+        decided = [
+            key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default
+        ]
+        asked = {"energy_error_kT": self.energy_error_kT, "trajectory_error": self.trajectory_error}
+        if faults := auto_faults(self.integrator, asked, decided):
+            raise ValueError("; ".join(faults))
         if not self.duration_ps * 1000 / self.timestep_fs < MOST_STEPS:
             raise ValueError(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
         if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
@@ -192,6 +202,16 @@ class Stage(Section):
     def steps(self) -> int:
         """Number of steps: the duration in steps, rounded."""
         return round(self.duration_ps * 1000 / self.timestep_fs)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether integrator and step are still to be chosen."""
+        return self.integrator == AUTO
+
+    def decided(self, integrator: str, timestep_fs: float) -> "Stage":
+        """This stage with what a pilot has chosen."""
+        none = {"energy_error_kT": None, "trajectory_error": None}
+        return self.model_copy(update={"integrator": integrator, "timestep_fs": timestep_fs} | none)
 
     @property
     def scheme(self) -> Scheme:
@@ -308,6 +328,9 @@ class MolecularScene(Scene):
         wanted = self.output.trajectory_interval_ps
         faults = []
         for k, stage in enumerate(self.stages):
+            if stage.is_open:
+                faults.append(f"output.trajectory: a .dcd file cannot follow the step of stages.{k}; use .xtc")
+                continue
             every = max(1, round(wanted * 1000 / stage.timestep_fs))
             uneven = stage.steps % every and k < len(self.stages) - 1
             if abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:

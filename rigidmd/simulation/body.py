@@ -18,6 +18,7 @@ from rigidmd.mechanics.rotor import SplitRotor
 from rigidmd.output.folder import SCENE_FILE
 from rigidmd.scene import BodyScene
 from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
+from rigidmd.simulation.subjects import decided_for_body
 
 MOTION_FILE = "motion.csv"
 
@@ -36,7 +37,11 @@ class BodySimulation(Simulation):
         self, scene: BodyScene, *arguments, applied: dict[str, Callable[[Pose], tuple]] | None = None, **options
     ):
         super().__init__(scene, *arguments, **options)
-        self.system = build_body(scene, applied)
+        self._choice = None
+        if scene.run.is_open:
+            self._say("choosing integrator and step by pilot runs")
+            self.scene, self._choice = decided_for_body(scene, applied)
+        self.system = build_body(self.scene, applied)
         self.threads = 1
         self._reset()
 
@@ -54,6 +59,15 @@ class BodySimulation(Simulation):
         self._reset()
         self._stretches = self._phases()
 
+    def _durations(self) -> list[float]:
+        return [phase.steps * phase.dt for phase in self._stretches]
+
+    def _begin(self, k: int) -> Phase:
+        if k > 0:
+            self.state.time[0] = self.system.breaks()[k - 1]
+            self.engine.change(*self.system.during(float(self.state.time[0])))
+        return self._stretches[k]
+
     def _phases(self) -> list[Phase]:
         """From break to break of what follows time as told, in steps that end there, none longer than the scene's."""
         run = self.scene.run
@@ -69,11 +83,7 @@ class BodySimulation(Simulation):
         return phases
 
     def _advance(self, k: int, steps: int, done: int) -> None:
-        phase = self._stretches[k]
-        if k > 0 and done == 0:
-            self.state.time[0] = self.system.breaks()[k - 1]
-            self.engine.change(*self.system.during(float(self.state.time[0])))
-        self.engine.advance(self.state, self.system.method, phase.dt, steps, NoThermostat(), done)
+        self.engine.advance(self.state, self.system.method, self._stretches[k].dt, steps, NoThermostat(), done)
 
     def _file_names(self) -> list[str]:
         from rigidmd.output.body_figures import FIGURES
@@ -122,6 +132,8 @@ class BodySimulation(Simulation):
             self.system, results.samples, sum(p.steps for p in self._stretches), prepared, wall, sum(computing),
             self._interrupted,
         )  # fmt: skip
+        if self._choice:
+            results.summary["notes"].insert(0, self._choice)
         if self.folder is None:
             return
         from rigidmd.output.body_figures import draw_motion

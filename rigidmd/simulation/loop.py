@@ -191,8 +191,12 @@ class Simulation(ABC):
         """Everything before the first step, compiling included."""
 
     @abstractmethod
-    def _phases(self) -> list[Phase]:
-        """The stretches of the run."""
+    def _durations(self) -> list[float]:
+        """How long the stretches of the run are, ps or s."""
+
+    @abstractmethod
+    def _begin(self, k: int) -> Phase:
+        """Make ready for stretch k, and say how it is walked."""
 
     @abstractmethod
     def _advance(self, k: int, steps: int, done: int) -> None:
@@ -218,10 +222,11 @@ class Simulation(ABC):
         """Advance through all phases; seconds of computing in each."""
         computing = []
         step, time = 0, 0.0
-        phases = self._phases()
-        with _bar(sum(phase.steps * phase.dt for phase in phases), self.time_unit, progress) as bar:
+        durations = self._durations()
+        with _bar(sum(durations), self.time_unit, progress) as bar:
             self._show(observers, Moment(self, 0, 0.0, 0), [True] * len(observers))
-            for k, phase in enumerate(phases):
+            for k in range(len(durations)):
+                phase = self._begin(k)
                 intervals = [max(1, round(observer.interval / phase.dt)) for observer in observers]
                 seconds, done = 0.0, 0
                 while done < phase.steps and not self._interrupted:

@@ -20,6 +20,7 @@ from rigidmd.output.folder import SCENE_FILE
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import WITH_VELOCITIES
 from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
+from rigidmd.simulation.subjects import choose_for_molecules
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 STREAM_THERMOSTAT = 3  # see build.system for the others
@@ -34,6 +35,7 @@ class MolecularSimulation(Simulation):
     def __init__(self, scene: MolecularScene, *arguments, **options):
         super().__init__(scene, *arguments, **options)
         self.system = build(scene)
+        self._asked = scene
         self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
         self._reset()
 
@@ -46,6 +48,7 @@ class MolecularSimulation(Simulation):
     def _reset(self) -> None:
         self.engine = Engine(self.system.model, self.system.terms)
         self.state = self.system.state.copy()
+        self.scene = self.system.scene = self._asked  # a run may have decided what it leaves open
         numba.set_num_threads(self.threads)
 
     def _file_names(self) -> list[str]:
@@ -91,9 +94,11 @@ class MolecularSimulation(Simulation):
                         ],
                     )
         for k in range(len(self.scene.stages)):
-            self.engine.advance(self.state, self.scene.stages[k].scheme, 0.0, 0, self._thermostat(k))
+            if not self.scene.stages[k].is_open:
+                self.engine.advance(self.state, self.scene.stages[k].scheme, 0.0, 0, self._thermostat(k))
         self.engine.forget()
         self._relief = relief
+        self._choices: dict[int, str] = {}
         self._thermostats = [self._thermostat(k) for k in range(len(self.scene.stages))]
 
     def _thermostat(self, k: int) -> NamedTuple:
@@ -114,8 +119,30 @@ class MolecularSimulation(Simulation):
         thermostat = self._thermostats[k]
         return float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
 
-    def _phases(self) -> list[Phase]:
-        return [Phase(stage.timestep_fs * FEMTOSECOND, stage.steps) for stage in self.scene.stages]
+    def _durations(self) -> list[float]:
+        return [stage.duration_ps for stage in self.scene.stages]
+
+    def _begin(self, k: int) -> Phase:
+        if self.scene.stages[k].is_open:
+            self._choose(k)
+        # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
+        self.engine = Engine(self.system.model, self.system.terms)
+        stage = self.scene.stages[k]
+        return Phase(stage.timestep_fs * FEMTOSECOND, stage.steps)
+
+    def _choose(self, k: int) -> None:
+        """Find integrator and step of a stage on the present state, and put them into the scene."""
+        stage = self.scene.stages[k]
+        self._say("choosing integrator and step by pilot runs")
+        integrator, timestep, reason = choose_for_molecules(self.system, self.state, stage)
+        self._choices[k] = f"{integrator} at {timestep:g} fs chosen: {reason}"
+        stages = list(self.scene.stages)
+        stages[k] = stage.decided(integrator, timestep)
+        self.scene = self.system.scene = self.scene.model_copy(update={"stages": tuple(stages)})
+        if self.folder is not None:
+            from rigidmd.output.scene_file import write_scene
+
+            write_scene(self.folder, self.scene, self.system)
 
     def _advance(self, k: int, steps: int, done: int) -> None:
         stage = self.scene.stages[k]
@@ -199,7 +226,7 @@ class MolecularSimulation(Simulation):
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
         results.summary = summarise(
             self.system, results.samples, self.state, self._relief, self.threads, prepared, wall, computing,
-            self._interrupted,
+            self._interrupted, self._choices,
         )  # fmt: skip
         if self.folder is None:
             return

@@ -1,0 +1,96 @@
+"""integrator = "auto": what is chosen keeps the error asked for, is written down, and repeats."""
+
+import numpy as np
+import pytest
+from conftest import ROOT, small_scene
+
+from rigidmd.cli import main
+from rigidmd.errors import SceneError
+from rigidmd.scene import Scene
+from rigidmd.simulation import Simulation
+
+TOP = ROOT / "systems" / "heavy_top_3.toml"
+
+
+def liquid(**last):
+    """27 waters, warmed up, then 0.3 ps of NVE as told."""
+    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5}, {"duration_ps": 0.3} | last]
+    return small_scene({"spce": 27}, 9.4, forces={"cutoff_A": 4.69, "switch_start_A": 3.0}, stages=stages,
+                       output={"trajectory": False, "log_interval_ps": 0.01, "figure": False})  # fmt: skip
+
+
+def energy_error(results):
+    """rms of the energy of the last stage, kT per degree of freedom."""
+    own = results["stage"] == 1
+    energy, kinetic = results["energy"][own], results["kinetic"][own]
+    return float(np.sqrt(np.mean((energy - energy[0]) ** 2)) / (2 * kinetic.mean()))
+
+
+def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(tmp_path):
+    results = Simulation(liquid(integrator="auto", energy_error_kT=1e-5), tmp_path / "a").run()
+    stage = results.summary["stages"][1]
+    assert stage["integrator"] != "velocity_verlet"
+    assert f"{stage['integrator']} at {stage['timestep_fs']:g} fs chosen: error" in stage["choice"]
+    assert "times fewer than velocity_verlet at" in stage["choice"]
+    assert energy_error(results) < 3e-5  # the pilot was shorter
+    # the scene that was written says what was chosen, and repeats the run to the bit
+    again = Scene.read(tmp_path / "a" / "scene.toml")
+    assert again.stages[1].integrator == stage["integrator"]
+    assert again.stages[1].timestep_fs == stage["timestep_fs"]
+    assert again.stages[1].energy_error_kT is None
+    repeated = Simulation(again).run()
+    for one, other in zip(results.state, repeated.state, strict=True):
+        assert one.tobytes() == other.tobytes()
+    assert repeated.summary["stages"][1]["choice"] is None
+
+
+def test_a_crude_error_is_kept_crudely():
+    simulation = Simulation(liquid(integrator="auto", energy_error_kT=3e-3))
+    first = simulation.run()
+    coarse = first.summary["stages"][1]
+    assert energy_error(first) < 1e-2
+    assert energy_error(first) > 1e-5
+    second = simulation.run().summary["stages"][1]  # a simulation chooses anew, and the same
+    assert (second["integrator"], second["timestep_fs"]) == (coarse["integrator"], coarse["timestep_fs"])
+
+
+@pytest.mark.parametrize("target", [1e-3, 1e-8])
+def test_the_error_of_a_top_is_what_was_asked_for(target):
+    changes = {"run.integrator": "auto", "run.trajectory_error": target, "run.timestep_s": 0.05}
+    simulation = Simulation(Scene.read(TOP, changes))
+    results = simulation.run()
+    exact = Simulation(Scene.read(TOP, {"run.integrator": "srkn_6", "run.timestep_s": 0.001})).run()
+    error = np.abs(results.state.rotation - exact.state.rotation).max()
+    assert target / 100 < error < 1.5 * target
+    assert "chosen: error" in results.summary["notes"][0]
+    assert simulation.scene.run.integrator == results.summary["integrator"] != "auto"
+
+
+def test_what_cannot_be_kept_is_said(capsys, tmp_path):
+    command = ["run", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-30", "-o", str(tmp_path)]
+    assert main(command) != 0
+    assert "no integrator keeps its error below 1e-30" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stage", "fault"),
+    [
+        ({"integrator": "auto"}, "integrator = 'auto' needs one of energy_error_kT, trajectory_error"),
+        ({"integrator": "auto", "energy_error_kT": 1e-3, "trajectory_error": 1e-3}, "needs one of"),
+        ({"energy_error_kT": 1e-3}, "energy_error_kT would do nothing without integrator = 'auto'"),
+        ({"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0}, "timestep_fs would do nothing with"),
+        ({"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"}, "rotor would do nothing with"),
+    ],
+)
+def test_contradictions_are_refused(stage, fault):
+    with pytest.raises(SceneError, match=fault):
+        liquid(**stage)
+
+
+def test_check_says_that_it_is_open(capsys):
+    assert main(["check", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-6"]) == 0
+    assert "the integrator is chosen before the run" in capsys.readouterr().out
+    water = str(ROOT / "systems" / "water.toml")
+    more = ["--set", "stages.1.integrator=auto", "--set", "stages.1.energy_error_kT=1e-4"]
+    assert main(["check", water, *more, "--set", "stages.1.timestep_fs=2.0"]) == 0
+    assert "integrator and step chosen at its start for an error of 0.0001 kT" in capsys.readouterr().out
