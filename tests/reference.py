@@ -17,6 +17,14 @@ def quintic(r, start, cutoff):
     return 1 - 10 * t**3 + 15 * t**4 - 6 * t**5
 
 
+def nonic(r, start, cutoff):
+    t = (r - start) / (cutoff - start)
+    return 1 - 126 * t**5 + 420 * t**6 - 540 * t**7 + 315 * t**8 - 70 * t**9
+
+
+SWITCHES = {"switch": quintic, "smooth_switch": nonic}
+
+
 def inverse_power(r, p, cutoff, start, name):
     """Energy of r^-p with its ending; by the definition of each ending in the manuals."""
     force = p * cutoff ** (-p - 1)
@@ -26,8 +34,8 @@ def inverse_power(r, p, cutoff, start, name):
         return r**-p - cutoff**-p
     if name == "force_shift":
         return r**-p - cutoff**-p + force * (r - cutoff)
-    if name == "switch":
-        return r**-p * (quintic(r, start, cutoff) if r > start else 1.0)
+    if name in SWITCHES:
+        return r**-p * (SWITCHES[name](r, start, cutoff) if r > start else 1.0)
     # force_switch, GROMACS manual eq. 5.30 ff.
     a = -p * ((p + 4) * cutoff - (p + 1) * start) / (cutoff ** (p + 2) * (cutoff - start) ** 2)
     b = p * ((p + 3) * cutoff - (p + 1) * start) / (cutoff ** (p + 2) * (cutoff - start) ** 3)
@@ -53,8 +61,8 @@ def reaction_field(r, cutoff, start, name, permittivity):
     slope = -1 / cutoff**2 + 2 * k * cutoff
     if name == "force_shift":
         return bare(r) - bare(cutoff) - slope * (r - cutoff)
-    if name == "switch":
-        return (bare(r) - bare(cutoff)) * (quintic(r, start, cutoff) if r > start else 1.0)
+    if name in SWITCHES:
+        return (bare(r) - bare(cutoff)) * (SWITCHES[name](r, start, cutoff) if r > start else 1.0)
     # force_switch: integrate a cubic that takes force and its derivative to zero
     curve = 2 / cutoff**3 + 2 * k
     d = cutoff - start
@@ -75,7 +83,10 @@ class Oracle:
         self.system = system
         self.edges = np.array(system.space) if np.isfinite(system.space.volume) else None
         self.cutoff = system.cutoff
-        self.start = scene.forces.switch_start_A or max(0.9 * self.cutoff, self.cutoff - 1.0)
+        usual = (
+            0.6 * self.cutoff if scene.forces.truncation == "smooth_switch" else max(0.9 * self.cutoff, self.cutoff - 1)
+        )
+        self.start = scene.forces.switch_start_A or usual
         self.forces = scene.forces
         species = [system.species[k] for k in system.model.species]
         self.charge = np.concatenate([m.charges for m in species])

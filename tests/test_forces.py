@@ -10,7 +10,7 @@ from rigidmd.dynamics.engine import Engine
 from rigidmd.forces.pairs import PairForces
 from rigidmd.mechanics.rotation import from_vector
 
-ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch"]
+ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 MIXTURES = [
     ({"spce": 12}, 13.0),
     ({"tip4p2005": 8, "nitrogen": 5, "argon": 4}, 14.0),

@@ -340,7 +340,8 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
     """Terms by name, constant energies by name, tail pressure."""
     forces = scene.forces
     index = model.species
-    start = forces.switch_start_A or max(0.9 * cutoff, cutoff - 1.0)
+    usual = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
+    start = forces.switch_start_A or usual
     terms, constants, tail_pressure = {}, {}, 0.0
     named = _named_pairs(scene, species)
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
@@ -407,8 +408,9 @@ def _set_momenta(system: System, arrangement: Arrangement) -> None:
     if scene.structure is not None and scene.structure.velocities:
         state.velocity[:] = arrangement.velocity
         state.angular_momentum_body[:] = arrangement.angular_momentum_body[: len(state.angular_momentum_body)]
-        state.velocity[~mobile(system.model)] = 0.0
-        state.angular_momentum_body[system.model.inertia[system.model.species][: len(state.rotation)] == 0] = 0.0
+        held = ~mobile(system.model)
+        state.velocity[held] = 0.0
+        state.angular_momentum_body[held[: len(state.rotation)]] = 0.0
         if remove_momentum(system.model, state.velocity):
             system.notes.append("the total momentum of the file's velocities was taken out")
         return

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.forces import pairs
-from rigidmd.forces.truncation import Name, added, ending, shape_of, switching
+from rigidmd.forces.truncation import SWITCHES, Name, added, ending, shape_of, switching
 from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
 
@@ -20,7 +20,7 @@ class ReactionField(NamedTuple):
 
     cutoff: float  # Å
     start: float  # Å, see truncation.Shape
-    switched: bool
+    switched: int
     end: np.ndarray  # (4,) see truncation.ending
     field: float  # 1/Å³
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
@@ -39,7 +39,7 @@ def reaction_field(
 
     # A switching function multiplies what is left at the cut-off, and that must be little: the energy is first shifted
     # to zero there. Unshifted, two unit charges would lose 230 kJ/mol between 8 and 9 Å.
-    end = ending("shift" if name == "switch" else name, shape, at)
+    end = ending("shift" if name in SWITCHES else name, shape, at)
     return ReactionField(*shape, end, field, charge_e * sqrt(COULOMB))
 
 
@@ -52,7 +52,7 @@ def radial(law, r2):
     w = inverse * inverse * inverse - 2 * law.field
     if r2 > law.start * law.start:
         if law.switched:
-            s, slope = switching(law.cutoff, law.start, r)
+            s, slope = switching(law.switched, law.cutoff, law.start, r)
             w = s * w - slope * u * inverse
             u = s * u
         else:

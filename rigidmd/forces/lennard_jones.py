@@ -18,7 +18,7 @@ class LennardJones(NamedTuple):
 
     cutoff: float  # Å
     start: float  # Å, see truncation.Shape
-    switched: bool
+    switched: int
     end12: np.ndarray  # (4,) see truncation.ending
     end6: np.ndarray  # (4,)
     kind: np.ndarray  # (s,) kind of each site, index into c6 and c12
@@ -76,7 +76,7 @@ def _pair(law, i, j, r2):
         if r2 > law.start * law.start:
             r = sqrt(r2)
             if law.switched:
-                s, slope = switching(law.cutoff, law.start, r)
+                s, slope = switching(law.switched, law.cutoff, law.start, r)
                 w = s * w - slope * u / r
                 u = s * u
             else:
@@ -115,7 +115,7 @@ def _lost(law: LennardJones, end: np.ndarray, p: int) -> float:
 
     def ended(r: float) -> float:
         if law.switched:
-            return (1 - switching(law.cutoff, law.start, r)[0]) * r ** (2 - p)
+            return (1 - switching(law.switched, law.cutoff, law.start, r)[0]) * r ** (2 - p)
         return -(r**2) * added(end, r - law.start)[0]
 
     if law.start < law.cutoff:

@@ -116,10 +116,11 @@ class Forces(Section):
 
     cutoff_A: Positive | None = None
     """Cut-off between sites; 9 Å in a periodic box, none without one"""
-    truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch"] = "switch"
-    """How forces end at the cut-off, Lennard-Jones and charges alike"""
+    truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
+    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order"""
     switch_start_A: Positive | None = None
-    """Where force_switch and switch begin; 1 Å before the cut-off, or at 0.9 of it if that is longer"""
+    """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
+    and smooth_switch, at 0.6 of the cut-off"""
     mixing: Literal["lorentz-berthelot", "geometric"] = "lorentz-berthelot"
     """Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = ()
@@ -135,7 +136,7 @@ class Forces(Section):
 
     @model_validator(mode="after")
     def _nothing_idle(self):
-        if self.switch_start_A is not None and self.truncation not in ("force_switch", "switch"):
+        if self.switch_start_A is not None and "switch" not in self.truncation:
             raise ValueError(f"switch_start_A would do nothing with truncation = {self.truncation!r}")
         if self.electrostatics == "none" and self.reaction_field_permittivity != inf:
             raise ValueError("reaction_field_permittivity would do nothing with electrostatics = 'none'")
