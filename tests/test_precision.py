@@ -1,6 +1,8 @@
 """`rigidmd precision`: what it measures, what it says, what it writes."""
 
 import csv
+import itertools
+import tomllib
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from conftest import ROOT, small_scene
 
 from rigidmd.cli import main
 from rigidmd.errors import SceneError
-from rigidmd.output.precision_report import advice, table_text
+from rigidmd.output.precision_report import advice, table_text, write_precision
 from rigidmd.scene import Scene
 from rigidmd.simulation.precision import precision
 
@@ -121,3 +123,97 @@ def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     assert main(command) == 2  # nothing is overwritten
     assert main([*command, "--force"]) == 0
     assert main(["precision", str(TOP), "--timesteps", "a"]) == 2
+
+
+@pytest.fixture(scope="module")
+def water():
+    stages = [
+        {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.5},
+        {"duration_ps": 1.0, "timestep_fs": 1.0},
+    ]
+    forces = {"cutoff_A": 6.0, "truncation": "smooth_switch"}
+    return small_scene({"spce": 64}, 12.42, forces=forces, stages=stages)
+
+
+def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
+    found = precision(water, ["velocity_verlet", "srkn_4"], [4.0, 1.0], span=0.02, repeats=1, averages=3.0)
+    coarse, fine = trials(found, "velocity_verlet")
+    loss = {}
+    for trial in (coarse, fine):
+        on, half, unbiased = (trial.averages[f"T_rot{kind}"][0] for kind in ("", " half-step", " unbiased"))
+        loss[trial.timestep] = unbiased - on
+        assert half - on == pytest.approx(1.5 * (unbiased - on))
+    # of the order of (omega dt)²/6 with the 100 rad/ps of librations, and quadratic in the step
+    assert 3 < loss[4.0] < 20
+    assert loss[4.0] / loss[1.0] == pytest.approx(16, rel=0.2)
+    gap, error = coarse.averages["T_rot - T_trans unbiased"]
+    assert abs(gap) < 4 * error
+    assert "T_rot unbiased" not in trials(found, "srkn_4")[0].averages
+    assert found.most_exact.integrator == "srkn_4"
+    assert found.most_exact.timestep == pytest.approx(1.0)
+    said = table_text(found)
+    assert "T_rot - T_trans on the steps (K)" in said
+    assert "(held against)" in said
+    assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(advice(found))
+    written = write_precision(tmp_path, found, "a command")
+    rows = list(csv.DictReader((tmp_path / "precision_averages.csv").open()))
+    assert [path.name for path in written][-1] == "precision_averages.csv"
+    assert float(rows[0]["T_rot unbiased (K)"]) == pytest.approx(coarse.averages["T_rot unbiased"][0])
+    assert "Averages over 3 ps" in (tmp_path / "precision.html").read_text()
+
+
+def test_comparators_stand_beside_the_schemes_and_fail_in_words():
+    upright = tomllib.loads(TOP.read_text()) | {"start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}}
+    names = ["velocity_verlet", "rk4", "rk4_quaternion", "rk4_euler_angles", "dop853"]
+    found = precision(Scene.from_dict(upright), names, [1e-3, 5e-4], span=0.2, repeats=1)
+    assert {trial.integrator for trial in found.trials if trial.diverged} == {"rk4_euler_angles"}
+    assert "rk4_euler_angles: the Euler angles became singular" in "\n".join(advice(found))
+    drift = {trial.integrator: trial.orthogonality for trial in found.trials if not trial.diverged}
+    assert drift["velocity_verlet"] < 1e-13
+    assert drift["rk4"] > 1e-11  # nothing keeps Q a rotation there
+    adaptive = trials(found, "dop853")
+    assert [trial.tolerance for trial in adaptive] == sorted((t.tolerance for t in adaptive), reverse=True)
+    assert all(b.forces > a.forces and b.timestep < a.timestep for a, b in itertools.pairwise(adaptive))
+    assert adaptive[-1].rotation_error < 1e-8
+
+
+def test_what_else_is_kept_is_shown(top):
+    verlet = trials(top, "velocity_verlet")[0]
+    assert set(verlet.kept) == {"L_z", "L_3"}
+    assert max(verlet.kept.values()) < 1e-12
+    assert "error of L_z" in table_text(top)
+    dimer = precision(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["velocity_verlet"], [1.0], repeats=1)
+    assert set(dimer.trials[0].kept) == {"momentum", "L"}
+    assert max(dimer.trials[0].kept.values()) < 1e-11
+
+
+@pytest.mark.slow
+def test_orders_cost_and_temperatures_of_512_waters():
+    """Slopes over a decade, the best scheme at 1e-5 kJ/mol, and both temperatures at 2 and 4 fs."""
+    changes = {
+        "molecules.0.count": 512, "forces.truncation": "smooth_switch", "forces.switch_start_A": 5.0,
+        "stages.0.duration_ps": 10.0,
+    }  # fmt: skip
+    scene = Scene.read(ROOT / "systems" / "water.toml", changes)
+    found = precision(scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1)
+    for name, order, margin in (("velocity_verlet", 2, 0.1), ("chin_4a", 4, 0.2), ("srkn_4", 4, 0.2)):
+        own = [trial for trial in trials(found, name) if trial.rotation_error < 0.01]
+        a, b = own[0], own[-1]
+        slope = np.log(a.rotation_error / b.rotation_error) / np.log(a.timestep / b.timestep)
+        assert a.rotation_error / b.rotation_error > 10
+        assert slope == pytest.approx(order, abs=margin)
+    unit = found.subject.energy_size / 100 / 512  # of the energy error, in kJ/mol per molecule
+    for trial in found.trials:
+        trial.seconds = [float(trial.forces)]  # in forces, which no noise can touch
+    target = 1e-5 / unit
+    verlet, _ = found.time_for("velocity_verlet", "energy_rms", target)
+    best = min(at[0] for name in ("two_stage", "chin_4a", "srkn_4", "srkn_6")
+               if (at := found.time_for(name, "energy_rms", target)))  # fmt: skip
+    assert verlet / best > 2
+    found = precision(scene, ["velocity_verlet"], [4.0, 2.0], span=0.02, repeats=1, averages=40.0)
+    for trial in found.trials:
+        on, on_error = trial.averages["T_rot - T_trans"]
+        unbiased, error = trial.averages["T_rot - T_trans unbiased"]
+        assert abs(unbiased) < 2.5 * error
+        if trial.timestep == pytest.approx(4.0):
+            assert on < -3 * on_error
