@@ -21,8 +21,12 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
+from llvmlite import ir
 from numba import types
-from numba.extending import overload
+from numba.core import cgutils
+from numba.core.codegen import get_host_cpu_features
+from numba.core.imputils import impl_ret_borrowed
+from numba.extending import intrinsic, models, overload, register_model
 
 PACKAGE = Path(__file__).parent
 UNUSED_AFTER_DAYS = 30.0
@@ -32,9 +36,20 @@ UNUSED_AFTER_DAYS = 30.0
 PAIR_FLAGS = {"reassoc", "contract", "nsz", "arcp"}
 
 
+def _simd_bits() -> int:
+    """Bits of the vectors that pair loops use: the widest that this machine computes with."""
+    if named := os.environ.get("RIGIDMD_SIMD_BITS"):
+        return int(named)
+    features = get_host_cpu_features().split(",")
+    return 512 if "+avx512f" in features else 256 if "+avx2" in features else 128
+
+
+SIMD_BITS = _simd_bits()
+
+
 def source_digest() -> str:
-    """Hexadecimal digest of every source file of the package and of Numba's version."""
-    digest = hashlib.sha256(numba.__version__.encode())
+    """Hexadecimal digest of every source file of the package, of Numba's version and of the width of vectors."""
+    digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS}".encode())
     for path in sorted(PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(PACKAGE).as_posix().encode())
         digest.update(path.read_bytes())
@@ -99,3 +114,42 @@ def _options(fastmath, inline: bool) -> dict:
 def is_a(numba_type, named_tuple) -> bool:
     """Whether a Numba type is that of the given NamedTuple class; what overloads choose by."""
     return isinstance(numba_type, types.BaseNamedTuple) and numba_type.instance_class is named_tuple
+
+
+class Parcel(types.Type):
+    """Numba type of the address of a tuple: how arguments of any type get to the threads of a `prange`.
+
+    By themselves only arrays and tuples of arrays do, each with its shape and strides copied on the way.
+    """
+
+    def __init__(self, content):
+        self.content = content
+        super().__init__(f"parcel({content})")
+
+
+@register_model(Parcel)
+class _ParcelModel(models.PrimitiveModel):
+    def __init__(self, manager, parcel):
+        super().__init__(manager, parcel, ir.IntType(8).as_pointer())
+
+
+@intrinsic
+def packed(typing, content):
+    """The parcel of a tuple, to be opened before the calling function returns."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), ir.IntType(8).as_pointer())
+
+    return Parcel(content)(content), emit
+
+
+@intrinsic
+def opened(typing, parcel):
+    """The tuple in a parcel."""
+
+    def emit(context, builder, signature, arguments):
+        kind = context.get_value_type(parcel.content).as_pointer()
+        content = builder.load(builder.bitcast(arguments[0], kind))
+        return impl_ret_borrowed(context, builder, parcel.content, content)
+
+    return parcel.content(parcel), emit

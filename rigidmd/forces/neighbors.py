@@ -1,193 +1,254 @@
-"""Neighbour lists: the pairs of sites of one law that may lie inside its cut-off.
+"""Neighbour lists: for each site of one law the clusters that may hold a site inside its cut-off.
 
-Built from cells in O(N), with a skin; used until any site has moved more than half the skin since, whether its body
-shifted or turned. That is checked at every force evaluation, before the list is used, so no pair is ever missed.
+A list is good until any site has moved more than half the skin since it was built, whether its body shifted or turned.
+That is checked at every force evaluation, before the list is used, so no pair is ever missed. In each row the clusters
+stand in shells by their distance, and what sites have moved so far says how many shells can matter: a new list is
+worked through as if it had no skin.
 
-The list is cut into a fixed number of blocks of sites. Each block has its own room, filled by whichever thread takes
-it, so the list and everything summed from it has the same bits for any number of threads. Each pair stands once: (i, j)
-in the row of the smaller index if i + j is odd, else of the larger, which makes all rows about equally long.
+Each pair of clusters stands in one of its two rows: that of the one behind, clusters being thought of as a ring. The
+list is cut into blocks of rows, filled by whichever thread takes them, so the list and everything summed from it has the
+same bits for any number of threads.
 """
 
-from math import ceil, floor, inf
+from math import ceil, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numba import prange
 
-from rigidmd.forces.space import Space, nearest_image, wrap_index
+from rigidmd.forces.boxes import box_tree, within_reach
+from rigidmd.forces.clusters import Clusters, clusters_of, follow, sort_into_clusters
+from rigidmd.forces.lanes import bits, larger, load, load_beside, lowest_bit, smallest, width_of
+from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
-from rigidmd.jit import kernel
+from rigidmd.jit import PAIR_FLAGS, kernel, opened, packed
 
-BLOCKS = 16  # enough for 16 threads; every block adds one array of site forces
-SITES_PER_BLOCK = 32  # small systems get fewer blocks, the smallest one, and then no thread is started
-
-LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its cell a site is
+SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
+LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
+ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
 
 class PairList(NamedTuple):
-    """Pairs of sites of different molecules closer than `radius` when the list was built."""
+    """Rows of clusters for the sites of one law.
 
-    radius: float  # cut-off + skin, Å
+    An entry is 32 * cluster + image, the image one of 27 (-1, 0, 1 boxes along x, y, z).
+    """
+
+    cutoff: float  # Å
     skin: float  # Å
-    molecule: np.ndarray  # (s,) pairs inside one molecule are left out
-    bounds: np.ndarray  # (blocks + 1,) block b holds rows of sites bounds[b] ... bounds[b + 1] - 1
-    start: np.ndarray  # (s,) row of site i: partner[b, start[i]:stop[i]]
-    stop: np.ndarray  # (s,)
-    partner: np.ndarray  # (blocks, capacity) int32
-    needed: np.ndarray  # (blocks,) room the last build asked for
-    reference: np.ndarray  # (s, 3) site positions of the last build
-    counters: np.ndarray  # (2,) usable (0 or 1); builds so far
+    group: np.ndarray  # (s,) pairs inside one group are left out
+    clusters: Clusters
+    shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
+    row: np.ndarray  # (slots, SHELLS + 1) shell k of slot i: entries[b, row[i, k]:row[i, k + 1]]
+    entries: np.ndarray  # (blocks, capacity) int32
+    special: np.ndarray  # (slots, 2) entries with a mask: masked[b, special[i, 0]:special[i, 1]]
+    masked: np.ndarray  # (blocks, capacity, 2) entry, and as bits the lanes that count
+    needed: np.ndarray  # (blocks, 3) room the last build asked for: entries, masked entries, window
+    counters: np.ndarray  # (3,) usable (0 or 1); builds so far; shells that matter now
 
 
-def empty_list(space: Space, molecule: np.ndarray, cutoff: float, skin: float) -> PairList:
-    """A list that will be built at its first use, with room for about what a uniform density needs."""
-    s = len(molecule)
-    blocks = max(1, min(BLOCKS, s // SITES_PER_BLOCK))
-    bounds = np.linspace(0, s, blocks + 1).astype(np.int64)
-    radius = cutoff + skin if cutoff < inf else inf
-    partners = s if space.volume == inf else min(s, s / space.volume * 4 / 3 * np.pi * radius**3)
-    capacity = int(1.2 * np.diff(bounds).max() * 0.5 * partners) + 16
+def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtype: type) -> PairList:
+    """A list that will be built at its first use, which finds out how much room it needs."""
+    clusters = clusters_of(len(group), dtype)
+    blocks, slots = len(clusters.moved2), len(clusters.order)
     return PairList(
-        radius=radius,
-        skin=skin,
-        molecule=molecule,
-        bounds=bounds,
-        start=np.zeros(s, np.int64),
-        stop=np.zeros(s, np.int64),
-        partner=np.empty((blocks, capacity), np.int32),
-        needed=np.zeros(blocks, np.int64),
-        reference=np.zeros((s, 3)),
-        counters=np.zeros(2, np.int64),
+        cutoff=cutoff,
+        skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
+        group=group,
+        clusters=clusters,
+        shift=np.zeros(4 * 27),
+        row=np.zeros((slots, SHELLS + 1), np.int32),
+        entries=np.empty((blocks, 0), np.int32),
+        special=np.zeros((slots, 2), np.int32),
+        masked=np.empty((blocks, 0, 2), np.int32),
+        needed=np.zeros((blocks, 3), np.int64),
+        counters=np.zeros(3, np.int64),
     )
 
 
 def enlarged(pairs: PairList) -> PairList:
     """The same list with the room its last build asked for, and a tenth more."""
-    return pairs._replace(partner=np.empty((len(pairs.partner), int(1.1 * pairs.needed.max()) + 16), np.int32))
-
-
-@kernel
-def is_usable(pairs, position):
-    """Whether no site has moved more than half the skin since the last build; False too if one is not a number."""
-    if pairs.counters[0] == 0:
-        return False
-    limit = (0.5 * pairs.skin) ** 2
-    for i in range(len(position)):
-        d2 = 0.0
-        for k in range(3):
-            d2 += (position[i, k] - pairs.reference[i, k]) ** 2
-        if not d2 <= limit:
-            return False
-    return True
+    entries, masked, _ = (int(1.1 * n) + 16 for n in pairs.needed.max(axis=0))
+    blocks = len(pairs.needed)
+    return pairs._replace(
+        entries=np.empty((blocks, entries), np.int32), masked=np.empty((blocks, masked, 2), np.int32)
+    )
 
 
 @kernel
 def update_list(pairs, space, position):
-    """Build the list anew if it is no longer good for these site positions (s, 3). A status code."""
-    if is_usable(pairs, position):
-        return OK
+    """Bring clusters to the site positions (s, 3), and build the list anew if it is no longer good. A status code."""
+    if pairs.counters[0] == 1:
+        moved2 = follow(pairs.clusters, position, (0.5 * pairs.skin) ** 2)
+        if moved2 < inf:
+            pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)
+            return OK
     pairs.counters[0] = 0
+    radius = pairs.cutoff + pairs.skin
     for x in position.flat:
-        if not abs(x) < LOST * pairs.radius:
+        if not abs(x) < LOST * radius:
             return NOT_FINITE
-    origin, size, shape, reach = _grid(space, position, pairs.radius)
-    cell, cell_start, order = _sort_into_cells(space, position, origin, size, shape)
-    _fill(pairs, space, position, cell, cell_start, order, shape, reach)
-    if pairs.needed.max() > pairs.partner.shape[1]:
+    sort_into_clusters(pairs.clusters, space, position, pairs.group)
+    for image in range(27):
+        for k, length in enumerate((space.x, space.y, space.z)):
+            boxes = image // 3 ** (2 - k) % 3 - 1
+            pairs.shift[4 * image + k] = boxes * length if boxes != 0 else 0.0
+    tree = box_tree(pairs.clusters)
+    if len(pairs.needed) == 1:
+        _fill_block(pairs, space, tree, 0)
+    else:
+        _fill_threaded(packed((pairs, space, tree)), len(pairs.needed))
+    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
         return LIST_FULL
-    pairs.reference[:] = position
+    pairs.counters[2] = 1
     pairs.counters[0] = 1
     pairs.counters[1] += 1
     return OK
 
 
-@kernel
-def _grid(space, position, radius):
-    """Cells about half the list radius wide, no more than about eight for each site: origin, size, shape, reach."""
-    origin = np.zeros(3)
-    size = np.zeros(3)
-    shape = np.ones(3, np.int64)
-    reach = np.zeros(3, np.int64)
-    most = 2 * ceil(len(position) ** (1 / 3))
+@kernel(parallel=True)
+def _fill_threaded(parcel, blocks):
+    for block in prange(blocks):
+        _fill_block(*opened(parcel), block)
+
+
+@kernel(fastmath=PAIR_FLAGS)
+def _fill_block(pairs, space, tree, block):
+    """Rows of one block. Entries beyond the room are counted, not stored."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    everyone = (1 << width) - 1
+    count = len(clusters.origin) // 4
+    radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
+    bounds2 = np.empty(SHELLS)
+    for k in range(SHELLS):
+        bounds2[k] = ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2
+    entries, masked = pairs.entries[block], pairs.masked[block]
+    filled = filled_masked = window = 0
+    room = min(27 * count, 1024)
+    found, candidate = np.empty(room, np.int64), np.empty(room, np.int64)
+    near = np.empty((6, room + width), clusters.local.dtype)
+    apart = np.empty((3, room), clusters.local.dtype)
+    row, shell = np.empty(room, np.int64), np.empty(room, np.int64)
+    stack = np.empty((len(tree.level), 2), np.int64)
+    low, high = np.empty(3), np.empty(3)
+    filler = len(clusters.order) - len(pairs.group)  # slots of the last cluster that hold no site
+    for c in range(pairs.clusters.bounds[block], pairs.clusters.bounds[block + 1]):
+        candidates = 0
+        for image in range(27):
+            if not _reaches(space, tree, c, image, radius):
+                continue
+            for k in range(3):
+                low[k] = tree.low[k, c] - pairs.shift[4 * image + k]
+                high[k] = tree.high[k, c] - pairs.shift[4 * image + k]
+            hits = within_reach(tree, low, high, radius * radius, stack, found, 0)
+            if hits > len(found):
+                found = np.empty(2 * hits, np.int64)
+                hits = within_reach(tree, low, high, radius * radius, stack, found, 0)
+            if candidates + hits > len(candidate):
+                grown = 2 * (candidates + hits)
+                candidate = _copied(candidate, np.empty(grown, np.int64))
+                near = np.empty((6, grown + width), clusters.local.dtype)
+                apart = np.empty((3, grown), clusters.local.dtype)
+                row, shell = np.empty(grown, np.int64), np.empty(grown, np.int64)
+            for k in range(hits):
+                ahead = found[k] - c
+                if ahead < 0:
+                    ahead += count
+                if 2 * ahead < count or 2 * ahead == count and c < found[k]:
+                    candidate[candidates] = 32 * found[k] + image
+                    candidates += 1
+        for n in range(candidates):
+            other, image = candidate[n] >> 5, candidate[n] & 31
+            for k in range(3):
+                offset = pairs.shift[4 * image + k] - clusters.origin[4 * c + k]
+                near[k, n] = tree.low[k, other] + offset
+                near[3 + k, n] = tree.high[k, other] + offset
+                apart[k, n] = -offset - clusters.origin[4 * other + k]
+        for own in range(width):
+            i = width * c + own
+            first = min(filled, len(entries))
+            special = min(filled_masked, len(masked))
+            in_row = 0
+            if i < len(pairs.group):
+                x = clusters.local[3 * width * c + own]
+                y = clusters.local[3 * width * c + own + width]
+                z = clusters.local[3 * width * c + own + 2 * width]
+                for n0 in range(0, candidates, width):
+                    dx = larger(larger(load(near[0], n0) - x, x - load(near[3], n0)), 0.0)
+                    dy = larger(larger(load(near[1], n0) - y, y - load(near[4], n0)), 0.0)
+                    dz = larger(larger(load(near[2], n0) - z, z - load(near[5], n0)), 0.0)
+                    close = bits(dx * dx + dy * dy + dz * dz < radius * radius)
+                    if candidates - n0 < width:
+                        close &= (1 << (candidates - n0)) - 1
+                    while close != 0:
+                        n = n0 + lowest_bit(close)
+                        close &= close - 1
+                        other = candidate[n] >> 5
+                        at = 3 * width * other
+                        dx = x + apart[0, n] - load(clusters.local, at)
+                        dy = y + apart[1, n] - load(clusters.local, at + width)
+                        dz = z + apart[2, n] - load(clusters.local, at + 2 * width)
+                        r2 = dx * dx + dy * dy + dz * dz
+                        inside = bits(r2 < radius * radius)
+                        if inside == 0:
+                            continue
+                        same = load_beside(clusters.group, width * other, clusters.local) == clusters.group[i]
+                        left_out = bits(same)
+                        if other == c:
+                            left_out |= (1 << (own + 1)) - 1
+                        if other == count - 1:
+                            left_out |= everyone ^ (everyone >> filler)
+                        if left_out == 0:
+                            row[in_row] = candidate[n]
+                            m = smallest(r2)
+                            k = 0
+                            while k < SHELLS - 1 and m > bounds2[k]:
+                                k += 1
+                            shell[in_row] = k
+                            in_row += 1
+                        elif inside & ~left_out:
+                            if filled_masked < len(masked):
+                                masked[filled_masked, 0] = candidate[n]
+                                masked[filled_masked, 1] = everyone & ~left_out
+                            filled_masked += 1
+                        else:
+                            continue
+                        ahead = other - pairs.clusters.bounds[block]
+                        window = max(window, ahead + count if ahead < 0 else ahead)
+            pairs.special[i, 0] = special
+            pairs.special[i, 1] = min(filled_masked, len(masked))
+            pairs.row[i, 0] = first
+            for k in range(SHELLS):
+                for n in range(in_row):
+                    if shell[n] == k:
+                        if filled < len(entries):
+                            entries[filled] = row[n]
+                        filled += 1
+                pairs.row[i, k + 1] = min(filled, len(entries))
+    pairs.needed[block, 0] = filled
+    pairs.needed[block, 1] = filled_masked
+    pairs.needed[block, 2] = window + 1
+
+
+@kernel(inline=True)
+def _copied(source, target):
+    target[: len(source)] = source
+    return target
+
+
+@kernel(inline=True)
+def _reaches(space, tree, c, image, radius):
+    """Whether a cluster, moved by an image, can come near anything at all."""
+    root = tree.level[-2]
     lengths = (space.x, space.y, space.z)
     for k in range(3):
-        length = lengths[k]
-        if length == inf:
-            origin[k] = position[:, k].min()
-            length = position[:, k].max() - origin[k]
-        shape[k] = max(1, int(min(float(most), floor(2 * length / radius))))
-        size[k] = length / shape[k]
-        reach[k] = shape[k] if radius == inf or size[k] == 0 else int(min(float(shape[k]), ceil(radius / size[k])))
-    return origin, size, shape, reach
-
-
-@kernel
-def _sort_into_cells(space, position, origin, size, shape):
-    """Counting sort: cell (s, 3) of each site; the sites of cell c are order[cell_start[c]:cell_start[c + 1]]."""
-    cell = np.empty((len(position), 3), np.int64)
-    flat = np.empty(len(position), np.int64)
-    cell_start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
-    lengths = (space.x, space.y, space.z)
-    for i in range(len(position)):
-        for k in range(3):
-            x = position[i, k] - origin[k]
-            if lengths[k] < inf:
-                x -= lengths[k] * floor(x / lengths[k])
-            cell[i, k] = min(shape[k] - 1, int(x / size[k])) if size[k] > 0 else 0
-        flat[i] = (cell[i, 0] * shape[1] + cell[i, 1]) * shape[2] + cell[i, 2]
-        cell_start[flat[i] + 1] += 1
-    cell_start[:] = np.cumsum(cell_start)
-    filled = cell_start[:-1].copy()
-    order = np.empty(len(position), np.int64)
-    for i in range(len(position)):
-        order[filled[flat[i]]] = i
-        filled[flat[i]] += 1
-    return cell, cell_start, order
-
-
-@kernel(parallel=True)
-def _fill(pairs, space, position, cell, cell_start, order, shape, reach):
-    for block in prange(len(pairs.needed)):
-        _fill_block(pairs, space, position, cell, cell_start, order, shape, reach, block)
-
-
-@kernel
-def _fill_block(pairs, space, position, cell, cell_start, order, shape, reach, block):
-    """Rows of one block. Pairs beyond the room are counted, not stored."""
-    partner = pairs.partner[block]
-    radius2 = pairs.radius**2
-    count = 0
-    low = np.empty(3, np.int64)
-    high = np.empty(3, np.int64)
-    for i in range(pairs.bounds[block], pairs.bounds[block + 1]):
-        pairs.start[i] = min(count, len(partner))
-        for k in range(3):
-            # With few cells the neighbourhood would meet itself round the box: visit each cell once.
-            every = 2 * reach[k] + 1 >= shape[k]
-            low[k] = 0 if every else cell[i, k] - reach[k]
-            high[k] = shape[k] - 1 if every else cell[i, k] + reach[k]
-        for cx in range(low[0], high[0] + 1):
-            x = wrap_index(space, cx, shape[0])
-            for cy in range(low[1], high[1] + 1):
-                y = wrap_index(space, cy, shape[1])
-                for cz in range(low[2], high[2] + 1):
-                    z = wrap_index(space, cz, shape[2])
-                    if x < 0 or y < 0 or z < 0:
-                        continue
-                    c = (x * shape[1] + y) * shape[2] + z
-                    for slot in range(cell_start[c], cell_start[c + 1]):
-                        j = order[slot]
-                        if (j > i) != ((i + j) % 2 == 1) or pairs.molecule[i] == pairs.molecule[j]:
-                            continue
-                        dx, dy, dz = nearest_image(
-                            space,
-                            position[i, 0] - position[j, 0],
-                            position[i, 1] - position[j, 1],
-                            position[i, 2] - position[j, 2],
-                        )
-                        if dx * dx + dy * dy + dz * dz <= radius2:
-                            if count < len(partner):
-                                partner[count] = j
-                            count += 1
-        pairs.stop[i] = min(count, len(partner))
-    pairs.needed[block] = count
+        boxes = image // 3 ** (2 - k) % 3 - 1
+        if boxes != 0:
+            if lengths[k] == inf:
+                return False
+            low = tree.low[k, root:].min()
+            high = tree.high[k, root:].max()
+            if tree.low[k, c] - boxes * lengths[k] > high + radius or tree.high[k, c] - boxes * lengths[k] < low - radius:
+                return False
+    return True

@@ -1,7 +1,8 @@
 """Forces between pairs of sites: the one loop for every such law.
 
-A law says only what two sites at a distance do: an `@implements(pair)` for its NamedTuple. This loop finds the pairs,
-takes the nearest image, sums energies, virial and forces, and hands the forces to the bodies.
+A law says only what one site and a vector of others at their distances do: an `@implements(pair)` for its NamedTuple,
+and how its numbers for each site follow the sites into another order (`arrange`). This loop finds the pairs, takes the
+images, sums energies, virial and forces, and hands the forces to the bodies.
 """
 
 from typing import NamedTuple
@@ -10,40 +11,66 @@ import numpy as np
 from numba import prange
 
 from rigidmd.forces import terms
+from rigidmd.forces.lanes import (
+    double, fill, four, lane, load, load_beside, load_four, mask_of, narrowed, select, store, total, width_of,
+)  # fmt: skip
 from rigidmd.forces.neighbors import PairList, empty_list, enlarged, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.space import Space, nearest_image
-from rigidmd.forces.terms import OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.forces.space import Space
+from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
+from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel, opened, packed
+
+PRECISIONS = {"double": np.float64, "mixed": np.float32}
 
 
 class PairForces(NamedTuple):
     """A pair law, the sites that take part in it, and the work arrays to evaluate it."""
 
-    law: NamedTuple
+    law: NamedTuple  # in the order of the sites
+    arranged: NamedTuple  # what the loop reads: numbers for each site in the order of slots, in the precision of lanes
     space: Space
     sites: BodySites | CentralSites
     pairs: PairList
     position: np.ndarray  # (s, 3) lab frame
-    force: np.ndarray  # (blocks, s, 3) lab frame; blocks are summed in order
+    force: np.ndarray  # (s, 3) lab frame
+    own: np.ndarray  # (3 slots,) what its own row does to each site, stored as Clusters.local
+    others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
 
 
-def pair_forces(law: NamedTuple, space: Space, sites: BodySites | CentralSites, skin: float) -> PairForces:
+def pair_forces(
+    law: NamedTuple, space: Space, sites: BodySites | CentralSites, skin: float, precision: str = "double"
+) -> PairForces:
     """The term for a law with a `cutoff`; its neighbour list is built at the first use."""
-    s = len(sites.molecule)
-    pairs = empty_list(space, sites.molecule, law.cutoff, skin)
-    blocks = len(pairs.needed)
+    dtype = PRECISIONS[precision]
+    pairs = empty_list(space, sites.molecule, law.cutoff, skin, dtype)
+    blocks, slots = len(pairs.needed), len(pairs.clusters.order)
     return PairForces(
-        law, space, sites, pairs, np.zeros((s, 3)), np.zeros((blocks, s, 3)), np.zeros((blocks, TALLY_SIZE))
+        law=law,
+        arranged=law.room(slots, dtype),
+        space=space,
+        sites=sites,
+        pairs=pairs,
+        position=np.zeros((len(sites.molecule), 3)),
+        force=np.zeros((len(sites.molecule), 3)),
+        own=np.zeros(3 * slots),
+        others=np.zeros((blocks, 0), dtype),
+        tallies=np.zeros((blocks, TALLY_SIZE)),
     )
 
 
 def with_room(term: NamedTuple) -> NamedTuple:
     """The term with as much room in its neighbour list as the last build asked for; other terms as they are."""
-    if isinstance(term, PairForces) and term.pairs.needed.max(initial=0) > term.pairs.partner.shape[1]:
-        return term._replace(pairs=enlarged(term.pairs))
-    return term
+    if not isinstance(term, PairForces):
+        return term
+    pairs, others = term.pairs, term.others
+    entries, masked, window = pairs.needed.max(axis=0)
+    if entries > pairs.entries.shape[1] or masked > pairs.masked.shape[1]:
+        pairs = enlarged(pairs)
+    cluster = len(pairs.clusters.local) // (len(pairs.clusters.origin) // 4)
+    if window * cluster > others.shape[1]:
+        others = np.zeros((len(others), int(1.1 * window + 1) * cluster), others.dtype)
+    return term._replace(pairs=pairs, others=others)
 
 
 def forget_list(term: NamedTuple) -> None:
@@ -53,8 +80,16 @@ def forget_list(term: NamedTuple) -> None:
 
 
 def pair(law, i, j, r2):
-    """(energy, force/r) of sites i and j of a law at squared distance r2 below cutoff²; force > 0 repels."""
+    """(energy, force/r) of the site in slot i and those in slots j, j + 1, ... at squared distances r2, as vectors.
+
+    Below cutoff² only; force > 0 repels.
+    """
     raise TypeError(f"{type(law).__name__} is no pair law, or this was called outside compiled code")
+
+
+def arrange(law, arranged, order):
+    """Fill the numbers that an arranged law has for each slot from those of the sites that are there now."""
+    raise TypeError("compiled code only")
 
 
 @implements(terms.add_forces)
@@ -64,13 +99,20 @@ def _add_pair_forces(term, state, load, tally):
 
     def add_pair_forces(term, state, load, tally):
         place_sites(term.sites, state, term.position)
+        builds = term.pairs.counters[1]
         status = update_list(term.pairs, term.space, term.position)
         if status != OK:
             return status
+        clusters = term.pairs.clusters
+        if builds != term.pairs.counters[1]:
+            arrange(term.law, term.arranged, clusters.order)
+        if term.pairs.needed[:, 2].max() * 3 * width_of(clusters.local) > term.others.shape[1]:
+            term.pairs.counters[0] = 0
+            return LIST_FULL
         if tally is None:
-            site_forces(term.law, term.space, term.pairs, term.position, term.force, None)
+            site_forces(term.arranged, term.pairs, term.own, term.others, None, term.force)
         else:
-            site_forces(term.law, term.space, term.pairs, term.position, term.force, term.tallies)
+            site_forces(term.arranged, term.pairs, term.own, term.others, term.tallies, term.force)
             for block in range(len(term.tallies)):
                 for k in range(len(tally)):
                     tally[k] += term.tallies[block, k]
@@ -82,58 +124,114 @@ def _add_pair_forces(term, state, load, tally):
 
 
 @kernel
-def site_forces(law, space, pairs, position, force, tallies):
-    """Forces on sites into force (blocks, s, 3); energy and site virial of each block into tallies unless None."""
-    if len(force) == 1:
-        _block_forces(law, space, pairs, position, force, tallies, 0)
+def site_forces(law, pairs, own, others, tallies, force):
+    """Forces on sites into force (s, 3); energy and site virial of each block into tallies unless None."""
+    if len(others) == 1:
+        _block_forces(law, pairs, own, others, tallies, 0)
+        _gather_block(pairs, own, others, force, 0)
     else:
-        _site_forces_threaded(law, space, pairs, position, force, tallies)
+        _forces_threaded(packed((law, pairs, own, others, tallies)), len(others))
+        _gather_threaded(packed((pairs, own, others, force)), len(others))
 
 
 @kernel(parallel=True)
-def _site_forces_threaded(law, space, pairs, position, force, tallies):
-    for block in prange(len(force)):
-        _block_forces(law, space, pairs, position, force, tallies, block)
+def _forces_threaded(parcel, blocks):
+    for block in prange(blocks):
+        _block_forces(*opened(parcel), block)
+
+
+@kernel(parallel=True)
+def _gather_threaded(parcel, blocks):
+    for block in prange(blocks):
+        _gather_block(*opened(parcel), block)
 
 
 @kernel(fastmath=PAIR_FLAGS)
-def _block_forces(law, space, pairs, position, force, tallies, block):
-    partner = pairs.partner[block]
-    f = force[block]
-    f[:] = 0.0
-    cutoff2 = law.cutoff * law.cutoff
-    energy = xx = xy = xz = yy = yz = zz = 0.0
-    for i in range(pairs.bounds[block], pairs.bounds[block + 1]):
-        x = position[i, 0]
-        y = position[i, 1]
-        z = position[i, 2]
-        fx = fy = fz = 0.0
-        for slot in range(pairs.start[i], pairs.stop[i]):
-            j = partner[slot]
-            dx, dy, dz = nearest_image(space, x - position[j, 0], y - position[j, 1], z - position[j, 2])
-            r2 = dx * dx + dy * dy + dz * dz
-            if r2 < cutoff2:
-                u, w = pair(law, i, j, r2)
-                gx = w * dx
-                gy = w * dy
-                gz = w * dz
-                fx += gx
-                fy += gy
-                fz += gz
-                f[j, 0] -= gx
-                f[j, 1] -= gy
-                f[j, 2] -= gz
-                if tallies is not None:
-                    energy += u
-                    xx += gx * dx
-                    xy += gx * dy
-                    xz += gx * dz
-                    yy += gy * dy
-                    yz += gy * dz
-                    zz += gz * dz
-        f[i, 0] += fx
-        f[i, 1] += fy
-        f[i, 2] += fz
+def _block_forces(law, pairs, own, others, tallies, block):
+    """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    others = others[block]
+    others[: 3 * width * pairs.needed[block, 2]] = 0.0
     if tallies is not None:
-        for k, value in enumerate((energy, xx, xy, xz, xy, yy, yz, xz, yz, zz)):
-            tallies[block, k] = value
+        tallies[block] = 0.0
+    entries = pairs.entries[block]
+    masked = pairs.masked[block]
+    zero = fill(0.0, clusters.local)
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for i in range(width * c, width * (c + 1)):
+            at = 2 * width * c + i
+            here = load_four(clusters.origin, 4 * c) + four(
+                clusters.local[at], clusters.local[at + width], clusters.local[at + 2 * width]
+            )
+            sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+            for n in range(pairs.special[i, 0], pairs.special[i, 1]):
+                sums = _meet(law, pairs, block, i, here, masked[n, 0], masked[n, 1], others, sums, tallies)
+            for n in range(pairs.row[i, 0], pairs.row[i, pairs.counters[2]]):
+                sums = _meet(law, pairs, block, i, here, entries[n], None, others, sums, tallies)
+            for k in range(3):
+                own[at + k * width] = total(sums[k])
+            if tallies is not None:
+                for k, of in enumerate((3, 4, 5, 6, 5, 7, 8, 6, 8, 9)):
+                    tallies[block, k] += total(sums[of])
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
+    """Site i at `here` meets a cluster: forces into `others` and, with energy and virial, onto the vectors `sums`."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    c = entry >> 5
+    j = width * c
+    offset = narrowed(
+        here - load_four(pairs.shift, 4 * (entry & 31)) - load_four(clusters.origin, 4 * c), clusters.local
+    )
+    dx = lane(offset, 0) - load(clusters.local, 3 * j)
+    dy = lane(offset, 1) - load(clusters.local, 3 * j + width)
+    dz = lane(offset, 2) - load(clusters.local, 3 * j + 2 * width)
+    r2 = dx * dx + dy * dy + dz * dz
+    counts = r2 < law.cutoff * law.cutoff
+    if mask is not None:
+        counts = counts & mask_of(mask, r2)
+    u, w = pair(law, i, j, r2)
+    w = select(counts, w, 0.0)
+    gx = w * dx
+    gy = w * dy
+    gz = w * dz
+    ahead = c - clusters.bounds[block]
+    if ahead < 0:
+        ahead += len(clusters.origin) // 4
+    at = 3 * width * ahead
+    store(others, at, load(others, at) - gx)
+    store(others, at + width, load(others, at + width) - gy)
+    store(others, at + 2 * width, load(others, at + 2 * width) - gz)
+    fx, fy, fz, energy, xx, xy, xz, yy, yz, zz = sums
+    if tallies is not None:
+        energy = energy + select(counts, u, 0.0)
+        xx = xx + gx * dx
+        xy = xy + gx * dy
+        xz = xz + gx * dz
+        yy = yy + gy * dy
+        yz = yz + gy * dz
+        zz = zz + gz * dz
+    return fx + gx, fy + gy, fz + gz, energy, xx, xy, xz, yy, yz, zz
+
+
+@kernel(fastmath=PAIR_FLAGS)
+def _gather_block(pairs, own, others, force, block):
+    """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for k in range(3):
+            at = 3 * width * c + k * width
+            on_cluster = load_beside(own, at, clusters.local)
+            for b in range(len(others)):
+                ahead = c - clusters.bounds[b]
+                if ahead < 0:
+                    ahead += len(clusters.origin) // 4
+                if ahead < pairs.needed[b, 2]:
+                    on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
+            store(own, at, on_cluster)
+            for slot in range(width * c, min(width * (c + 1), len(force))):
+                force[clusters.order[slot], k] = own[at + slot - width * c]

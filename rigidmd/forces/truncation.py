@@ -19,61 +19,102 @@ from collections.abc import Callable
 from math import inf
 from typing import Literal, NamedTuple, get_args
 
-import numpy as np
-
-from rigidmd.jit import PAIR_FLAGS, kernel
+from rigidmd.forces.lanes import larger
+from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 
 Name = Literal["plain", "shift", "force_shift", "force_switch", "switch"]
 NAMES: tuple[str, ...] = get_args(Name)
 
 
-class Shape(NamedTuple):
-    """Where the ending begins and whether it multiplies (switch) or adds."""
+class Plain(NamedTuple):
+    """Nothing happens before the cut-off; `plain` and `shift`."""
 
     cutoff: float  # Å, may be infinite
-    start: float  # Å; equal to the cut-off where nothing happens before it
-    switched: bool
+
+
+class Bent(NamedTuple):
+    """A polynomial is added to the force from the start on; `force_shift` and `force_switch`."""
+
+    cutoff: float  # Å
+    start: float  # Å
+
+
+class Switched(NamedTuple):
+    """The energy is multiplied by a function that falls from 1 at the start to 0; `switch`."""
+
+    cutoff: float  # Å
+    start: float  # Å
+
+
+Shape = Plain | Bent | Switched
+Polynomial = tuple[float, float, float, float]
 
 
 def shape_of(name: Name, cutoff: float, start: float) -> Shape:
     """The shape of the ending called `name`; `start` (Å) counts for force_switch and switch only."""
-    if cutoff == inf:
-        return Shape(inf, inf, False)
-    if name == "force_shift":
-        return Shape(cutoff, 0.0, False)
-    if name in ("force_switch", "switch"):
-        return Shape(cutoff, start, name == "switch")
-    return Shape(cutoff, cutoff, False)
+    if cutoff == inf or name in ("plain", "shift"):
+        return Plain(cutoff)
+    if name == "switch":
+        return Switched(cutoff, start)
+    return Bent(cutoff, 0.0 if name == "force_shift" else start)
 
 
-def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, float, float]]) -> np.ndarray:
+def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, float, float]]) -> Polynomial:
     """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) is its energy v, force -v' and -v''."""
     if shape.cutoff == inf or name in ("plain", "switch"):
-        return np.zeros(4)
+        return (0.0, 0.0, 0.0, 0.0)
     v, force, slope = at_cutoff(shape.cutoff)
     if name == "shift":
-        return np.array([-v, 0.0, 0.0, 0.0])
+        return (-v, 0.0, 0.0, 0.0)
     d = shape.cutoff - shape.start
     if name == "force_shift":
-        return np.array([-v - force * d, -force, 0.0, 0.0])
+        return (-v - force * d, -force, 0.0, 0.0)
     quadratic = (slope - 3 * force / d) / d
     cubic = (2 * force / d - slope) / d**2
-    return np.array([quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic])
+    return (quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic)
+
+
+def ended(shape, end, r, inverse, u, w):
+    """(energy, force/r) with the ending: u, w without it at distance r = 1/inverse; numbers or vectors.
+
+    The constant of `end` is part of u already.
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(ended, PAIR_FLAGS, inline=True)
+def _ended(shape, end, r, inverse, u, w):
+    if is_a(shape, Plain):
+        return lambda shape, end, r, inverse, u, w: (u, w)
+    if is_a(shape, Bent):
+
+        def bent(shape, end, r, inverse, u, w):
+            du, df = added(end, larger(r - shape.start, 0.0))
+            return u + du, w + df * inverse
+
+        return bent
+
+    def switched(shape, end, r, inverse, u, w):
+        s, slope = switching(shape, r)
+        return s * u, s * w - slope * u * inverse
+
+    return switched
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def added(end, x):
-    """(energy, force) that an ending adds at x = r - start > 0, its constant not counted."""
+    """(energy, force) that an ending adds at x = r - start >= 0, its constant not counted."""
     linear = end[1]
     quadratic = end[2]
     cubic = end[3]
     x2 = x * x
-    return -x * (linear + x2 * (quadratic / 3 + x * cubic / 4)), linear + x2 * (quadratic + x * cubic)
+    return -1.0 * x * (linear + x2 * (quadratic / 3 + x * (cubic / 4))), linear + x2 * (quadratic + x * cubic)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def switching(cutoff, start, r):
-    """(S, dS/dr) of the quintic 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start)."""
-    width = cutoff - start
-    t = (r - start) / width
-    return 1 - t * t * t * (10 - t * (15 - 6 * t)), -30 * t * t * (1 - t) ** 2 / width
+def switching(shape, r):
+    """(S, dS/dr) of the quintic 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start), and 1 before the start."""
+    per_width = 1 / (shape.cutoff - shape.start)
+    t = larger((r - shape.start) * per_width, 0.0)
+    left = 1.0 - t
+    return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), t * t * left * left * (-30.0 * per_width)
