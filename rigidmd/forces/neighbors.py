@@ -147,7 +147,8 @@ def _fill_block(pairs, space, tree, block):
                 hits = within_reach(tree, low, high, radius * radius, stack, found, 0)
             if candidates + hits > len(candidate):
                 grown = 2 * (candidates + hits)
-                candidate = _copied(candidate, np.empty(grown, np.int64))
+                before, candidate = candidate, np.empty(grown, np.int64)
+                candidate[: len(before)] = before
                 near = np.empty((6, grown + width), clusters.local.dtype)
                 apart = np.empty((3, grown), clusters.local.dtype)
                 row, shell = np.empty(grown, np.int64), np.empty(grown, np.int64)
@@ -229,12 +230,6 @@ def _fill_block(pairs, space, tree, block):
     pairs.needed[block, 0] = filled
     pairs.needed[block, 1] = filled_masked
     pairs.needed[block, 2] = window + 1
-
-
-@kernel(inline=True)
-def _copied(source, target):
-    target[: len(source)] = source
-    return target
 
 
 @kernel(inline=True)

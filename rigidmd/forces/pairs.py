@@ -146,7 +146,7 @@ def _gather_threaded(parcel, blocks):
         _gather_block(*opened(parcel), block)
 
 
-@kernel(fastmath=PAIR_FLAGS)
+@kernel(fastmath=PAIR_FLAGS, counted=False)
 def _block_forces(law, pairs, own, others, tallies, block):
     """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
     clusters = pairs.clusters
@@ -217,7 +217,7 @@ def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
     return fx + gx, fy + gy, fz + gz, energy, xx, xy, xz, yy, yz, zz
 
 
-@kernel(fastmath=PAIR_FLAGS)
+@kernel(fastmath=PAIR_FLAGS, counted=False)
 def _gather_block(pairs, own, others, force, block):
     """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
     clusters = pairs.clusters
