@@ -50,7 +50,7 @@ def box_tree(clusters):
     return BoxTree(low, high, level[: levels + 1])
 
 
-@kernel(fastmath=PAIR_FLAGS)
+@kernel(fastmath=PAIR_FLAGS, counted=False)
 def within_reach(tree, low, high, radius2, stack, found, count):
     """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,), in ascending order.
 

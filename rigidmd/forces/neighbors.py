@@ -112,138 +112,174 @@ def _fill_threaded(parcel, blocks):
         _fill_block(*opened(parcel), block)
 
 
-@kernel(fastmath=PAIR_FLAGS)
-def _fill_block(pairs, space, tree, block):
-    """Rows of one block. Entries beyond the room are counted, not stored."""
-    clusters = pairs.clusters
-    width = width_of(clusters.local)
-    everyone = (1 << width) - 1
-    count = len(clusters.origin) // 4
-    radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
+class Scratch(NamedTuple):
+    """What the rows of one cluster are made with: its candidates, and one row."""
+
+    bounds2: np.ndarray  # (SHELLS,) squared outer radii of the shells, Å²
+    stack: np.ndarray  # (levels, 2) for within_reach
+    low: np.ndarray  # (3,) box of the cluster, moved by an image
+    high: np.ndarray  # (3,)
+    entry: np.ndarray  # (room,) candidates
+    box: np.ndarray  # (6, room + lanes) their low and high corners from the cluster's origin, in the precision of lanes
+    apart: np.ndarray  # (3, room) from their origins to the cluster's
+    row: np.ndarray  # (room,) entries of a row
+    shell: np.ndarray  # (room,) their shells
+    ends: np.ndarray  # (SHELLS,) where each shell ends; 0 between rows
+
+
+@kernel
+def _scratch(pairs, tree, room):
+    local = pairs.clusters.local
     bounds2 = np.empty(SHELLS)
     for k in range(SHELLS):
         bounds2[k] = ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2
-    entries, masked = pairs.entries[block], pairs.masked[block]
-    filled = filled_masked = window = 0
-    room = min(27 * count, 1024)
-    found, candidate = np.empty(room, np.int64), np.empty(room, np.int64)
-    near = np.empty((6, room + width), clusters.local.dtype)
-    apart = np.empty((3, room), clusters.local.dtype)
-    row, shell = np.empty(room, np.int64), np.empty(room, np.int64)
-    stack = np.empty((len(tree.level), 2), np.int64)
-    low, high = np.empty(3), np.empty(3)
-    filler = len(clusters.order) - len(pairs.group)  # slots of the last cluster that hold no site
-    for c in range(pairs.clusters.bounds[block], pairs.clusters.bounds[block + 1]):
-        candidates = 0
-        for image in range(27):
-            if not _reaches(space, tree, c, image, radius):
-                continue
-            for k in range(3):
-                low[k] = tree.low[k, c] - pairs.shift[4 * image + k]
-                high[k] = tree.high[k, c] - pairs.shift[4 * image + k]
-            hits = within_reach(tree, low, high, radius * radius, stack, found, 0)
-            if hits > len(found):
-                found = np.empty(2 * hits, np.int64)
-                hits = within_reach(tree, low, high, radius * radius, stack, found, 0)
-            if candidates + hits > len(candidate):
-                grown = 2 * (candidates + hits)
-                before, candidate = candidate, np.empty(grown, np.int64)
-                candidate[: len(before)] = before
-                near = np.empty((6, grown + width), clusters.local.dtype)
-                apart = np.empty((3, grown), clusters.local.dtype)
-                row, shell = np.empty(grown, np.int64), np.empty(grown, np.int64)
-            for k in range(hits):
-                ahead = found[k] - c
-                if ahead < 0:
-                    ahead += count
-                if 2 * ahead < count or 2 * ahead == count and c < found[k]:
-                    candidate[candidates] = 32 * found[k] + image
-                    candidates += 1
-        for n in range(candidates):
-            other, image = candidate[n] >> 5, candidate[n] & 31
-            for k in range(3):
-                offset = pairs.shift[4 * image + k] - clusters.origin[4 * c + k]
-                near[k, n] = tree.low[k, other] + offset
-                near[3 + k, n] = tree.high[k, other] + offset
-                apart[k, n] = -offset - clusters.origin[4 * other + k]
-        for own in range(width):
-            i = width * c + own
-            first = min(filled, len(entries))
-            special = min(filled_masked, len(masked))
-            in_row = 0
-            if i < len(pairs.group):
-                x = clusters.local[3 * width * c + own]
-                y = clusters.local[3 * width * c + own + width]
-                z = clusters.local[3 * width * c + own + 2 * width]
-                for n0 in range(0, candidates, width):
-                    dx = larger(larger(load(near[0], n0) - x, x - load(near[3], n0)), 0.0)
-                    dy = larger(larger(load(near[1], n0) - y, y - load(near[4], n0)), 0.0)
-                    dz = larger(larger(load(near[2], n0) - z, z - load(near[5], n0)), 0.0)
-                    close = bits(dx * dx + dy * dy + dz * dz < radius * radius)
-                    if candidates - n0 < width:
-                        close &= (1 << (candidates - n0)) - 1
-                    while close != 0:
-                        n = n0 + lowest_bit(close)
-                        close &= close - 1
-                        other = candidate[n] >> 5
-                        at = 3 * width * other
-                        dx = x + apart[0, n] - load(clusters.local, at)
-                        dy = y + apart[1, n] - load(clusters.local, at + width)
-                        dz = z + apart[2, n] - load(clusters.local, at + 2 * width)
-                        r2 = dx * dx + dy * dy + dz * dz
-                        inside = bits(r2 < radius * radius)
-                        if inside == 0:
-                            continue
-                        same = load_beside(clusters.group, width * other, clusters.local) == clusters.group[i]
-                        left_out = bits(same)
-                        if other == c:
-                            left_out |= (1 << (own + 1)) - 1
-                        if other == count - 1:
-                            left_out |= everyone ^ (everyone >> filler)
-                        if left_out == 0:
-                            row[in_row] = candidate[n]
-                            m = smallest(r2)
-                            k = 0
-                            while k < SHELLS - 1 and m > bounds2[k]:
-                                k += 1
-                            shell[in_row] = k
-                            in_row += 1
-                        elif inside & ~left_out:
-                            if filled_masked < len(masked):
-                                masked[filled_masked, 0] = candidate[n]
-                                masked[filled_masked, 1] = everyone & ~left_out
-                            filled_masked += 1
-                        else:
-                            continue
-                        ahead = other - pairs.clusters.bounds[block]
-                        window = max(window, ahead + count if ahead < 0 else ahead)
-            pairs.special[i, 0] = special
-            pairs.special[i, 1] = min(filled_masked, len(masked))
-            pairs.row[i, 0] = first
-            for k in range(SHELLS):
-                for n in range(in_row):
-                    if shell[n] == k:
-                        if filled < len(entries):
-                            entries[filled] = row[n]
-                        filled += 1
-                pairs.row[i, k + 1] = min(filled, len(entries))
-    pairs.needed[block, 0] = filled
-    pairs.needed[block, 1] = filled_masked
-    pairs.needed[block, 2] = window + 1
+    return Scratch(
+        bounds2,
+        np.empty((len(tree.level), 2), np.int64),
+        np.empty(3),
+        np.empty(3),
+        np.empty(room, np.int64),
+        np.empty((6, room + width_of(local)), local.dtype),
+        np.empty((3, room), local.dtype),
+        np.empty(room, np.int64),
+        np.empty(room, np.int64),
+        np.zeros(SHELLS, np.int64),
+    )
 
 
-@kernel(inline=True)
-def _reaches(space, tree, c, image, radius):
-    """Whether a cluster, moved by an image, can come near anything at all."""
-    root = tree.level[-2]
+@kernel
+def _fill_block(pairs, space, tree, block):
+    """Rows of one block. Entries beyond the room are counted, not stored."""
+    clusters = pairs.clusters
+    scratch = _scratch(pairs, tree, 256)
+    entries = masked = window = 0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        candidates = _find_candidates(pairs, space, tree, c, scratch)
+        if candidates > len(scratch.entry):
+            scratch = _scratch(pairs, tree, 2 * candidates)
+            candidates = _find_candidates(pairs, space, tree, c, scratch)
+        entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
+        window = max(window, ahead + c - clusters.bounds[block] + 1)
+    pairs.needed[block, 0] = entries
+    pairs.needed[block, 1] = masked
+    pairs.needed[block, 2] = min(window, len(clusters.origin) // 4)
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def _find_candidates(pairs, space, tree, c, scratch):
+    """Clusters and images that stand in a cluster's rows and whose box is within reach of its box; how many.
+
+    There may be more than there is room for.
+    """
+    clusters = pairs.clusters
+    count = len(clusters.origin) // 4
     lengths = (space.x, space.y, space.z)
-    for k in range(3):
-        boxes = image // 3 ** (2 - k) % 3 - 1
-        if boxes != 0:
-            if lengths[k] == inf:
-                return False
-            low = tree.low[k, root:].min()
-            high = tree.high[k, root:].max()
-            if tree.low[k, c] - boxes * lengths[k] > high + radius or tree.high[k, c] - boxes * lengths[k] < low - radius:
-                return False
-    return True
+    radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
+    entry = scratch.entry
+    candidates = 0
+    for image in range(27):
+        reaches = True
+        for k in range(3):
+            shift = pairs.shift[4 * image + k]
+            scratch.low[k] = tree.low[k, c] - shift
+            scratch.high[k] = tree.high[k, c] - shift
+            if shift != 0.0:
+                reaches &= abs(shift) < inf and scratch.high[k] > -radius and scratch.low[k] < lengths[k] + radius
+        if not reaches:
+            continue
+        first = candidates
+        found = within_reach(tree, scratch.low, scratch.high, radius * radius, scratch.stack, entry, first)
+        if found > len(entry):
+            return found
+        for n in range(first, found):
+            ahead = entry[n] - c
+            if ahead < 0:
+                ahead += count
+            if 2 * ahead < count or 2 * ahead == count and c < entry[n]:
+                entry[candidates] = 32 * entry[n] + image
+                candidates += 1
+    for n in range(candidates):
+        other, image = entry[n] >> 5, entry[n] & 31
+        for k in range(3):
+            offset = pairs.shift[4 * image + k] - clusters.origin[4 * c + k]
+            scratch.box[k, n] = tree.low[k, other] + offset
+            scratch.box[3 + k, n] = tree.high[k, other] + offset
+            scratch.apart[k, n] = -offset - clusters.origin[4 * other + k]
+    return candidates
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
+    """Rows of the sites of a cluster from its candidates; entries and masked entries of the block so far, and how far
+    ahead on the ring the farthest cluster is."""
+    clusters = pairs.clusters
+    local = clusters.local
+    width = width_of(local)
+    everyone = (1 << width) - 1
+    count = len(clusters.origin) // 4
+    filler = len(clusters.order) - len(pairs.group)  # slots of the last cluster that hold no site
+    radius2 = scratch.bounds2[SHELLS - 1]
+    entries, masked = pairs.entries[block], pairs.masked[block]
+    farthest = 0
+    for own in range(width):
+        i = width * c + own
+        pairs.row[i, 0] = min(filled, len(entries))
+        pairs.special[i, 0] = min(filled_masked, len(masked))
+        x = local[3 * width * c + own]
+        y = local[3 * width * c + own + width]
+        z = local[3 * width * c + own + 2 * width]
+        in_row = 0
+        for first in range(0, candidates if i < len(pairs.group) else 0, width):
+            dx = larger(larger(load(scratch.box[0], first) - x, x - load(scratch.box[3], first)), 0.0)
+            dy = larger(larger(load(scratch.box[1], first) - y, y - load(scratch.box[4], first)), 0.0)
+            dz = larger(larger(load(scratch.box[2], first) - z, z - load(scratch.box[5], first)), 0.0)
+            close = bits(dx * dx + dy * dy + dz * dz < radius2)
+            if candidates - first < width:
+                close &= (1 << (candidates - first)) - 1
+            while close != 0:
+                n = first + lowest_bit(close)
+                close &= close - 1
+                entry = scratch.entry[n]
+                other = entry >> 5
+                at = 3 * width * other
+                dx = x + scratch.apart[0, n] - load(local, at)
+                dy = y + scratch.apart[1, n] - load(local, at + width)
+                dz = z + scratch.apart[2, n] - load(local, at + 2 * width)
+                r2 = dx * dx + dy * dy + dz * dz
+                nearest2 = smallest(r2)
+                left_out = bits(load_beside(clusters.group, width * other, local) == clusters.group[i])
+                if other == c:
+                    left_out |= (1 << (own + 1)) - 1
+                if other == count - 1:
+                    left_out |= everyone ^ (everyone >> filler)
+                inside = nearest2 < radius2
+                if left_out == 0:
+                    # no branches: what is inside is hard to foretell, and a wrong guess costs more than the distances
+                    k = 0
+                    for bound in range(SHELLS - 1):
+                        k += nearest2 > scratch.bounds2[bound]
+                    scratch.row[in_row] = entry
+                    scratch.shell[in_row] = k
+                    in_row += inside
+                    scratch.ends[k] += inside
+                elif inside and left_out != everyone:
+                    if filled_masked < len(masked):
+                        masked[filled_masked, 0] = entry
+                        masked[filled_masked, 1] = everyone & ~left_out
+                    filled_masked += 1
+                ahead = other - c
+                ahead += count if ahead < 0 else 0
+                farthest = max(farthest, ahead if inside else 0)
+        for k in range(SHELLS):
+            ends = filled
+            filled += scratch.ends[k]
+            scratch.ends[k] = ends
+            pairs.row[i, k + 1] = min(filled, len(entries))
+        if filled <= len(entries):
+            for n in range(in_row):
+                k = scratch.shell[n]
+                entries[scratch.ends[k]] = scratch.row[n]
+                scratch.ends[k] += 1
+        scratch.ends[:] = 0
+        pairs.special[i, 1] = min(filled_masked, len(masked))
+    return filled, filled_masked, farthest
