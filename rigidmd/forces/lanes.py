@@ -274,17 +274,23 @@ def _inverse_root(x):
     return refined
 
 
-@intrinsic
-def _larger(typing, x, y):
-    def emit(context, builder, signature, arguments):
-        a, b = (_filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
-        return builder.select(builder.fcmp_ordered("<", a, b), b, a)
+def _chosen(sign):
+    def chosen(typing, x, y):
+        def emit(context, builder, signature, arguments):
+            a, b = (_filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
+            return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
-    return x(x, y), emit
+        return x(x, y), emit
+
+    return chosen
+
+
+_larger = intrinsic(_chosen(">"))
+_smaller = intrinsic(_chosen("<"))
 
 
 def larger(x, y):
-    """The larger of x and a number y, in each lane."""
+    """The larger of x and y, which may be a number, in each lane; y where x is not a number."""
     raise TypeError("compiled code only")
 
 
@@ -293,6 +299,18 @@ def _larger_of_both(x, y):
     if isinstance(x, Lanes):
         return lambda x, y: _larger(x, y)
     return lambda x, y: max(x, y)
+
+
+def smaller(x, y):
+    """The smaller of x and y, which may be a number, in each lane; y where x is not a number."""
+    raise TypeError("compiled code only")
+
+
+@implements(smaller, PAIR_FLAGS, inline=True)
+def _smaller_of_both(x, y):
+    if isinstance(x, Lanes):
+        return lambda x, y: _smaller(x, y)
+    return lambda x, y: min(x, y)
 
 
 @intrinsic
@@ -359,19 +377,15 @@ def total(typing, x):
     return types.float64(x), emit
 
 
-def _extreme(name):
-    def extreme(typing, x):
-        def emit(context, builder, signature, arguments):
-            kind, flags = arguments[0].type, (*FLAGS, "nnan")
-            return _call(builder, f"llvm.vector.reduce.{name}.{_suffix(kind)}", kind.element, *arguments, flags=flags)
+@intrinsic
+def largest(typing, x):
+    """The largest number of all lanes; what it makes of lanes that are none is not defined."""
 
-        return x.dtype(x), emit
+    def emit(context, builder, signature, arguments):
+        kind, flags = arguments[0].type, (*FLAGS, "nnan")
+        return _call(builder, f"llvm.vector.reduce.fmax.{_suffix(kind)}", kind.element, *arguments, flags=flags)
 
-    return extreme
-
-
-smallest = intrinsic(_extreme("fmin"))  # of numbers: what it makes of a NaN is not defined
-largest = intrinsic(_extreme("fmax"))
+    return x.dtype(x), emit
 
 
 @intrinsic

@@ -18,7 +18,7 @@ from numba import prange
 
 from rigidmd.forces.boxes import box_tree, within_reach
 from rigidmd.forces.clusters import Clusters, clusters_of, follow, sort_into_clusters
-from rigidmd.forces.lanes import bits, larger, load, load_beside, lowest_bit, smallest, width_of
+from rigidmd.forces.lanes import bits, fill, load, load_beside, lowest_bit, smaller, width_of
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
 from rigidmd.jit import PAIR_FLAGS, kernel, opened, packed
@@ -113,37 +113,37 @@ def _fill_threaded(parcel, blocks):
 
 
 class Scratch(NamedTuple):
-    """What the rows of one cluster are made with: its candidates, and one row."""
+    """What the rows of one cluster are made with."""
 
     bounds2: np.ndarray  # (SHELLS,) squared outer radii of the shells, Å²
     stack: np.ndarray  # (levels, 2) for within_reach
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     entry: np.ndarray  # (room,) candidates
-    box: np.ndarray  # (6, room + lanes) their low and high corners from the cluster's origin, in the precision of lanes
-    apart: np.ndarray  # (3, room) from their origins to the cluster's
-    row: np.ndarray  # (room,) entries of a row
-    shell: np.ndarray  # (room,) their shells
-    ends: np.ndarray  # (SHELLS,) where each shell ends; 0 between rows
+    inside: np.ndarray  # (room, SHELLS) for each candidate the sites, as bits, that have it in each shell
+    special: np.ndarray  # (room,) candidates that need a mask for some site
+    row: np.ndarray  # (sites of a cluster, room)
+    ends: np.ndarray  # (sites of a cluster,) of their rows so far
 
 
 @kernel
 def _scratch(pairs, tree, room):
-    local = pairs.clusters.local
+    width = width_of(pairs.clusters.local)
     bounds2 = np.empty(SHELLS)
     for k in range(SHELLS):
-        bounds2[k] = ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2
+        bounds2[k] = ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2 if k else (
+            pairs.cutoff * (1 + ROUNDING)
+        ) ** 2
     return Scratch(
         bounds2,
         np.empty((len(tree.level), 2), np.int64),
         np.empty(3),
         np.empty(3),
         np.empty(room, np.int64),
-        np.empty((6, room + width_of(local)), local.dtype),
-        np.empty((3, room), local.dtype),
+        np.empty((room, SHELLS), np.int64),
         np.empty(room, np.int64),
-        np.empty(room, np.int64),
-        np.zeros(SHELLS, np.int64),
+        np.empty((width, room), np.int32),
+        np.empty(width, np.int64),
     )
 
 
@@ -198,88 +198,129 @@ def _find_candidates(pairs, space, tree, c, scratch):
             if 2 * ahead < count or 2 * ahead == count and c < entry[n]:
                 entry[candidates] = 32 * entry[n] + image
                 candidates += 1
-    for n in range(candidates):
-        other, image = entry[n] >> 5, entry[n] & 31
-        for k in range(3):
-            offset = pairs.shift[4 * image + k] - clusters.origin[4 * c + k]
-            scratch.box[k, n] = tree.low[k, other] + offset
-            scratch.box[3 + k, n] = tree.high[k, other] + offset
-            scratch.apart[k, n] = -offset - clusters.origin[4 * other + k]
     return candidates
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
 def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
-    """Rows of the sites of a cluster from its candidates; entries and masked entries of the block so far, and how far
-    ahead on the ring the farthest cluster is."""
+    """Rows of the sites of a cluster from its candidates.
+
+    Entries and masked entries of the block so far, and how far ahead on the ring the farthest cluster is.
+    """
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    count = len(clusters.origin) // 4
+    entries, masked = pairs.entries[block], pairs.masked[block]
+    farthest = specials = 0
+    for n in range(candidates):
+        needs_mask = _sort_into_shells(pairs, c, scratch, n)
+        scratch.special[specials] = n
+        specials += needs_mask
+        ahead = (scratch.entry[n] >> 5) - c
+        farthest = max(farthest, ahead + count if ahead < 0 else ahead)
+    scratch.ends[:] = 0
+    for k in range(SHELLS):
+        for n in range(candidates):
+            sites = scratch.inside[n, k]
+            while sites != 0:
+                own = lowest_bit(sites)
+                sites &= sites - 1
+                scratch.row[own, scratch.ends[own]] = scratch.entry[n]
+                scratch.ends[own] += 1
+        for own in range(width):
+            pairs.row[width * c + own, k + 1] = scratch.ends[own]
+    for own in range(width):
+        i = width * c + own
+        enough = filled + scratch.ends[own] <= len(entries)
+        pairs.row[i, 0] = 0
+        for k in range(SHELLS + 1):
+            pairs.row[i, k] = pairs.row[i, k] + filled if enough else 0
+        if enough:
+            for n in range(scratch.ends[own]):
+                entries[filled + n] = scratch.row[own, n]
+        filled += scratch.ends[own]
+        pairs.special[i, 0] = min(filled_masked, len(masked))
+        for n in range(specials if i < len(pairs.group) else 0):
+            entry = scratch.entry[scratch.special[n]]
+            mask = _mask_of_lanes(pairs, i, entry, scratch.bounds2[SHELLS - 1])
+            if mask != 0:
+                if filled_masked < len(masked):
+                    masked[filled_masked, 0] = entry
+                    masked[filled_masked, 1] = mask
+                filled_masked += 1
+        pairs.special[i, 1] = min(filled_masked, len(masked))
+    return filled, filled_masked, farthest
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _sort_into_shells(pairs, c, scratch, n):
+    """Which sites of a cluster have candidate n in which shell; whether some of them need a mask with it.
+
+    The sites are the lanes here, and the candidate's sites come one after the other: no sums across lanes, no guesses.
+    """
     clusters = pairs.clusters
     local = clusters.local
     width = width_of(local)
     everyone = (1 << width) - 1
     count = len(clusters.origin) // 4
-    filler = len(clusters.order) - len(pairs.group)  # slots of the last cluster that hold no site
-    radius2 = scratch.bounds2[SHELLS - 1]
-    entries, masked = pairs.entries[block], pairs.masked[block]
-    farthest = 0
-    for own in range(width):
-        i = width * c + own
-        pairs.row[i, 0] = min(filled, len(entries))
-        pairs.special[i, 0] = min(filled_masked, len(masked))
-        x = local[3 * width * c + own]
-        y = local[3 * width * c + own + width]
-        z = local[3 * width * c + own + 2 * width]
-        in_row = 0
-        for first in range(0, candidates if i < len(pairs.group) else 0, width):
-            dx = larger(larger(load(scratch.box[0], first) - x, x - load(scratch.box[3], first)), 0.0)
-            dy = larger(larger(load(scratch.box[1], first) - y, y - load(scratch.box[4], first)), 0.0)
-            dz = larger(larger(load(scratch.box[2], first) - z, z - load(scratch.box[5], first)), 0.0)
-            close = bits(dx * dx + dy * dy + dz * dz < radius2)
-            if candidates - first < width:
-                close &= (1 << (candidates - first)) - 1
-            while close != 0:
-                n = first + lowest_bit(close)
-                close &= close - 1
-                entry = scratch.entry[n]
-                other = entry >> 5
-                at = 3 * width * other
-                dx = x + scratch.apart[0, n] - load(local, at)
-                dy = y + scratch.apart[1, n] - load(local, at + width)
-                dz = z + scratch.apart[2, n] - load(local, at + 2 * width)
-                r2 = dx * dx + dy * dy + dz * dz
-                nearest2 = smallest(r2)
-                left_out = bits(load_beside(clusters.group, width * other, local) == clusters.group[i])
-                if other == c:
-                    left_out |= (1 << (own + 1)) - 1
-                if other == count - 1:
-                    left_out |= everyone ^ (everyone >> filler)
-                inside = nearest2 < radius2
-                if left_out == 0:
-                    # no branches: what is inside is hard to foretell, and a wrong guess costs more than the distances
-                    k = 0
-                    for bound in range(SHELLS - 1):
-                        k += nearest2 > scratch.bounds2[bound]
-                    scratch.row[in_row] = entry
-                    scratch.shell[in_row] = k
-                    in_row += inside
-                    scratch.ends[k] += inside
-                elif inside and left_out != everyone:
-                    if filled_masked < len(masked):
-                        masked[filled_masked, 0] = entry
-                        masked[filled_masked, 1] = everyone & ~left_out
-                    filled_masked += 1
-                ahead = other - c
-                ahead += count if ahead < 0 else 0
-                farthest = max(farthest, ahead if inside else 0)
-        for k in range(SHELLS):
-            ends = filled
-            filled += scratch.ends[k]
-            scratch.ends[k] = ends
-            pairs.row[i, k + 1] = min(filled, len(entries))
-        if filled <= len(entries):
-            for n in range(in_row):
-                k = scratch.shell[n]
-                entries[scratch.ends[k]] = scratch.row[n]
-                scratch.ends[k] += 1
-        scratch.ends[:] = 0
-        pairs.special[i, 1] = min(filled_masked, len(masked))
-    return filled, filled_masked, farthest
+    other, image = scratch.entry[n] >> 5, scratch.entry[n] & 31
+    at = 3 * width * c
+    x = load(local, at) + apart(pairs, c, other, image, 0)
+    y = load(local, at + width) + apart(pairs, c, other, image, 1)
+    z = load(local, at + 2 * width) + apart(pairs, c, other, image, 2)
+    group = load_beside(clusters.group, width * c, local)
+    nearest2 = fill(inf, local)
+    mates = group < group
+    for lane in range(width):
+        at = 3 * width * other + lane
+        dx = x - local[at]
+        dy = y - local[at + width]
+        dz = z - local[at + 2 * width]
+        nearest2 = smaller(nearest2, dx * dx + dy * dy + dz * dz)
+        mates = mates | (group == clusters.group[width * other + lane])
+    special = bits(mates)
+    if other == c or other == count - 1:
+        special = everyone
+    taken = special
+    if c == count - 1:
+        taken |= everyone ^ (everyone >> filler(pairs))
+    for k in range(SHELLS):
+        inside = bits(nearest2 <= scratch.bounds2[k]) & ~taken
+        scratch.inside[n, k] = inside
+        taken |= inside
+    return special != 0
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _mask_of_lanes(pairs, i, entry, radius2):
+    """The sites of a cluster that site i may meet, as bits; 0 if none of them is inside the radius."""
+    clusters = pairs.clusters
+    local = clusters.local
+    width = width_of(local)
+    everyone = (1 << width) - 1
+    c, other, image = i // width, entry >> 5, entry & 31
+    at = 2 * width * c + i
+    start = 3 * width * other
+    dx = local[at] + apart(pairs, c, other, image, 0) - load(local, start)
+    dy = local[at + width] + apart(pairs, c, other, image, 1) - load(local, start + width)
+    dz = local[at + 2 * width] + apart(pairs, c, other, image, 2) - load(local, start + 2 * width)
+    left_out = bits(load_beside(clusters.group, width * other, local) == clusters.group[i])
+    if other == c:
+        left_out |= (2 << (i - width * c)) - 1  # each pair once
+    if other == len(clusters.origin) // 4 - 1:
+        left_out |= everyone ^ (everyone >> filler(pairs))
+    meets = everyone & ~left_out
+    return meets if bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def apart(pairs, c, other, image, k):
+    """From the origin of another cluster to that of cluster c, moved by an image, Å."""
+    clusters = pairs.clusters
+    return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]
+
+
+@kernel(inline=True)
+def filler(pairs):
+    """Slots of the last cluster that hold no site."""
+    return len(pairs.clusters.order) - len(pairs.group)
