@@ -3,12 +3,12 @@
 A node holds as many children as a vector of float64 has lanes; one look tells which of them are within reach.
 """
 
-from math import inf
+from math import ceil, inf
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.lanes import bits, larger, load, lowest_bit, width_of
+from rigidmd.forces.lanes import bits, lane_count, larger, load, lowest_bit, width_of
 from rigidmd.jit import PAIR_FLAGS, kernel
 
 
@@ -20,34 +20,36 @@ class BoxTree(NamedTuple):
     level: np.ndarray  # (levels + 1,) where each level begins
 
 
-@kernel
-def box_tree(clusters):
-    """The tree of clusters as they are."""
-    arity = width_of(clusters.origin)
+def box_tree(count: int) -> BoxTree:
+    """Room for the tree of this many clusters."""
+    arity = lane_count(np.float64)
+    level = [0]
+    while len(level) == 1 or count > 1:
+        count = ceil(count / arity)
+        level.append(level[-1] + count * arity)
+    nodes = (3, level[-1])
+    return BoxTree(np.full(nodes, inf), np.full(nodes, -inf), np.array(level))
+
+
+@kernel(counted=False)
+def grow(tree, clusters):
+    """Fit the boxes to the clusters as they are."""
+    arity = width_of(tree.low)
     width = width_of(clusters.local)
-    count = len(clusters.origin) // 4
-    level = np.zeros(64, np.int64)
-    levels = 0
-    families = count
-    while levels == 0 or families > 1:
-        families = (families + arity - 1) // arity
-        level[levels + 1] = level[levels] + families * arity
-        levels += 1
-    low = np.full((3, level[levels]), inf)
-    high = np.full((3, level[levels]), -inf)
-    for c in range(count):
+    tree.low[:] = inf
+    tree.high[:] = -inf
+    for c in range(len(clusters.origin) // 4):
         for k in range(3):
             for at in range(3 * width * c + k * width, 3 * width * c + (k + 1) * width):
                 x = clusters.origin[4 * c + k] + clusters.local[at]
-                low[k, c] = min(low[k, c], x)
-                high[k, c] = max(high[k, c], x)
-    for upper in range(1, levels):
-        for child in range(level[upper - 1], level[upper]):
-            node = level[upper] + (child - level[upper - 1]) // arity
+                tree.low[k, c] = min(tree.low[k, c], x)
+                tree.high[k, c] = max(tree.high[k, c], x)
+    for upper in range(1, len(tree.level) - 1):
+        for child in range(tree.level[upper - 1], tree.level[upper]):
+            node = tree.level[upper] + (child - tree.level[upper - 1]) // arity
             for k in range(3):
-                low[k, node] = min(low[k, node], low[k, child])
-                high[k, node] = max(high[k, node], high[k, child])
-    return BoxTree(low, high, level[: levels + 1])
+                tree.low[k, node] = min(tree.low[k, node], tree.low[k, child])
+                tree.high[k, node] = max(tree.high[k, node], tree.high[k, child])
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)

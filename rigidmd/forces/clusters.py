@@ -9,10 +9,8 @@ from math import ceil, floor, inf
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
-
 from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of
-from rigidmd.jit import PAIR_FLAGS, kernel, opened, packed
+from rigidmd.jit import PAIR_FLAGS, kernel
 
 BLOCKS = 16  # enough for 16 threads
 SERIAL_SITES = 1000  # up to this many there is one block, and no thread is started
@@ -29,6 +27,7 @@ class Clusters(NamedTuple):
     local: np.ndarray  # (3 slots,) positions relative to the origins, Å
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved2: np.ndarray  # (blocks,) largest squared displacement since, Å²
+    wrapped: np.ndarray  # (s, 3) positions in the box when last sorted
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
@@ -46,12 +45,13 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
         local=np.zeros(3 * slots, dtype),
         reference=np.zeros(3 * slots, dtype),
         moved2=np.zeros(blocks),
+        wrapped=np.zeros((sites, 3)),
     )
 
 
 @kernel
-def sort_into_clusters(clusters, space, position, group):
-    """Sort sites at positions (s, 3) of groups (s,) into clusters, and settle them there.
+def sort_into_clusters(clusters, space, position):
+    """Sort sites at positions (s, 3) into clusters; they must then be settled there.
 
     Columns along z as wide as a cluster, up one and down the next, so that a cluster that begins in one column and ends
     in the next is compact too.
@@ -61,7 +61,7 @@ def sort_into_clusters(clusters, space, position, group):
     low = np.full(3, inf)
     high = np.full(3, -inf)
     lengths = (space.x, space.y, space.z)
-    wrapped = np.empty((s, 3))
+    wrapped = clusters.wrapped
     for i in range(s):
         for k in range(3):
             boxes = floor(position[i, k] / lengths[k]) if lengths[k] < inf else 0.0
@@ -99,10 +99,6 @@ def sort_into_clusters(clusters, space, position, group):
             b -= 1
         order[b] = i
     order[s:] = order[s - 1]
-    if len(clusters.moved2) == 1:
-        _settle_block(clusters, wrapped, position, group, 0)
-    else:
-        _settle_threaded(packed((clusters, wrapped, position, group)), len(clusters.moved2))
 
 
 @kernel(inline=True)
@@ -110,21 +106,15 @@ def _bin(x, extent, count):
     return min(count - 1, int(x / extent * count)) if extent > 0 else 0
 
 
-@kernel(parallel=True)
-def _settle_threaded(parcel, blocks):
-    for block in prange(blocks):
-        _settle_block(*opened(parcel), block)
-
-
-@kernel
-def _settle_block(clusters, wrapped, position, group, block):
+@kernel(counted=False)
+def settle_block(clusters, position, group, block):
     """Origins, anchors and places of newly sorted clusters; their origin is the middle of their box."""
     width = width_of(clusters.local)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         for k in range(3):
             low, high = inf, -inf
             for slot in range(width * c, width * (c + 1)):
-                x = wrapped[clusters.order[slot], k]
+                x = clusters.wrapped[clusters.order[slot], k]
                 low = min(low, x)
                 high = max(high, x)
             clusters.origin[4 * c + k] = 0.5 * (low + high)
@@ -133,31 +123,17 @@ def _settle_block(clusters, wrapped, position, group, block):
             clusters.group[slot] = group[i]
             for k in range(3):
                 at = slot + 2 * width * c + k * width
-                clusters.anchor[slot, k] = position[i, k] - (wrapped[i, k] - clusters.origin[4 * c + k])
+                clusters.anchor[slot, k] = position[i, k] - (clusters.wrapped[i, k] - clusters.origin[4 * c + k])
                 clusters.local[at] = position[i, k] - clusters.anchor[slot, k]
                 clusters.reference[at] = clusters.local[at]
 
 
-@kernel
-def follow(clusters, position, limit2):
-    """Bring `local` to the positions (s, 3); the largest squared displacement since the sorting.
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def follow_block(clusters, position, limit2, block):
+    """Bring `local` of a block to the positions (s, 3); the largest squared displacement since the sorting.
 
     Infinite if it is beyond limit2 or not a number.
     """
-    if len(clusters.moved2) == 1:
-        return _follow_block(clusters, position, limit2, 0)
-    _follow_threaded(packed((clusters, position, limit2)), clusters.moved2)
-    return clusters.moved2.max()
-
-
-@kernel(parallel=True)
-def _follow_threaded(parcel, moved2):
-    for block in prange(len(moved2)):
-        moved2[block] = _follow_block(*opened(parcel), block)
-
-
-@kernel(fastmath=PAIR_FLAGS)
-def _follow_block(clusters, position, limit2, block):
     width = width_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1

@@ -14,14 +14,12 @@ from math import ceil, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
-
-from rigidmd.forces.boxes import box_tree, within_reach
-from rigidmd.forces.clusters import Clusters, clusters_of, follow, sort_into_clusters
+from rigidmd.forces.boxes import BoxTree, box_tree, within_reach
+from rigidmd.forces.clusters import Clusters, clusters_of, sort_into_clusters
 from rigidmd.forces.lanes import bits, fill, load, load_beside, lowest_bit, smaller, width_of
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
-from rigidmd.jit import PAIR_FLAGS, kernel, opened, packed
+from rigidmd.jit import PAIR_FLAGS, kernel
 
 SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
@@ -38,6 +36,7 @@ class PairList(NamedTuple):
     skin: float  # Å
     group: np.ndarray  # (s,) pairs inside one group are left out
     clusters: Clusters
+    tree: BoxTree
     shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
     row: np.ndarray  # (slots, SHELLS + 1) shell k of slot i: entries[b, row[i, k]:row[i, k + 1]]
     entries: np.ndarray  # (blocks, capacity) int32
@@ -56,6 +55,7 @@ def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtyp
         skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
         group=group,
         clusters=clusters,
+        tree=box_tree(len(clusters.origin) // 4),
         shift=np.zeros(4 * 27),
         row=np.zeros((slots, SHELLS + 1), np.int32),
         entries=np.empty((blocks, 0), np.int32),
@@ -76,40 +76,42 @@ def enlarged(pairs: PairList) -> PairList:
 
 
 @kernel
-def update_list(pairs, space, position):
-    """Bring clusters to the site positions (s, 3), and build the list anew if it is no longer good. A status code."""
-    if pairs.counters[0] == 1:
-        moved2 = follow(pairs.clusters, position, (0.5 * pairs.skin) ** 2)
-        if moved2 < inf:
-            pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)
-            return OK
+def still_good(pairs):
+    """Whether the list is good for sites that have moved as `clusters.moved2` says, and which shells matter then."""
+    moved2 = pairs.clusters.moved2.max()
+    if not moved2 < inf:
+        return False
+    pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)
+    return True
+
+
+@kernel
+def prepare(pairs, space, position):
+    """Sort the sites for a new list. A status code."""
     pairs.counters[0] = 0
-    radius = pairs.cutoff + pairs.skin
     for x in position.flat:
-        if not abs(x) < LOST * radius:
+        if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
             return NOT_FINITE
-    sort_into_clusters(pairs.clusters, space, position, pairs.group)
+    sort_into_clusters(pairs.clusters, space, position)
     for image in range(27):
         for k, length in enumerate((space.x, space.y, space.z)):
             boxes = image // 3 ** (2 - k) % 3 - 1
             pairs.shift[4 * image + k] = boxes * length if boxes != 0 else 0.0
-    tree = box_tree(pairs.clusters)
-    if len(pairs.needed) == 1:
-        _fill_block(pairs, space, tree, 0)
-    else:
-        _fill_threaded(packed((pairs, space, tree)), len(pairs.needed))
-    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
-        return LIST_FULL
-    pairs.counters[2] = 1
-    pairs.counters[0] = 1
-    pairs.counters[1] += 1
     return OK
 
 
-@kernel(parallel=True)
-def _fill_threaded(parcel, blocks):
-    for block in prange(blocks):
-        _fill_block(*opened(parcel), block)
+@kernel
+def conclude(pairs, others):
+    """Whether a new list had all the room it needs, and the forces (blocks, room) of blocks on others have. A status."""
+    window = pairs.needed[:, 2].max() * 3 * width_of(pairs.clusters.local)
+    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
+        return LIST_FULL
+    if window > others.shape[1]:
+        return LIST_FULL
+    pairs.counters[0] = 1
+    pairs.counters[1] += 1
+    pairs.counters[2] = 1
+    return OK
 
 
 class Scratch(NamedTuple):
@@ -120,14 +122,14 @@ class Scratch(NamedTuple):
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     entry: np.ndarray  # (room,) candidates
-    inside: np.ndarray  # (room, SHELLS) for each candidate the sites, as bits, that have it in each shell
+    inside: np.ndarray  # (room, SHELLS + 1) for each candidate the sites, as bits, with it in each shell or with a mask
     special: np.ndarray  # (room,) candidates that need a mask for some site
     row: np.ndarray  # (sites of a cluster, room)
     ends: np.ndarray  # (sites of a cluster,) of their rows so far
 
 
 @kernel
-def _scratch(pairs, tree, room):
+def _scratch(pairs, room):
     width = width_of(pairs.clusters.local)
     bounds2 = np.empty(SHELLS)
     for k in range(SHELLS):
@@ -136,11 +138,11 @@ def _scratch(pairs, tree, room):
         ) ** 2
     return Scratch(
         bounds2,
-        np.empty((len(tree.level), 2), np.int64),
+        np.empty((len(pairs.tree.level), 2), np.int64),
         np.empty(3),
         np.empty(3),
         np.empty(room, np.int64),
-        np.empty((room, SHELLS), np.int64),
+        np.empty((room, SHELLS + 1), np.int64),
         np.empty(room, np.int64),
         np.empty((width, room), np.int32),
         np.empty(width, np.int64),
@@ -148,16 +150,16 @@ def _scratch(pairs, tree, room):
 
 
 @kernel
-def _fill_block(pairs, space, tree, block):
+def fill_block(pairs, space, block):
     """Rows of one block. Entries beyond the room are counted, not stored."""
     clusters = pairs.clusters
-    scratch = _scratch(pairs, tree, 256)
+    scratch = _scratch(pairs, 256)
     entries = masked = window = 0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        candidates = _find_candidates(pairs, space, tree, c, scratch)
+        candidates = _find_candidates(pairs, space, c, scratch)
         if candidates > len(scratch.entry):
-            scratch = _scratch(pairs, tree, 2 * candidates)
-            candidates = _find_candidates(pairs, space, tree, c, scratch)
+            scratch = _scratch(pairs, 2 * candidates)
+            candidates = _find_candidates(pairs, space, c, scratch)
         entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
         window = max(window, ahead + c - clusters.bounds[block] + 1)
     pairs.needed[block, 0] = entries
@@ -166,13 +168,13 @@ def _fill_block(pairs, space, tree, block):
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
-def _find_candidates(pairs, space, tree, c, scratch):
+def _find_candidates(pairs, space, c, scratch):
     """Clusters and images that stand in a cluster's rows and whose box is within reach of its box; how many.
 
     There may be more than there is room for.
     """
-    clusters = pairs.clusters
-    count = len(clusters.origin) // 4
+    tree = pairs.tree
+    count = len(pairs.clusters.origin) // 4
     lengths = (space.x, space.y, space.z)
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
     entry = scratch.entry
@@ -242,7 +244,9 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
         pairs.special[i, 0] = min(filled_masked, len(masked))
         for n in range(specials if i < len(pairs.group) else 0):
             entry = scratch.entry[scratch.special[n]]
-            mask = _mask_of_lanes(pairs, i, entry, scratch.bounds2[SHELLS - 1])
+            mask = 0
+            if scratch.inside[scratch.special[n], SHELLS] >> own & 1:
+                mask = _mask_of_lanes(pairs, i, entry, scratch.bounds2[SHELLS - 1])
             if mask != 0:
                 if filled_masked < len(masked):
                     masked[filled_masked, 0] = entry
@@ -288,6 +292,7 @@ def _sort_into_shells(pairs, c, scratch, n):
         inside = bits(nearest2 <= scratch.bounds2[k]) & ~taken
         scratch.inside[n, k] = inside
         taken |= inside
+    scratch.inside[n, SHELLS] = special
     return special != 0
 
 

@@ -8,19 +8,32 @@ images, sums energies, virial and forces, and hands the forces to the bodies.
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
-
 from rigidmd.forces import terms
+from rigidmd.forces.boxes import grow
+from rigidmd.forces.clusters import follow_block, settle_block
 from rigidmd.forces.lanes import (
     double, fill, four, lane, load, load_beside, load_four, mask_of, narrowed, select, store, total, width_of,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, empty_list, enlarged, update_list
+from rigidmd.forces.neighbors import PairList, conclude, empty_list, enlarged, fill_block, prepare, still_good
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel, opened, packed
+from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
+
+
+class Addresses(NamedTuple):
+    """Where the machine code of the parts of the work is; 0 until it is needed."""
+
+    follow: int = 0
+    prepare: int = 0
+    settle: int = 0
+    grow: int = 0
+    fill: int = 0
+    forces: int = 0
+    forces_and_energies: int = 0
+    gather: int = 0
 
 
 class PairForces(NamedTuple):
@@ -36,6 +49,8 @@ class PairForces(NamedTuple):
     own: np.ndarray  # (3 slots,) what its own row does to each site, stored as Clusters.local
     others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
+    status: np.ndarray  # (1,) what preparing the list said
+    addresses: Addresses
 
 
 def pair_forces(
@@ -56,13 +71,17 @@ def pair_forces(
         own=np.zeros(3 * slots),
         others=np.zeros((blocks, 0), dtype),
         tallies=np.zeros((blocks, TALLY_SIZE)),
+        status=np.zeros(1, np.int64),
+        addresses=Addresses(),
     )
 
 
 def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with as much room in its neighbour list as the last build asked for; other terms as they are."""
+    """The term with its machine code, and as much room as its last neighbour list asked for; other terms as they are."""
     if not isinstance(term, PairForces):
         return term
+    if term.addresses.forces == 0:
+        return term._replace(addresses=Addresses(*(part.address(term) for part in PARTS)))
     pairs, others = term.pairs, term.others
     entries, masked, window = pairs.needed.max(axis=0)
     if entries > pairs.entries.shape[1] or masked > pairs.masked.shape[1]:
@@ -98,22 +117,31 @@ def _add_pair_forces(term, state, load, tally):
         return None
 
     def add_pair_forces(term, state, load, tally):
-        place_sites(term.sites, state, term.position)
-        builds = term.pairs.counters[1]
-        status = update_list(term.pairs, term.space, term.position)
-        if status != OK:
-            return status
-        clusters = term.pairs.clusters
-        if builds != term.pairs.counters[1]:
-            arrange(term.law, term.arranged, clusters.order)
-        if term.pairs.needed[:, 2].max() * 3 * width_of(clusters.local) > term.others.shape[1]:
-            term.pairs.counters[0] = 0
+        blocks = len(term.tallies)
+        at = term.addresses
+        if at.forces == 0:
             return LIST_FULL
+        parcel = packed(term)
+        place_sites(term.sites, state, term.position)
+        if term.pairs.counters[0] == 1:
+            call_blocks(at.follow, parcel, blocks)
+        if term.pairs.counters[0] == 0 or not still_good(term.pairs):
+            call(at.prepare, parcel, 0)
+            if term.status[0] != OK:
+                return term.status[0]
+            call_blocks(at.settle, parcel, blocks)
+            call(at.grow, parcel, 0)
+            call_blocks(at.fill, parcel, blocks)
+            status = conclude(term.pairs, term.others)
+            if status != OK:
+                return status
         if tally is None:
-            site_forces(term.arranged, term.pairs, term.own, term.others, None, term.force)
+            call_blocks(at.forces, parcel, blocks)
         else:
-            site_forces(term.arranged, term.pairs, term.own, term.others, term.tallies, term.force)
-            for block in range(len(term.tallies)):
+            call_blocks(at.forces_and_energies, parcel, blocks)
+        call_blocks(at.gather, parcel, blocks)
+        if tally is not None:
+            for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += term.tallies[block, k]
             virial_of_offsets(term.sites, state, term.position, term.force, tally)
@@ -123,31 +151,62 @@ def _add_pair_forces(term, state, load, tally):
     return add_pair_forces
 
 
-@kernel
-def site_forces(law, pairs, own, others, tallies, force):
-    """Forces on sites into force (s, 3); energy and site virial of each block into tallies unless None."""
-    if len(others) == 1:
-        _block_forces(law, pairs, own, others, tallies, 0)
-        _gather_block(pairs, own, others, force, 0)
-    else:
-        _forces_threaded(packed((law, pairs, own, others, tallies)), len(others))
-        _gather_threaded(packed((pairs, own, others, force)), len(others))
+@work(counted=False)
+def _follow(parcel, block):
+    term = opened(parcel)
+    clusters = term.pairs.clusters
+    clusters.moved2[block] = follow_block(clusters, term.position, (0.5 * term.pairs.skin) ** 2, block)
 
 
-@kernel(parallel=True)
-def _forces_threaded(parcel, blocks):
-    for block in prange(blocks):
-        _block_forces(*opened(parcel), block)
+@work()
+def _prepare(parcel, block):
+    term = opened(parcel)
+    term.status[0] = prepare(term.pairs, term.space, term.position)
+    if term.status[0] == OK:
+        arrange(term.law, term.arranged, term.pairs.clusters.order)
 
 
-@kernel(parallel=True)
-def _gather_threaded(parcel, blocks):
-    for block in prange(blocks):
-        _gather_block(*opened(parcel), block)
+@work(counted=False)
+def _settle(parcel, block):
+    term = opened(parcel)
+    settle_block(term.pairs.clusters, term.position, term.pairs.group, block)
+
+
+@work(counted=False)
+def _grow(parcel, block):
+    pairs = opened(parcel).pairs
+    grow(pairs.tree, pairs.clusters)
+
+
+@work()
+def _fill(parcel, block):
+    term = opened(parcel)
+    fill_block(term.pairs, term.space, block)
+
+
+@work(fastmath=PAIR_FLAGS, counted=False)
+def _forces(parcel, block):
+    term = opened(parcel)
+    block_forces(term.arranged, term.pairs, term.own, term.others, None, block)
+
+
+@work(fastmath=PAIR_FLAGS, counted=False)
+def _forces_and_energies(parcel, block):
+    term = opened(parcel)
+    block_forces(term.arranged, term.pairs, term.own, term.others, term.tallies, block)
+
+
+@work(fastmath=PAIR_FLAGS, counted=False)
+def _gather(parcel, block):
+    term = opened(parcel)
+    gather_block(term.pairs, term.own, term.others, term.force, block)
+
+
+PARTS = (_follow, _prepare, _settle, _grow, _fill, _forces, _forces_and_energies, _gather)
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
-def _block_forces(law, pairs, own, others, tallies, block):
+def block_forces(law, pairs, own, others, tallies, block):
     """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
@@ -218,7 +277,7 @@ def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
-def _gather_block(pairs, own, others, force, block):
+def gather_block(pairs, own, others, force, block):
     """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
