@@ -31,7 +31,8 @@ LIBRARIES = {
     "matplotlib": {"output/report.py", "output/body_figures.py", "output/precision_report.py"},
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/body.py", "scene/actions.py"},
     "numba": {
-        "jit.py", "forces/terms.py", "forces/sites.py", "forces/pairs.py", "forces/neighbors.py", "dynamics/advance.py",
+        "jit.py", "forces/terms.py", "forces/sites.py", "forces/pairs.py", "forces/neighbors.py", "forces/lanes.py",
+        "forces/clusters.py", "dynamics/advance.py",
         "simulation/molecules.py", "measure/summary.py", "measure/body_summary.py",  # number of threads, version
     },
 }  # fmt: skip

@@ -365,7 +365,9 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
         if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
             raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
         sites = _taking_part(species, index, chosen)
-        terms["lennard_jones"] = pair_forces(law, space, sites, forces.skin_A, _groups(sites, frozen[index]))
+        terms["lennard_jones"] = pair_forces(
+            law, space, sites, forces.skin_A, scene.precision, _groups(sites, frozen[index])
+        )
         if forces.tail_correction:
             constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
@@ -373,7 +375,9 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
         charge = np.concatenate([species[k].charges[chosen[k]] for k in index])
         law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
         sites = _taking_part(species, index, chosen)
-        terms["coulomb"] = pair_forces(law, space, sites, forces.skin_A, _groups(sites, frozen[index]))
+        terms["coulomb"] = pair_forces(
+            law, space, sites, forces.skin_A, scene.precision, _groups(sites, frozen[index])
+        )
         if cutoff < inf:
             constants["reaction_field_self"] = sum(
                 int((index == k).sum())

@@ -1,14 +1,17 @@
 """Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), its endings at the cut-off, mixing rules, tail correction."""
 
-from math import pi, sqrt
+from math import pi
 from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
 
 from rigidmd.forces import pairs
-from rigidmd.forces.truncation import Name, added, ending, shape_of, switching
-from rigidmd.jit import PAIR_FLAGS, implements, is_a
+from rigidmd.forces.lanes import inverse_root, load
+from rigidmd.forces.truncation import (
+    POLYNOMIALS, Bent, Name, Plain, Polynomial, Shape, added, ended, ending, shape_of,
+)  # fmt: skip
+from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
 
@@ -17,13 +20,43 @@ class LennardJones(NamedTuple):
     """c12/r¹² - c6/r⁶ between kinds of sites, each power with its own ending."""
 
     cutoff: float  # Å
-    start: float  # Å, see truncation.Shape
-    switched: int
-    end12: np.ndarray  # (4,) see truncation.ending
-    end6: np.ndarray  # (4,)
+    shape: Shape
+    end12: Polynomial  # see truncation.ending
+    end6: Polynomial
     kind: np.ndarray  # (s,) kind of each site, index into c6 and c12
     c12: np.ndarray  # (kinds, kinds) u Å¹⁴/ps²
     c6: np.ndarray  # (kinds, kinds) u Å⁸/ps²
+
+    def room(self, slots: int, dtype: type) -> "OneKind | ManyKinds":
+        """What the loop reads: two numbers where all sites are of one kind, else a table with room for all slots."""
+        head, kinds = self[:4], len(self.c12)
+        if kinds == 1:
+            return OneKind(*head, float(self.c12[0, 0]), float(self.c6[0, 0]))
+        table = np.zeros((2, kinds * slots), dtype)
+        return ManyKinds(*head, np.zeros(slots, np.int32), *table)
+
+
+class OneKind(NamedTuple):
+    """The law between sites that are all of one kind."""
+
+    cutoff: float
+    shape: Shape
+    end12: Polynomial
+    end6: Polynomial
+    c12: float
+    c6: float
+
+
+class ManyKinds(NamedTuple):
+    """The law with what each kind does to the site in each slot, so that the loop loads it without gathering."""
+
+    cutoff: float
+    shape: Shape
+    end12: Polynomial
+    end6: Polynomial
+    kind: np.ndarray  # (slots,)
+    c12: np.ndarray  # (kinds slots,)
+    c6: np.ndarray  # (kinds slots,)
 
 
 def lennard_jones(
@@ -47,7 +80,8 @@ def lennard_jones(
         sigma_ij[[i, j], [j, i]] = own_sigma
         epsilon_ij[[i, j], [j, i]] = own_epsilon
     return LennardJones(
-        *shape,
+        cutoff,
+        shape,
         ending(name, shape, _inverse_power(12)),
         ending(name, shape, _inverse_power(6)),
         kind,
@@ -63,30 +97,56 @@ def _inverse_power(p: int):
 
 @implements(pairs.pair, PAIR_FLAGS, inline=True)
 def _pair(law, i, j, r2):
-    if not is_a(law, LennardJones):
+    if is_a(law, OneKind):
+        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, r2)
+    if not is_a(law, ManyKinds):
         return None
 
     def pair(law, i, j, r2):
-        c12 = law.c12[law.kind[i], law.kind[j]]
-        c6 = law.c6[law.kind[i], law.kind[j]]
-        inverse2 = 1 / r2
-        six = inverse2 * inverse2 * inverse2
-        u = c12 * (six * six + law.end12[0]) - c6 * (six + law.end6[0])
-        w = (12 * c12 * six - 6 * c6) * six * inverse2
-        if r2 > law.start * law.start:
-            r = sqrt(r2)
-            if law.switched:
-                s, slope = switching(law.switched, law.cutoff, law.start, r)
-                w = s * w - slope * u / r
-                u = s * u
-            else:
-                u12, f12 = added(law.end12, r - law.start)
-                u6, f6 = added(law.end6, r - law.start)
-                u += c12 * u12 - c6 * u6
-                w += (c12 * f12 - c6 * f6) / r
-        return u, w
+        at = law.kind[i] * len(law.kind) + j
+        return energy_and_force(law, load(law.c12, at), load(law.c6, at), r2)
 
     return pair
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def energy_and_force(law, c12, c6, r2):
+    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
+    inverse = inverse_root(r2)
+    inverse2 = inverse * inverse
+    six = inverse2 * inverse2 * inverse2
+    end = mixed(law.end12, law.end6, c12, c6)
+    u = (c12 * six - c6) * six + end[0]
+    w = (12 * c12 * six - 6 * c6) * six * inverse2
+    return ended(law.shape, end, r2 * inverse, inverse, u, w)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def mixed(end12, end6, c12, c6):
+    """The ending of a whole potential from those of its powers."""
+    return (
+        c12 * end12[0] - c6 * end6[0],
+        c12 * end12[1] - c6 * end6[1],
+        c12 * end12[2] - c6 * end6[2],
+        c12 * end12[3] - c6 * end6[3],
+    )
+
+
+@implements(pairs.arrange)
+def _arrange(law, arranged, order):
+    if not is_a(law, LennardJones):
+        return None
+    if is_a(arranged, OneKind):
+        return lambda law, arranged, order: None
+
+    def arrange(law, arranged, order):
+        for slot, i in enumerate(order):
+            arranged.kind[slot] = law.kind[i]
+            for k in range(len(law.c12)):
+                arranged.c12[k * len(order) + slot] = law.c12[k, law.kind[i]]
+                arranged.c6[k * len(order) + slot] = law.c6[k, law.kind[i]]
+
+    return arrange
 
 
 def tail(law: LennardJones, volume: float) -> tuple[float, float]:
@@ -101,7 +161,7 @@ def tail(law: LennardJones, volume: float) -> tuple[float, float]:
     for sign, c, p, end in ((1, law.c12, 12, law.end12), (-1, law.c6, 6, law.end6)):
         lost = _lost(law, end, p)
         # The pressure is that of the force alone: a jump of the energy at the cut-off (plain) has none.
-        jump = law.cutoff ** (3 - p) / 3 if end[0] == 0 and not law.switched else 0.0
+        jump = law.cutoff ** (3 - p) / 3 if end[0] == 0 and isinstance(law.shape, Plain) else 0.0
         strength = sign * count @ c @ count
         energy += 2 * pi / volume * strength * lost
         pressure += 2 * pi / volume**2 * strength * (lost + jump)
@@ -112,12 +172,13 @@ def _lost(law: LennardJones, end: np.ndarray, p: int) -> float:
     """Integral of r² (r⁻ᵖ - truncated r⁻ᵖ) over all r."""
     beyond = law.cutoff ** (3 - p) / (p - 3)
     inside = -end[0] * law.cutoff**3 / 3
+    if isinstance(law.shape, Plain):
+        return beyond + inside
+    start = law.shape.start
 
-    def ended(r: float) -> float:
-        if law.switched:
-            return (1 - switching(law.switched, law.cutoff, law.start, r)[0]) * r ** (2 - p)
-        return -(r**2) * added(end, r - law.start)[0]
+    def lost(r: float) -> float:
+        if isinstance(law.shape, Bent):
+            return -(r**2) * added(end, r - start)[0]
+        return (1 - POLYNOMIALS[type(law.shape)](law.shape, r)[0]) * r ** (2 - p)
 
-    if law.start < law.cutoff:
-        inside += quad(ended, law.start, law.cutoff)[0]
-    return beyond + inside
+    return beyond + inside + quad(lost, start, law.cutoff)[0]

@@ -1,193 +1,331 @@
-"""Neighbour lists: the pairs of sites of one law that may lie inside its cut-off.
+"""Neighbour lists: for each site of one law the clusters that may hold a site inside its cut-off.
 
-Built from cells in O(N), with a skin; used until any site has moved more than half the skin since, whether its body
-shifted or turned. That is checked at every force evaluation, before the list is used, so no pair is ever missed.
+A list is good until any site has moved more than half the skin since it was built, whether its body shifted or turned.
+That is checked at every force evaluation, before the list is used, so no pair is ever missed. In each row the clusters
+stand in shells by their distance, and what sites have moved so far says how many shells can matter: a new list is
+worked through as if it had no skin.
 
-The list is cut into a fixed number of blocks of sites. Each block has its own room, filled by whichever thread takes
-it, so the list and everything summed from it has the same bits for any number of threads. Each pair stands once: (i, j)
-in the row of the smaller index if i + j is odd, else of the larger, which makes all rows about equally long.
+Each pair of clusters stands in one of its two rows: that of the one behind, clusters being thought of as a ring. The
+list is cut into blocks of rows, filled by whichever thread takes them, so the list and everything summed from it has the
+same bits for any number of threads.
 """
 
-from math import ceil, floor, inf
+from math import ceil, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
-
-from rigidmd.forces.space import Space, nearest_image, wrap_index
+from rigidmd.forces.boxes import BoxTree, box_tree, within_reach
+from rigidmd.forces.clusters import Clusters, clusters_of, sort_into_clusters
+from rigidmd.forces.lanes import bits, fill, load, load_beside, lowest_bit, smaller, width_of
+from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
-from rigidmd.jit import kernel
+from rigidmd.jit import PAIR_FLAGS, kernel
 
-BLOCKS = 16  # enough for 16 threads; every block adds one array of site forces
-SITES_PER_BLOCK = 32  # small systems get fewer blocks, the smallest one, and then no thread is started
-
-LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its cell a site is
+SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
+LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
+ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
 
 class PairList(NamedTuple):
-    """Pairs of sites of different groups closer than `radius` when the list was built."""
+    """Rows of clusters for the sites of one law.
 
-    radius: float  # cut-off + skin, Å
+    An entry is 32 * cluster + image, the image one of 27 (-1, 0, 1 boxes along x, y, z).
+    """
+
+    cutoff: float  # Å
     skin: float  # Å
-    group: np.ndarray  # (s,) molecule, one number for all that is frozen; pairs inside a group are left out
-    bounds: np.ndarray  # (blocks + 1,) block b holds rows of sites bounds[b] ... bounds[b + 1] - 1
-    start: np.ndarray  # (s,) row of site i: partner[b, start[i]:stop[i]]
-    stop: np.ndarray  # (s,)
-    partner: np.ndarray  # (blocks, capacity) int32
-    needed: np.ndarray  # (blocks,) room the last build asked for
-    reference: np.ndarray  # (s, 3) site positions of the last build
-    counters: np.ndarray  # (2,) usable (0 or 1); builds so far
+    group: np.ndarray  # (s,) pairs inside one group are left out
+    clusters: Clusters
+    tree: BoxTree
+    shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
+    row: np.ndarray  # (slots, SHELLS + 1) shell k of slot i: entries[b, row[i, k]:row[i, k + 1]]
+    entries: np.ndarray  # (blocks, capacity) int32
+    special: np.ndarray  # (slots, 2) entries with a mask: masked[b, special[i, 0]:special[i, 1]]
+    masked: np.ndarray  # (blocks, capacity, 2) entry, and as bits the lanes that count
+    needed: np.ndarray  # (blocks, 3) room the last build asked for: entries, masked entries, window
+    counters: np.ndarray  # (3,) usable (0 or 1); builds so far; shells that matter now
 
 
-def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float) -> PairList:
-    """A list that will be built at its first use, with room for about what a uniform density needs."""
-    s = len(group)
-    blocks = max(1, min(BLOCKS, s // SITES_PER_BLOCK))
-    bounds = np.linspace(0, s, blocks + 1).astype(np.int64)
-    radius = cutoff + skin if cutoff < inf else inf
-    partners = s if space.volume == inf else min(s, s / space.volume * 4 / 3 * np.pi * radius**3)
-    capacity = int(1.2 * np.diff(bounds).max() * 0.5 * partners) + 16
+def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtype: type) -> PairList:
+    """A list that will be built at its first use, which finds out how much room it needs."""
+    clusters = clusters_of(len(group), dtype)
+    blocks, slots = len(clusters.moved2), len(clusters.order)
     return PairList(
-        radius=radius,
-        skin=skin,
+        cutoff=cutoff,
+        skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
         group=group,
-        bounds=bounds,
-        start=np.zeros(s, np.int64),
-        stop=np.zeros(s, np.int64),
-        partner=np.empty((blocks, capacity), np.int32),
-        needed=np.zeros(blocks, np.int64),
-        reference=np.zeros((s, 3)),
-        counters=np.zeros(2, np.int64),
+        clusters=clusters,
+        tree=box_tree(len(clusters.origin) // 4),
+        shift=np.zeros(4 * 27),
+        row=np.zeros((slots, SHELLS + 1), np.int32),
+        entries=np.empty((blocks, 0), np.int32),
+        special=np.zeros((slots, 2), np.int32),
+        masked=np.empty((blocks, 0, 2), np.int32),
+        needed=np.zeros((blocks, 3), np.int64),
+        counters=np.zeros(3, np.int64),
     )
 
 
 def enlarged(pairs: PairList) -> PairList:
     """The same list with the room its last build asked for, and a tenth more."""
-    return pairs._replace(partner=np.empty((len(pairs.partner), int(1.1 * pairs.needed.max()) + 16), np.int32))
+    entries, masked, _ = (int(1.1 * n) + 16 for n in pairs.needed.max(axis=0))
+    blocks = len(pairs.needed)
+    return pairs._replace(
+        entries=np.empty((blocks, entries), np.int32), masked=np.empty((blocks, masked, 2), np.int32)
+    )
 
 
 @kernel
-def is_usable(pairs, position):
-    """Whether no site has moved more than half the skin since the last build; False too if one is not a number."""
-    if pairs.counters[0] == 0:
+def still_good(pairs):
+    """Whether the list is good for sites that have moved as `clusters.moved2` says, and which shells matter then."""
+    moved2 = pairs.clusters.moved2.max()
+    if not moved2 < inf:
         return False
-    limit = (0.5 * pairs.skin) ** 2
-    for i in range(len(position)):
-        d2 = 0.0
-        for k in range(3):
-            d2 += (position[i, k] - pairs.reference[i, k]) ** 2
-        if not d2 <= limit:
-            return False
+    pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)
     return True
 
 
 @kernel
-def update_list(pairs, space, position):
-    """Build the list anew if it is no longer good for these site positions (s, 3). A status code."""
-    if is_usable(pairs, position):
-        return OK
+def prepare(pairs, space, position):
+    """Sort the sites for a new list. A status code."""
     pairs.counters[0] = 0
     for x in position.flat:
-        if not abs(x) < LOST * pairs.radius:
+        if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
             return NOT_FINITE
-    origin, size, shape, reach = _grid(space, position, pairs.radius)
-    cell, cell_start, order = _sort_into_cells(space, position, origin, size, shape)
-    _fill(pairs, space, position, cell, cell_start, order, shape, reach)
-    if pairs.needed.max() > pairs.partner.shape[1]:
-        return LIST_FULL
-    pairs.reference[:] = position
-    pairs.counters[0] = 1
-    pairs.counters[1] += 1
+    sort_into_clusters(pairs.clusters, space, position)
+    for image in range(27):
+        for k, length in enumerate((space.x, space.y, space.z)):
+            boxes = image // 3 ** (2 - k) % 3 - 1
+            pairs.shift[4 * image + k] = boxes * length if boxes != 0 else 0.0
     return OK
 
 
 @kernel
-def _grid(space, position, radius):
-    """Cells about half the list radius wide, no more than about eight for each site: origin, size, shape, reach."""
-    origin = np.zeros(3)
-    size = np.zeros(3)
-    shape = np.ones(3, np.int64)
-    reach = np.zeros(3, np.int64)
-    most = 2 * ceil(len(position) ** (1 / 3))
-    lengths = (space.x, space.y, space.z)
-    for k in range(3):
-        length = lengths[k]
-        if length == inf:
-            origin[k] = position[:, k].min()
-            length = position[:, k].max() - origin[k]
-        shape[k] = max(1, int(min(float(most), floor(2 * length / radius))))
-        size[k] = length / shape[k]
-        reach[k] = shape[k] if radius == inf or size[k] == 0 else int(min(float(shape[k]), ceil(radius / size[k])))
-    return origin, size, shape, reach
+def conclude(pairs, others):
+    """Whether a new list had all the room it needs, and the forces (blocks, room) of blocks on others have. A status."""
+    window = pairs.needed[:, 2].max() * 3 * width_of(pairs.clusters.local)
+    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
+        return LIST_FULL
+    if window > others.shape[1]:
+        return LIST_FULL
+    pairs.counters[0] = 1
+    pairs.counters[1] += 1
+    pairs.counters[2] = 1
+    return OK
+
+
+class Scratch(NamedTuple):
+    """What the rows of one cluster are made with."""
+
+    bounds2: np.ndarray  # (SHELLS,) squared outer radii of the shells, Å²
+    stack: np.ndarray  # (levels, 2) for within_reach
+    low: np.ndarray  # (3,) box of the cluster, moved by an image
+    high: np.ndarray  # (3,)
+    entry: np.ndarray  # (room,) candidates
+    inside: np.ndarray  # (room, SHELLS + 1) for each candidate the sites, as bits, with it in each shell or with a mask
+    special: np.ndarray  # (room,) candidates that need a mask for some site
+    row: np.ndarray  # (sites of a cluster, room)
+    ends: np.ndarray  # (sites of a cluster,) of their rows so far
 
 
 @kernel
-def _sort_into_cells(space, position, origin, size, shape):
-    """Counting sort: cell (s, 3) of each site; the sites of cell c are order[cell_start[c]:cell_start[c + 1]]."""
-    cell = np.empty((len(position), 3), np.int64)
-    flat = np.empty(len(position), np.int64)
-    cell_start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
-    lengths = (space.x, space.y, space.z)
-    for i in range(len(position)):
-        for k in range(3):
-            x = position[i, k] - origin[k]
-            if lengths[k] < inf:
-                x -= lengths[k] * floor(x / lengths[k])
-            cell[i, k] = min(shape[k] - 1, int(x / size[k])) if size[k] > 0 else 0
-        flat[i] = (cell[i, 0] * shape[1] + cell[i, 1]) * shape[2] + cell[i, 2]
-        cell_start[flat[i] + 1] += 1
-    cell_start[:] = np.cumsum(cell_start)
-    filled = cell_start[:-1].copy()
-    order = np.empty(len(position), np.int64)
-    for i in range(len(position)):
-        order[filled[flat[i]]] = i
-        filled[flat[i]] += 1
-    return cell, cell_start, order
-
-
-@kernel(parallel=True)
-def _fill(pairs, space, position, cell, cell_start, order, shape, reach):
-    for block in prange(len(pairs.needed)):
-        _fill_block(pairs, space, position, cell, cell_start, order, shape, reach, block)
+def _scratch(pairs, room):
+    width = width_of(pairs.clusters.local)
+    bounds2 = np.empty(SHELLS)
+    for k in range(SHELLS):
+        bounds2[k] = ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2 if k else (
+            pairs.cutoff * (1 + ROUNDING)
+        ) ** 2
+    return Scratch(
+        bounds2,
+        np.empty((len(pairs.tree.level), 2), np.int64),
+        np.empty(3),
+        np.empty(3),
+        np.empty(room, np.int64),
+        np.empty((room, SHELLS + 1), np.int64),
+        np.empty(room, np.int64),
+        np.empty((width, room), np.int32),
+        np.empty(width, np.int64),
+    )
 
 
 @kernel
-def _fill_block(pairs, space, position, cell, cell_start, order, shape, reach, block):
-    """Rows of one block. Pairs beyond the room are counted, not stored."""
-    partner = pairs.partner[block]
-    radius2 = pairs.radius**2
-    count = 0
-    low = np.empty(3, np.int64)
-    high = np.empty(3, np.int64)
-    for i in range(pairs.bounds[block], pairs.bounds[block + 1]):
-        pairs.start[i] = min(count, len(partner))
+def fill_block(pairs, space, block):
+    """Rows of one block. Entries beyond the room are counted, not stored."""
+    clusters = pairs.clusters
+    scratch = _scratch(pairs, 256)
+    entries = masked = window = 0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        candidates = _find_candidates(pairs, space, c, scratch)
+        if candidates > len(scratch.entry):
+            scratch = _scratch(pairs, 2 * candidates)
+            candidates = _find_candidates(pairs, space, c, scratch)
+        entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
+        window = max(window, ahead + c - clusters.bounds[block] + 1)
+    pairs.needed[block, 0] = entries
+    pairs.needed[block, 1] = masked
+    pairs.needed[block, 2] = min(window, len(clusters.origin) // 4)
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def _find_candidates(pairs, space, c, scratch):
+    """Clusters and images that stand in a cluster's rows and whose box is within reach of its box; how many.
+
+    There may be more than there is room for.
+    """
+    tree = pairs.tree
+    count = len(pairs.clusters.origin) // 4
+    lengths = (space.x, space.y, space.z)
+    radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
+    entry = scratch.entry
+    candidates = 0
+    for image in range(27):
+        reaches = True
         for k in range(3):
-            # With few cells the neighbourhood would meet itself round the box: visit each cell once.
-            every = 2 * reach[k] + 1 >= shape[k]
-            low[k] = 0 if every else cell[i, k] - reach[k]
-            high[k] = shape[k] - 1 if every else cell[i, k] + reach[k]
-        for cx in range(low[0], high[0] + 1):
-            x = wrap_index(space, cx, shape[0])
-            for cy in range(low[1], high[1] + 1):
-                y = wrap_index(space, cy, shape[1])
-                for cz in range(low[2], high[2] + 1):
-                    z = wrap_index(space, cz, shape[2])
-                    if x < 0 or y < 0 or z < 0:
-                        continue
-                    c = (x * shape[1] + y) * shape[2] + z
-                    for slot in range(cell_start[c], cell_start[c + 1]):
-                        j = order[slot]
-                        if (j > i) != ((i + j) % 2 == 1) or pairs.group[i] == pairs.group[j]:
-                            continue
-                        dx, dy, dz = nearest_image(
-                            space,
-                            position[i, 0] - position[j, 0],
-                            position[i, 1] - position[j, 1],
-                            position[i, 2] - position[j, 2],
-                        )
-                        if dx * dx + dy * dy + dz * dz <= radius2:
-                            if count < len(partner):
-                                partner[count] = j
-                            count += 1
-        pairs.stop[i] = min(count, len(partner))
-    pairs.needed[block] = count
+            shift = pairs.shift[4 * image + k]
+            scratch.low[k] = tree.low[k, c] - shift
+            scratch.high[k] = tree.high[k, c] - shift
+            if shift != 0.0:
+                reaches &= abs(shift) < inf and scratch.high[k] > -radius and scratch.low[k] < lengths[k] + radius
+        if not reaches:
+            continue
+        first = candidates
+        found = within_reach(tree, scratch.low, scratch.high, radius * radius, scratch.stack, entry, first)
+        if found > len(entry):
+            return found
+        for n in range(first, found):
+            ahead = entry[n] - c
+            if ahead < 0:
+                ahead += count
+            if 2 * ahead < count or 2 * ahead == count and c < entry[n]:
+                entry[candidates] = 32 * entry[n] + image
+                candidates += 1
+    return candidates
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
+    """Rows of the sites of a cluster from its candidates.
+
+    Entries and masked entries of the block so far, and how far ahead on the ring the farthest cluster is.
+    """
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    count = len(clusters.origin) // 4
+    entries, masked = pairs.entries[block], pairs.masked[block]
+    farthest = specials = 0
+    for n in range(candidates):
+        needs_mask = _sort_into_shells(pairs, c, scratch, n)
+        scratch.special[specials] = n
+        specials += needs_mask
+        ahead = (scratch.entry[n] >> 5) - c
+        farthest = max(farthest, ahead + count if ahead < 0 else ahead)
+    scratch.ends[:] = 0
+    for k in range(SHELLS):
+        for n in range(candidates):
+            sites = scratch.inside[n, k]
+            while sites != 0:
+                own = lowest_bit(sites)
+                sites &= sites - 1
+                scratch.row[own, scratch.ends[own]] = scratch.entry[n]
+                scratch.ends[own] += 1
+        for own in range(width):
+            pairs.row[width * c + own, k + 1] = scratch.ends[own]
+    for own in range(width):
+        i = width * c + own
+        enough = filled + scratch.ends[own] <= len(entries)
+        pairs.row[i, 0] = 0
+        for k in range(SHELLS + 1):
+            pairs.row[i, k] = pairs.row[i, k] + filled if enough else 0
+        if enough:
+            for n in range(scratch.ends[own]):
+                entries[filled + n] = scratch.row[own, n]
+        filled += scratch.ends[own]
+        pairs.special[i, 0] = min(filled_masked, len(masked))
+        for n in range(specials if i < len(pairs.group) else 0):
+            entry = scratch.entry[scratch.special[n]]
+            mask = 0
+            if scratch.inside[scratch.special[n], SHELLS] >> own & 1:
+                mask = _mask_of_lanes(pairs, i, entry, scratch.bounds2[SHELLS - 1])
+            if mask != 0:
+                if filled_masked < len(masked):
+                    masked[filled_masked, 0] = entry
+                    masked[filled_masked, 1] = mask
+                filled_masked += 1
+        pairs.special[i, 1] = min(filled_masked, len(masked))
+    return filled, filled_masked, farthest
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _sort_into_shells(pairs, c, scratch, n):
+    """Which sites of a cluster have candidate n in which shell; whether some of them need a mask with it.
+
+    The sites are the lanes here, and the candidate's sites come one after the other: no sums across lanes, no guesses.
+    """
+    clusters = pairs.clusters
+    local = clusters.local
+    width = width_of(local)
+    everyone = (1 << width) - 1
+    count = len(clusters.origin) // 4
+    other, image = scratch.entry[n] >> 5, scratch.entry[n] & 31
+    at = 3 * width * c
+    x = load(local, at) + apart(pairs, c, other, image, 0)
+    y = load(local, at + width) + apart(pairs, c, other, image, 1)
+    z = load(local, at + 2 * width) + apart(pairs, c, other, image, 2)
+    group = load_beside(clusters.group, width * c, local)
+    nearest2 = fill(inf, local)
+    mates = group < group
+    for lane in range(width):
+        at = 3 * width * other + lane
+        dx = x - local[at]
+        dy = y - local[at + width]
+        dz = z - local[at + 2 * width]
+        nearest2 = smaller(nearest2, dx * dx + dy * dy + dz * dz)
+        mates = mates | (group == clusters.group[width * other + lane])
+    special = bits(mates)
+    if other == c or other == count - 1:
+        special = everyone
+    taken = special
+    if c == count - 1:
+        taken |= everyone ^ (everyone >> filler(pairs))
+    for k in range(SHELLS):
+        inside = bits(nearest2 <= scratch.bounds2[k]) & ~taken
+        scratch.inside[n, k] = inside
+        taken |= inside
+    scratch.inside[n, SHELLS] = special
+    return special != 0
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _mask_of_lanes(pairs, i, entry, radius2):
+    """The sites of a cluster that site i may meet, as bits; 0 if none of them is inside the radius."""
+    clusters = pairs.clusters
+    local = clusters.local
+    width = width_of(local)
+    everyone = (1 << width) - 1
+    c, other, image = i // width, entry >> 5, entry & 31
+    at = 2 * width * c + i
+    start = 3 * width * other
+    dx = local[at] + apart(pairs, c, other, image, 0) - load(local, start)
+    dy = local[at + width] + apart(pairs, c, other, image, 1) - load(local, start + width)
+    dz = local[at + 2 * width] + apart(pairs, c, other, image, 2) - load(local, start + 2 * width)
+    left_out = bits(load_beside(clusters.group, width * other, local) == clusters.group[i])
+    if other == c:
+        left_out |= (2 << (i - width * c)) - 1  # each pair once
+    if other == len(clusters.origin) // 4 - 1:
+        left_out |= everyone ^ (everyone >> filler(pairs))
+    meets = everyone & ~left_out
+    return meets if bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def apart(pairs, c, other, image, k):
+    """From the origin of another cluster to that of cluster c, moved by an image, Å."""
+    clusters = pairs.clusters
+    return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]
+
+
+@kernel(inline=True)
+def filler(pairs):
+    """Slots of the last cluster that hold no site."""
+    return len(pairs.clusters.order) - len(pairs.group)

@@ -1,54 +1,103 @@
 """Forces between pairs of sites: the one loop for every such law.
 
-A law says only what two sites at a distance do: an `@implements(pair)` for its NamedTuple. This loop finds the pairs,
-takes the nearest image, sums energies, virial and forces, and hands the forces to the bodies.
+A law says only what one site and a vector of others at their distances do: an `@implements(pair)` for its NamedTuple,
+and how its numbers for each site follow the sites into another order (`arrange`). This loop finds the pairs, takes the
+images, sums energies, virial and forces, and hands the forces to the bodies.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
-
 from rigidmd.forces import terms
-from rigidmd.forces.neighbors import PairList, empty_list, enlarged, update_list
+from rigidmd.forces.boxes import grow
+from rigidmd.forces.clusters import follow_block, settle_block
+from rigidmd.forces.lanes import (
+    double, fill, four, lane, load, load_beside, load_four, mask_of, narrowed, select, store, total, width_of,
+)  # fmt: skip
+from rigidmd.forces.neighbors import PairList, conclude, empty_list, enlarged, fill_block, prepare, still_good
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.space import Space, nearest_image
-from rigidmd.forces.terms import OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.forces.space import Space
+from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
+from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
+
+PRECISIONS = {"double": np.float64, "mixed": np.float32}
+
+
+class Addresses(NamedTuple):
+    """Where the machine code of the parts of the work is; 0 until it is needed."""
+
+    follow: int = 0
+    prepare: int = 0
+    settle: int = 0
+    grow: int = 0
+    fill: int = 0
+    forces: int = 0
+    forces_and_energies: int = 0
+    gather: int = 0
 
 
 class PairForces(NamedTuple):
     """A pair law, the sites that take part in it, and the work arrays to evaluate it."""
 
-    law: NamedTuple
+    law: NamedTuple  # in the order of the sites
+    arranged: NamedTuple  # what the loop reads: numbers for each site in the order of slots, in the precision of lanes
     space: Space
     sites: BodySites | CentralSites
     pairs: PairList
     position: np.ndarray  # (s, 3) lab frame
-    force: np.ndarray  # (blocks, s, 3) lab frame; blocks are summed in order
+    force: np.ndarray  # (s, 3) lab frame
+    own: np.ndarray  # (3 slots,) what its own row does to each site, stored as Clusters.local
+    others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
+    status: np.ndarray  # (1,) what preparing the list said
+    addresses: Addresses
 
 
 def pair_forces(
-    law: NamedTuple, space: Space, sites: BodySites | CentralSites, skin: float, group: np.ndarray | None = None
+    law: NamedTuple,
+    space: Space,
+    sites: BodySites | CentralSites,
+    skin: float,
+    precision: str = "double",
+    group: np.ndarray | None = None,
 ) -> PairForces:
     """The term for a law with a `cutoff`; its neighbour list is built at the first use.
 
     group (s,) : sites of one group do not act on one another; the sites' molecules when not given
     """
-    s = len(sites.molecule)
-    pairs = empty_list(space, sites.molecule if group is None else group, law.cutoff, skin)
-    blocks = len(pairs.needed)
+    dtype = PRECISIONS[precision]
+    pairs = empty_list(space, sites.molecule if group is None else group, law.cutoff, skin, dtype)
+    blocks, slots = len(pairs.needed), len(pairs.clusters.order)
     return PairForces(
-        law, space, sites, pairs, np.zeros((s, 3)), np.zeros((blocks, s, 3)), np.zeros((blocks, TALLY_SIZE))
+        law=law,
+        arranged=law.room(slots, dtype),
+        space=space,
+        sites=sites,
+        pairs=pairs,
+        position=np.zeros((len(sites.molecule), 3)),
+        force=np.zeros((len(sites.molecule), 3)),
+        own=np.zeros(3 * slots),
+        others=np.zeros((blocks, 0), dtype),
+        tallies=np.zeros((blocks, TALLY_SIZE)),
+        status=np.zeros(1, np.int64),
+        addresses=Addresses(),
     )
 
 
 def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with as much room in its neighbour list as the last build asked for; other terms as they are."""
-    if isinstance(term, PairForces) and term.pairs.needed.max(initial=0) > term.pairs.partner.shape[1]:
-        return term._replace(pairs=enlarged(term.pairs))
-    return term
+    """The term with its machine code, and as much room as its last neighbour list asked for; other terms as they are."""
+    if not isinstance(term, PairForces):
+        return term
+    if term.addresses.forces == 0:
+        return term._replace(addresses=Addresses(*(part.address(term) for part in PARTS)))
+    pairs, others = term.pairs, term.others
+    entries, masked, window = pairs.needed.max(axis=0)
+    if entries > pairs.entries.shape[1] or masked > pairs.masked.shape[1]:
+        pairs = enlarged(pairs)
+    cluster = len(pairs.clusters.local) // (len(pairs.clusters.origin) // 4)
+    if window * cluster > others.shape[1]:
+        others = np.zeros((len(others), int(1.1 * window + 1) * cluster), others.dtype)
+    return term._replace(pairs=pairs, others=others)
 
 
 def forget_list(term: NamedTuple) -> None:
@@ -58,8 +107,16 @@ def forget_list(term: NamedTuple) -> None:
 
 
 def pair(law, i, j, r2):
-    """(energy, force/r) of sites i and j of a law at squared distance r2 below cutoff²; force > 0 repels."""
+    """(energy, force/r) of the site in slot i and those in slots j, j + 1, ... at squared distances r2, as vectors.
+
+    Below cutoff² only; force > 0 repels.
+    """
     raise TypeError(f"{type(law).__name__} is no pair law, or this was called outside compiled code")
+
+
+def arrange(law, arranged, order):
+    """Fill the numbers that an arranged law has for each slot from those of the sites that are there now."""
+    raise TypeError("compiled code only")
 
 
 @implements(terms.add_forces)
@@ -68,15 +125,31 @@ def _add_pair_forces(term, state, load, tally):
         return None
 
     def add_pair_forces(term, state, load, tally):
+        blocks = len(term.tallies)
+        at = term.addresses
+        if at.forces == 0:
+            return LIST_FULL
+        parcel = packed(term)
         place_sites(term.sites, state, term.position)
-        status = update_list(term.pairs, term.space, term.position)
-        if status != OK:
-            return status
+        if term.pairs.counters[0] == 1:
+            call_blocks(at.follow, parcel, blocks)
+        if term.pairs.counters[0] == 0 or not still_good(term.pairs):
+            call(at.prepare, parcel, 0)
+            if term.status[0] != OK:
+                return term.status[0]
+            call_blocks(at.settle, parcel, blocks)
+            call(at.grow, parcel, 0)
+            call_blocks(at.fill, parcel, blocks)
+            status = conclude(term.pairs, term.others)
+            if status != OK:
+                return status
         if tally is None:
-            site_forces(term.law, term.space, term.pairs, term.position, term.force, None)
+            call_blocks(at.forces, parcel, blocks)
         else:
-            site_forces(term.law, term.space, term.pairs, term.position, term.force, term.tallies)
-            for block in range(len(term.tallies)):
+            call_blocks(at.forces_and_energies, parcel, blocks)
+        call_blocks(at.gather, parcel, blocks)
+        if tally is not None:
+            for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += term.tallies[block, k]
             virial_of_offsets(term.sites, state, term.position, term.force, tally)
@@ -86,59 +159,146 @@ def _add_pair_forces(term, state, load, tally):
     return add_pair_forces
 
 
-@kernel
-def site_forces(law, space, pairs, position, force, tallies):
-    """Forces on sites into force (blocks, s, 3); energy and site virial of each block into tallies unless None."""
-    if len(force) == 1:
-        _block_forces(law, space, pairs, position, force, tallies, 0)
-    else:
-        _site_forces_threaded(law, space, pairs, position, force, tallies)
+@work(counted=False)
+def _follow(parcel, block):
+    term = opened(parcel)
+    clusters = term.pairs.clusters
+    clusters.moved2[block] = follow_block(clusters, term.position, (0.5 * term.pairs.skin) ** 2, block)
 
 
-@kernel(parallel=True)
-def _site_forces_threaded(law, space, pairs, position, force, tallies):
-    for block in prange(len(force)):
-        _block_forces(law, space, pairs, position, force, tallies, block)
+@work()
+def _prepare(parcel, block):
+    term = opened(parcel)
+    term.status[0] = prepare(term.pairs, term.space, term.position)
+    if term.status[0] == OK:
+        arrange(term.law, term.arranged, term.pairs.clusters.order)
 
 
-@kernel(fastmath=PAIR_FLAGS)
-def _block_forces(law, space, pairs, position, force, tallies, block):
-    partner = pairs.partner[block]
-    f = force[block]
-    f[:] = 0.0
-    cutoff2 = law.cutoff * law.cutoff
-    energy = xx = xy = xz = yy = yz = zz = 0.0
-    for i in range(pairs.bounds[block], pairs.bounds[block + 1]):
-        x = position[i, 0]
-        y = position[i, 1]
-        z = position[i, 2]
-        fx = fy = fz = 0.0
-        for slot in range(pairs.start[i], pairs.stop[i]):
-            j = partner[slot]
-            dx, dy, dz = nearest_image(space, x - position[j, 0], y - position[j, 1], z - position[j, 2])
-            r2 = dx * dx + dy * dy + dz * dz
-            if r2 < cutoff2:
-                u, w = pair(law, i, j, r2)
-                gx = w * dx
-                gy = w * dy
-                gz = w * dz
-                fx += gx
-                fy += gy
-                fz += gz
-                f[j, 0] -= gx
-                f[j, 1] -= gy
-                f[j, 2] -= gz
-                if tallies is not None:
-                    energy += u
-                    xx += gx * dx
-                    xy += gx * dy
-                    xz += gx * dz
-                    yy += gy * dy
-                    yz += gy * dz
-                    zz += gz * dz
-        f[i, 0] += fx
-        f[i, 1] += fy
-        f[i, 2] += fz
+@work(counted=False)
+def _settle(parcel, block):
+    term = opened(parcel)
+    settle_block(term.pairs.clusters, term.position, term.pairs.group, block)
+
+
+@work(counted=False)
+def _grow(parcel, block):
+    pairs = opened(parcel).pairs
+    grow(pairs.tree, pairs.clusters)
+
+
+@work()
+def _fill(parcel, block):
+    term = opened(parcel)
+    fill_block(term.pairs, term.space, block)
+
+
+@work(fastmath=PAIR_FLAGS, counted=False)
+def _forces(parcel, block):
+    term = opened(parcel)
+    block_forces(term.arranged, term.pairs, term.own, term.others, None, block)
+
+
+@work(fastmath=PAIR_FLAGS, counted=False)
+def _forces_and_energies(parcel, block):
+    term = opened(parcel)
+    block_forces(term.arranged, term.pairs, term.own, term.others, term.tallies, block)
+
+
+@work(fastmath=PAIR_FLAGS, counted=False)
+def _gather(parcel, block):
+    term = opened(parcel)
+    gather_block(term.pairs, term.own, term.others, term.force, block)
+
+
+PARTS = (_follow, _prepare, _settle, _grow, _fill, _forces, _forces_and_energies, _gather)
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def block_forces(law, pairs, own, others, tallies, block):
+    """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    others = others[block]
+    others[: 3 * width * pairs.needed[block, 2]] = 0.0
     if tallies is not None:
-        for k, value in enumerate((energy, xx, xy, xz, xy, yy, yz, xz, yz, zz)):
-            tallies[block, k] = value
+        tallies[block] = 0.0
+    entries = pairs.entries[block]
+    masked = pairs.masked[block]
+    zero = fill(0.0, clusters.local)
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for i in range(width * c, width * (c + 1)):
+            at = 2 * width * c + i
+            here = load_four(clusters.origin, 4 * c) + four(
+                clusters.local[at], clusters.local[at + width], clusters.local[at + 2 * width]
+            )
+            sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+            for n in range(pairs.special[i, 0], pairs.special[i, 1]):
+                sums = _meet(law, pairs, block, i, here, masked[n, 0], masked[n, 1], others, sums, tallies)
+            for n in range(pairs.row[i, 0], pairs.row[i, pairs.counters[2]]):
+                sums = _meet(law, pairs, block, i, here, entries[n], None, others, sums, tallies)
+            for k in range(3):
+                own[at + k * width] = total(sums[k])
+            if tallies is not None:
+                for k, of in enumerate((3, 4, 5, 6, 5, 7, 8, 6, 8, 9)):
+                    tallies[block, k] += total(sums[of])
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
+    """Site i at `here` meets a cluster: forces into `others` and, with energy and virial, onto the vectors `sums`."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    c = entry >> 5
+    j = width * c
+    offset = narrowed(
+        here - load_four(pairs.shift, 4 * (entry & 31)) - load_four(clusters.origin, 4 * c), clusters.local
+    )
+    dx = lane(offset, 0) - load(clusters.local, 3 * j)
+    dy = lane(offset, 1) - load(clusters.local, 3 * j + width)
+    dz = lane(offset, 2) - load(clusters.local, 3 * j + 2 * width)
+    r2 = dx * dx + dy * dy + dz * dz
+    counts = r2 < law.cutoff * law.cutoff
+    if mask is not None:
+        counts = counts & mask_of(mask, r2)
+    u, w = pair(law, i, j, r2)
+    w = select(counts, w, 0.0)
+    gx = w * dx
+    gy = w * dy
+    gz = w * dz
+    ahead = c - clusters.bounds[block]
+    if ahead < 0:
+        ahead += len(clusters.origin) // 4
+    at = 3 * width * ahead
+    store(others, at, load(others, at) - gx)
+    store(others, at + width, load(others, at + width) - gy)
+    store(others, at + 2 * width, load(others, at + 2 * width) - gz)
+    fx, fy, fz, energy, xx, xy, xz, yy, yz, zz = sums
+    if tallies is not None:
+        energy = energy + select(counts, u, 0.0)
+        xx = xx + gx * dx
+        xy = xy + gx * dy
+        xz = xz + gx * dz
+        yy = yy + gy * dy
+        yz = yz + gy * dz
+        zz = zz + gz * dz
+    return fx + gx, fy + gy, fz + gz, energy, xx, xy, xz, yy, yz, zz
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def gather_block(pairs, own, others, force, block):
+    """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for k in range(3):
+            at = 3 * width * c + k * width
+            on_cluster = load_beside(own, at, clusters.local)
+            for b in range(len(others)):
+                ahead = c - clusters.bounds[b]
+                if ahead < 0:
+                    ahead += len(clusters.origin) // 4
+                if ahead < pairs.needed[b, 2]:
+                    on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
+            store(own, at, on_cluster)
+            for slot in range(width * c, min(width * (c + 1), len(force))):
+                force[clusters.order[slot], k] = own[at + slot - width * c]

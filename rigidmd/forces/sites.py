@@ -61,7 +61,7 @@ def _place_molecule(sites, state, m, site_position):
 
 
 def load_molecule(sites, state, load, m, site_force):
-    """Add the sum of molecule m's site forces (blocks, s, 3), and their torque about its centre, to its load."""
+    """Add the sum of molecule m's site forces (s, 3), and their torque about its centre, to its load."""
     raise TypeError("compiled code only")
 
 
@@ -71,17 +71,17 @@ def _load_molecule(sites, state, load, m, site_force):
 
         def load_central(sites, state, load, m, site_force):
             for i in range(sites.first[m], sites.first[m + 1]):
-                fx, fy, fz = sum_blocks(site_force, i)
-                load.force[m, 0] += fx
-                load.force[m, 1] += fy
-                load.force[m, 2] += fz
+                for k in range(3):
+                    load.force[m, k] += site_force[i, k]
 
         return load_central
 
     def load_body(sites, state, load, m, site_force):
         q = state.rotation[m]
         for i in range(sites.first[m], sites.first[m + 1]):
-            fx, fy, fz = sum_blocks(site_force, i)
+            fx = site_force[i, 0]
+            fy = site_force[i, 1]
+            fz = site_force[i, 2]
             load.force[m, 0] += fx
             load.force[m, 1] += fy
             load.force[m, 2] += fz
@@ -97,19 +97,6 @@ def _load_molecule(sites, state, load, m, site_force):
             load.torque_body[m, 2] += x * by - y * bx
 
     return load_body
-
-
-@kernel(inline=True)
-def sum_blocks(site_force, i):
-    """Force on site i: the blocks' shares (blocks, s, 3), always added in the same order."""
-    fx = site_force[0, i, 0]
-    fy = site_force[0, i, 1]
-    fz = site_force[0, i, 2]
-    for block in range(1, len(site_force)):
-        fx += site_force[block, i, 0]
-        fy += site_force[block, i, 1]
-        fz += site_force[block, i, 2]
-    return fx, fy, fz
 
 
 @kernel(parallel=True)
@@ -136,7 +123,7 @@ def place_sites(sites, state, site_position):
 
 @kernel
 def load_from_sites(sites, state, load, site_force):
-    """Add the site forces (blocks, s, 3) to the bodies' forces and torques."""
+    """Add the site forces (s, 3) to the bodies' forces and torques."""
     if len(state.position) <= SERIAL:
         for m in range(len(state.position)):
             load_molecule(sites, state, load, m, site_force)
@@ -148,8 +135,7 @@ def load_from_sites(sites, state, load, site_force):
 def virial_of_offsets(sites, state, site_position, site_force, tally):
     """Turn the site virial in `tally` into the molecular one: subtract sum f (x) (x_site - X_molecule)."""
     for i in range(len(site_position)):
-        force = sum_blocks(site_force, i)
         for k in range(3):
             offset = site_position[i, k] - state.position[sites.molecule[i], k]
             for row in range(3):
-                tally[1 + 3 * row + k] -= force[row] * offset
+                tally[1 + 3 * row + k] -= site_force[i, row] * offset

@@ -270,8 +270,8 @@ class MolecularScene(Scene):
 
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Everything random follows from it"""
-    precision: Literal["double"] = "double"
-    """Arithmetic of the forces"""
+    precision: Literal["double", "mixed"] = "double"
+    """Arithmetic of the forces between sites; mixed: single, summed and moved in double"""
     threads: Count | None = None
     """Threads; all cores when not given. Results do not depend on it"""
     structure: Structure | None = None

@@ -1,0 +1,157 @@
+"""Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
+
+A slot is a place in that order. Positions are kept relative to the origin of their cluster, where a float32 has digits
+enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three vectors
+one after the other; slot k of cluster c has its x at `3 * width * c + k`.
+"""
+
+from math import ceil, floor, inf
+from typing import NamedTuple
+
+import numpy as np
+from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of
+from rigidmd.jit import PAIR_FLAGS, kernel
+
+BLOCKS = 16  # enough for 16 threads
+SERIAL_SITES = 1000  # up to this many there is one block, and no thread is started
+
+
+class Clusters(NamedTuple):
+    """The sites of one law in clusters. The last cluster is filled up with copies of the last site."""
+
+    bounds: np.ndarray  # (blocks + 1,) block b holds clusters bounds[b] ... bounds[b + 1] - 1
+    order: np.ndarray  # (slots,) the site in each slot
+    group: np.ndarray  # (slots,) int32 group of the site in each slot
+    anchor: np.ndarray  # (slots, 3) what to subtract from positions: origin and image, Å
+    origin: np.ndarray  # (4 clusters,) x, y, z, 0 in the box, Å
+    local: np.ndarray  # (3 slots,) positions relative to the origins, Å
+    reference: np.ndarray  # (3 slots,) `local` when last sorted
+    moved2: np.ndarray  # (blocks,) largest squared displacement since, Å²
+    wrapped: np.ndarray  # (s, 3) positions in the box when last sorted
+
+
+def clusters_of(sites: int, dtype: type) -> Clusters:
+    """Room for clusters of this many sites with positions of a NumPy dtype."""
+    width = lane_count(dtype)
+    count = max(1, ceil(sites / width))
+    blocks = min(BLOCKS, count) if sites > SERIAL_SITES else 1
+    slots = count * width
+    return Clusters(
+        bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
+        order=np.zeros(slots, np.int64),
+        group=np.zeros(slots, np.int32),
+        anchor=np.zeros((slots, 3)),
+        origin=np.zeros(4 * count),
+        local=np.zeros(3 * slots, dtype),
+        reference=np.zeros(3 * slots, dtype),
+        moved2=np.zeros(blocks),
+        wrapped=np.zeros((sites, 3)),
+    )
+
+
+@kernel
+def sort_into_clusters(clusters, space, position):
+    """Sort sites at positions (s, 3) into clusters; they must then be settled there.
+
+    Columns along z as wide as a cluster, up one and down the next, so that a cluster that begins in one column and ends
+    in the next is compact too.
+    """
+    s = len(position)
+    width = width_of(clusters.local)
+    low = np.full(3, inf)
+    high = np.full(3, -inf)
+    lengths = (space.x, space.y, space.z)
+    wrapped = clusters.wrapped
+    for i in range(s):
+        for k in range(3):
+            boxes = floor(position[i, k] / lengths[k]) if lengths[k] < inf else 0.0
+            wrapped[i, k] = position[i, k] - boxes * lengths[k] if boxes != 0.0 else position[i, k]
+            low[k] = min(low[k], wrapped[i, k])
+            high[k] = max(high[k], wrapped[i, k])
+    extent = high - low
+    edge = (extent[0] * extent[1] * extent[2] * width / s) ** (1 / 3)
+    nx = max(1, min(s, round(extent[0] / edge))) if edge > 0 else 1
+    ny = max(1, min(s // nx, round(extent[1] / edge))) if edge > 0 else 1
+    nz = max(1, s // (nx * ny))
+    cell = np.empty(s, np.int64)
+    height = np.empty(s)
+    start = np.zeros(nx * ny * nz + 1, np.int64)
+    for i in range(s):
+        x = _bin(wrapped[i, 0] - low[0], extent[0], nx)
+        y = _bin(wrapped[i, 1] - low[1], extent[1], ny)
+        z = _bin(wrapped[i, 2] - low[2], extent[2], nz)
+        column = x * ny + (y if x % 2 == 0 else ny - 1 - y)
+        up = column % 2 == 0
+        height[i] = wrapped[i, 2] if up else -wrapped[i, 2]
+        cell[i] = column * nz + (z if up else nz - 1 - z)
+        start[cell[i] + 1] += 1
+    start[:] = np.cumsum(start)
+    order = clusters.order
+    for i in range(s):
+        order[start[cell[i]]] = i
+        start[cell[i]] += 1
+    # now start[c] is where cell c ends; sites of a cell are in the order of their indices and few
+    for a in range(1, s):
+        i = order[a]
+        b = a
+        while b > 0 and cell[order[b - 1]] == cell[i] and height[order[b - 1]] > height[i]:
+            order[b] = order[b - 1]
+            b -= 1
+        order[b] = i
+    order[s:] = order[s - 1]
+
+
+@kernel(inline=True)
+def _bin(x, extent, count):
+    return min(count - 1, int(x / extent * count)) if extent > 0 else 0
+
+
+@kernel(counted=False)
+def settle_block(clusters, position, group, block):
+    """Origins, anchors and places of newly sorted clusters; their origin is the middle of their box."""
+    width = width_of(clusters.local)
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for k in range(3):
+            low, high = inf, -inf
+            for slot in range(width * c, width * (c + 1)):
+                x = clusters.wrapped[clusters.order[slot], k]
+                low = min(low, x)
+                high = max(high, x)
+            clusters.origin[4 * c + k] = 0.5 * (low + high)
+        for slot in range(width * c, width * (c + 1)):
+            i = clusters.order[slot]
+            clusters.group[slot] = group[i]
+            for k in range(3):
+                at = slot + 2 * width * c + k * width
+                clusters.anchor[slot, k] = position[i, k] - (clusters.wrapped[i, k] - clusters.origin[4 * c + k])
+                clusters.local[at] = position[i, k] - clusters.anchor[slot, k]
+                clusters.reference[at] = clusters.local[at]
+
+
+@kernel(fastmath=PAIR_FLAGS, counted=False)
+def follow_block(clusters, position, limit2, block):
+    """Bring `local` of a block to the positions (s, 3); the largest squared displacement since the sorting.
+
+    Infinite if it is beyond limit2 or not a number.
+    """
+    width = width_of(clusters.local)
+    local, reference = clusters.local, clusters.reference
+    full = (1 << width) - 1
+    worst = 0.0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        at = 3 * width * c
+        for k in range(width):
+            slot = width * c + k
+            i = clusters.order[slot]
+            local[at + k] = position[i, 0] - clusters.anchor[slot, 0]
+            local[at + width + k] = position[i, 1] - clusters.anchor[slot, 1]
+            local[at + 2 * width + k] = position[i, 2] - clusters.anchor[slot, 2]
+        dx = load(local, at) - load(reference, at)
+        dy = load(local, at + width) - load(reference, at + width)
+        dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
+        d2 = dx * dx + dy * dy + dz * dz
+        if bits(d2 <= limit2) != full:
+            worst = inf
+        else:
+            worst = max(worst, largest(d2))
+    return worst

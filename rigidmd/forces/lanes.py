@@ -1,0 +1,432 @@
+"""SIMD vectors for compiled code: a Numba type whose values are LLVM vectors.
+
+Lanes of float32 or float64 follow `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
+from and stored to contiguous arrays. Everything is portable LLVM; it becomes AVX-512, AVX2, SSE or NEON. How many lanes
+a vector has is chosen for the machine (jit.SIMD_BITS): 16 float32 with AVX-512, 8 with AVX2, 4 else; half as many float64.
+
+The same functions take scalars, so that a formula written once serves pair loops and single numbers.
+"""
+
+import operator
+from math import sqrt
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+
+from rigidmd.jit import PAIR_FLAGS, SIMD_BITS, implements
+
+FLAGS = tuple(sorted(PAIR_FLAGS))
+COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
+
+
+def lane_count(dtype) -> int:
+    """Lanes of a vector of a NumPy dtype on this machine."""
+    return SIMD_BITS // (8 * np.dtype(dtype).itemsize)
+
+
+class Lanes(types.Type):
+    """Numba type of a vector of `count` numbers."""
+
+    def __init__(self, dtype, count):
+        self.dtype, self.count = dtype, count
+        super().__init__(f"lanes({count} x {dtype})")
+
+
+class Mask(types.Type):
+    """Numba type of a truth value for each of `count` lanes."""
+
+    def __init__(self, count):
+        self.count = count
+        super().__init__(f"mask({count})")
+
+
+@register_model(Lanes)
+class LanesModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(manager[kind.dtype].get_value_type(), kind.count))
+
+
+@register_model(Mask)
+class MaskModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.count))
+
+
+# --- operators -------------------------------------------------------------------------------------------------------
+
+
+def _common(a, b) -> Lanes | None:
+    """The vector type of two operands, at least one of them a vector, the other one like it or a number."""
+    if isinstance(b, Lanes):
+        a, b = b, a
+    return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
+
+
+def _filled(context, builder, value, kind, lanes):
+    """The value as a vector: itself, or a number in every lane."""
+    if kind == lanes:
+        return value
+    number = context.cast(builder, value, kind, lanes.dtype)
+    vector = ir.VectorType(number.type, lanes.count)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, ir.IntType(32)(0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), lanes.count), [0] * lanes.count)
+    return builder.shuffle_vector(first, first, order)
+
+
+def _operator(functions, emit, result=lambda lanes: lanes):
+    """Teach Numba a binary operator: emit(builder, left, right) of two vectors."""
+    for function in functions:
+
+        @type_callable(function)
+        def of_types(context):
+            def typer(a, b):
+                lanes = _common(a, b)
+                return result(lanes) if lanes is not None else None
+
+            return typer
+
+        def lower(context, builder, signature, arguments):
+            lanes = _common(*signature.args)
+            left, right = (
+                _filled(context, builder, v, kind, lanes) for v, kind in zip(arguments, signature.args, strict=True)
+            )
+            return emit(builder, left, right)
+
+        for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+            lower_builtin(function, *kinds)(lower)
+
+
+_operator([operator.add, operator.iadd], lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
+_operator([operator.sub, operator.isub], lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
+_operator([operator.mul, operator.imul], lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
+_operator([operator.truediv, operator.itruediv], lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
+
+
+def _compare(function, sign):
+    def emit(builder, a, b):
+        if isinstance(a.type.element, ir.IntType):
+            return builder.icmp_signed(sign, a, b)
+        return builder.fcmp_ordered(sign, a, b)
+
+    _operator([function], emit, lambda lanes: Mask(lanes.count))
+
+
+for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.eq, "==")):
+    _compare(_function, _sign)
+
+
+def _logic(function, emit):
+    @type_callable(function)
+    def of_types(context):
+        return lambda a, b: a if isinstance(a, Mask) and a == b else None
+
+    lower_builtin(function, Mask, Mask)(lambda context, builder, signature, arguments: emit(builder, *arguments))
+
+
+_logic(operator.and_, lambda builder, a, b: builder.and_(a, b))
+_logic(operator.or_, lambda builder, a, b: builder.or_(a, b))
+
+
+# --- memory ----------------------------------------------------------------------------------------------------------
+
+
+def _address(context, builder, array_type, array, index, lanes):
+    """Where the vector at array[index] begins, as a pointer to a vector."""
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
+
+
+def _is_row(array) -> bool:
+    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C"
+
+
+def _load(lanes, array):
+    def emit(context, builder, signature, arguments):
+        address = _address(context, builder, array, *arguments, lanes)
+        return builder.load(address, align=array.dtype.bitwidth // 8)
+
+    return lanes(array, types.intp), emit
+
+
+@intrinsic
+def load(typing, array, index):
+    """The vector array[index], array[index + 1], ...; array contiguous, one axis."""
+    return _load(Lanes(array.dtype, COUNT[array.dtype]), array) if _is_row(array) else None
+
+
+@intrinsic
+def load_beside(typing, array, index, other):
+    """`load` with as many lanes as vectors of another array have."""
+    signature, emit = _load(Lanes(array.dtype, COUNT[other.dtype]), array)
+    return signature.return_type(array, types.intp, other), lambda c, b, s, a: emit(c, b, s, a[:2])
+
+
+@intrinsic
+def load_four(typing, array, index):
+    """Four numbers from array[index] on."""
+    return _load(Lanes(array.dtype, 4), array) if _is_row(array) else None
+
+
+@intrinsic
+def four(typing, x, y, z):
+    """(x, y, z, 0) as a vector of float64."""
+    lanes = Lanes(types.float64, 4)
+
+    def emit(context, builder, signature, arguments):
+        vector = ir.Constant(context.get_value_type(lanes), [0.0] * 4)
+        for k, value in enumerate(arguments):
+            vector = builder.insert_element(vector, value, ir.IntType(32)(k))
+        return vector
+
+    return lanes(types.float64, types.float64, types.float64), emit
+
+
+@intrinsic
+def store(typing, array, index, lanes):
+    """Write a vector to array[index], array[index + 1], ..."""
+
+    def emit(context, builder, signature, arguments):
+        target, index, value = arguments
+        address = _address(context, builder, array, target, index, lanes)
+        builder.store(value, address, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes), emit
+
+
+# --- functions of lanes ----------------------------------------------------------------------------------------------
+
+
+def _call(builder, name, result, *arguments, flags=FLAGS):
+    """Call an LLVM intrinsic."""
+    kind = ir.FunctionType(result, [a.type for a in arguments])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments, fastmath=flags)
+
+
+def _suffix(kind) -> str:
+    """How LLVM writes a vector type in names of intrinsics."""
+    element = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}.get(kind.element) or f"i{kind.element.width}"
+    return f"v{kind.count}{element}"
+
+
+@intrinsic
+def _root(typing, x):
+    def emit(context, builder, signature, arguments):
+        kind = arguments[0].type
+        return _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
+
+    return x(x), emit
+
+
+@intrinsic
+def _quick_inverse(typing, x):
+    """1/sqrt(x) in float32 where LLVM may take the machine's estimate with a Newton step: 2e-7."""
+
+    def emit(context, builder, signature, arguments):
+        kind = arguments[0].type
+        root = _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
+        return builder.fdiv(ir.Constant(kind, [1.0] * kind.count), root, flags=(*FLAGS, "afn"))
+
+    return x(x), emit
+
+
+def _converted(dtype):
+    def converted(typing, x):
+        lanes = Lanes(dtype, x.count)
+
+        def emit(context, builder, signature, arguments):
+            target = context.get_value_type(lanes)
+            if x.dtype == dtype:
+                return arguments[0]
+            change = builder.fptrunc if dtype.bitwidth < x.dtype.bitwidth else builder.fpext
+            return change(arguments[0], target)
+
+        return lanes(x), emit
+
+    return converted
+
+
+single = intrinsic(_converted(types.float32))
+double = intrinsic(_converted(types.float64))
+
+
+def inverse_root(x):
+    """1/sqrt(x), to about the last digit."""
+    raise TypeError("compiled code only")
+
+
+@implements(inverse_root, PAIR_FLAGS, inline=True)
+def _inverse_root(x):
+    if not isinstance(x, Lanes):
+        return lambda x: 1 / sqrt(x)
+    if x.dtype == types.float32:
+        return lambda x: _quick_inverse(x)
+
+    def refined(x):
+        # From the float32 result (24 bits) one step of third order reaches 53; a float64 root and division take longer.
+        y = double(_quick_inverse(single(x)))
+        e = 1.0 - x * y * y
+        return y + y * e * (0.5 + 0.375 * e)
+
+    return refined
+
+
+def _chosen(sign):
+    def chosen(typing, x, y):
+        def emit(context, builder, signature, arguments):
+            a, b = (_filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
+            return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+
+        return x(x, y), emit
+
+    return chosen
+
+
+_larger = intrinsic(_chosen(">"))
+_smaller = intrinsic(_chosen("<"))
+
+
+def larger(x, y):
+    """The larger of x and y, which may be a number, in each lane; y where x is not a number."""
+    raise TypeError("compiled code only")
+
+
+@implements(larger, PAIR_FLAGS, inline=True)
+def _larger_of_both(x, y):
+    if isinstance(x, Lanes):
+        return lambda x, y: _larger(x, y)
+    return lambda x, y: max(x, y)
+
+
+def smaller(x, y):
+    """The smaller of x and y, which may be a number, in each lane; y where x is not a number."""
+    raise TypeError("compiled code only")
+
+
+@implements(smaller, PAIR_FLAGS, inline=True)
+def _smaller_of_both(x, y):
+    if isinstance(x, Lanes):
+        return lambda x, y: _smaller(x, y)
+    return lambda x, y: min(x, y)
+
+
+@intrinsic
+def select(typing, mask, x, y):
+    """x where the mask is set, y elsewhere; y may be a number."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.select(
+            arguments[0], arguments[1], _filled(context, builder, arguments[2], signature.args[2], x)
+        )
+
+    return x(mask, x, y), emit
+
+
+@intrinsic
+def bits(typing, mask):
+    """The mask as an integer, bit k for lane k."""
+
+    def emit(context, builder, signature, arguments):
+        word = builder.bitcast(arguments[0], ir.IntType(mask.count))
+        return builder.zext(word, ir.IntType(64)) if mask.count < 64 else word
+
+    return types.int64(mask), emit
+
+
+@intrinsic
+def lowest_bit(typing, word):
+    """Index of the lowest bit that is set; the word is not 0."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.cttz(arguments[0], ir.IntType(1)(1))
+
+    return types.int64(types.int64), emit
+
+
+@intrinsic
+def mask_of(typing, word, lanes):
+    """The mask for such lanes whose lane k is bit k of an integer."""
+    mask = Mask(lanes.count)
+
+    def emit(context, builder, signature, arguments):
+        return builder.bitcast(builder.trunc(arguments[0], ir.IntType(mask.count)), context.get_value_type(mask))
+
+    return mask(types.int64, lanes), emit
+
+
+@intrinsic
+def total(typing, x):
+    """The sum of all lanes as a float64; added in pairs, always in the same order."""
+
+    def emit(context, builder, signature, arguments):
+        value, count = arguments[0], x.count
+        if x.dtype == types.float32:
+            value = builder.fpext(value, ir.VectorType(ir.DoubleType(), count))
+        while count > 1:
+            count //= 2
+            halves = []
+            for start in (0, count):
+                order = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(start, start + count)))
+                halves.append(builder.shuffle_vector(value, value, order))
+            value = builder.fadd(*halves)
+        return builder.extract_element(value, ir.IntType(32)(0))
+
+    return types.float64(x), emit
+
+
+@intrinsic
+def largest(typing, x):
+    """The largest number of all lanes; what it makes of lanes that are none is not defined."""
+
+    def emit(context, builder, signature, arguments):
+        kind, flags = arguments[0].type, (*FLAGS, "nnan")
+        return _call(builder, f"llvm.vector.reduce.fmax.{_suffix(kind)}", kind.element, *arguments, flags=flags)
+
+    return x.dtype(x), emit
+
+
+@intrinsic
+def lane(typing, x, k):
+    """The number in lane k."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.extract_element(arguments[0], arguments[1])
+
+    return x.dtype(x, types.intp), emit
+
+
+@intrinsic
+def fill(typing, number, array):
+    """A vector of an array's type with a number in every lane."""
+    lanes = Lanes(array.dtype, COUNT[array.dtype])
+
+    def emit(context, builder, signature, arguments):
+        return _filled(context, builder, arguments[0], number, lanes)
+
+    return lanes(number, array), emit
+
+
+def width_of(array):
+    """Lanes of the vectors of an array, known when compiled."""
+    raise TypeError("compiled code only")
+
+
+@implements(width_of, inline=True)
+def _width_of(array):
+    count = COUNT[array.dtype]
+    return lambda array: count
+
+
+def narrowed(x, array):
+    """A vector in the precision of an array."""
+    raise TypeError("compiled code only")
+
+
+@implements(narrowed, inline=True)
+def _narrowed(x, array):
+    if array.dtype == types.float32:
+        return lambda x, array: single(x)
+    return lambda x, array: x
