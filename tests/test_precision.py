@@ -152,7 +152,7 @@ def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
     assert found.most_exact.integrator == "srkn_4"
     assert found.most_exact.timestep == pytest.approx(1.0)
     said = table_text(found)
-    assert "T_rot - T_trans on the steps (K)" in said
+    assert "T_rot - T_trans (K): on the steps" in said
     assert "(held against)" in said
     assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(advice(found))
     written = write_precision(tmp_path, found, "a command")
@@ -181,7 +181,7 @@ def test_what_else_is_kept_is_shown(top):
     verlet = trials(top, "velocity_verlet")[0]
     assert set(verlet.kept) == {"L_z", "L_3"}
     assert max(verlet.kept.values()) < 1e-12
-    assert "error of L_z" in table_text(top)
+    assert "L_z" in table_text(top).splitlines()[1]
     dimer = precision(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["velocity_verlet"], [1.0], repeats=1)
     assert set(dimer.trials[0].kept) == {"momentum", "L"}
     assert max(dimer.trials[0].kept.values()) < 1e-11
@@ -196,8 +196,10 @@ def test_orders_cost_and_temperatures_of_512_waters():
     }  # fmt: skip
     scene = Scene.read(ROOT / "systems" / "water.toml", changes)
     found = precision(scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1)
-    for name, order, margin in (("velocity_verlet", 2, 0.1), ("chin_4a", 4, 0.2), ("srkn_4", 4, 0.2)):
-        own = [trial for trial in trials(found, name) if trial.rotation_error < 0.01]
+    for name, order, margin, most in (
+        ("velocity_verlet", 2, 0.1, 0.1), ("chin_4a", 4, 0.2, 1e-3), ("srkn_4", 4, 0.2, 1e-3)
+    ):  # fmt: skip
+        own = [trial for trial in trials(found, name) if trial.rotation_error < most]
         a, b = own[0], own[-1]
         slope = np.log(a.rotation_error / b.rotation_error) / np.log(a.timestep / b.timestep)
         assert a.rotation_error / b.rotation_error > 10

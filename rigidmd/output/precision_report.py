@@ -14,6 +14,9 @@ from rigidmd.output.report import FAINT, INK, signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
 COLORS = ("#2b6f9e", "#8fb4cf", "#c8553d", "#e2a08f", "#4f8a5b", "#9bbf9f", "#7a5ca3", "#b8862d", INK, FAINT)
+#: So that a line of the table fits a terminal.
+SHORT_TITLES = {"error of ": "", "energy drift in the span": "drift", " per ": "/", "seconds": "s", "spread (%)": "± %",
+                "energy rms": "energy", "orthogonality": "QᵀQ"}  # fmt: skip
 ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
 
@@ -72,7 +75,11 @@ def average_row(found: Precision, trial: Trial) -> list:
 
 def table_text(found: Precision) -> str:
     """The tables as a person reads them."""
-    text = _columns([headers(found), *(row(found, t) for t in found.trials)])
+    titles = headers(found)
+    for long, short in SHORT_TITLES.items():
+        titles = [title.replace(long, short) for title in titles]
+    text = "errors of Q, X, the energy (rms, drift over the span), and what else is conserved\n"
+    text += _columns([titles, *(row(found, t) for t in found.trials)])
     if found.sampled and (sampled := [t for t in found.trials if t.averages]):
         rows = [_brief_headers(), *(_brief_row(found, t) for t in sampled)]
         text += f"\n\naverages over {found.sampled:g} ps\n" + _columns(rows)
@@ -80,8 +87,9 @@ def table_text(found: Precision) -> str:
 
 
 def _brief_headers() -> list[str]:
-    of = [f"T_rot - T_trans {words} (K)" for words in ESTIMATORS.values()]
-    return ["integrator", "step (fs)", "T_trans (K)", *of, "bias of U (kJ/mol)", "bias of P (bar)"]
+    first, *others = ESTIMATORS.values()
+    return ["integrator", "step (fs)", "T_trans (K)", f"T_rot - T_trans (K): {first}", *others, "bias of U (kJ/mol)",
+            "bias of P (bar)"]  # fmt: skip
 
 
 def _brief_row(found: Precision, trial: Trial) -> list[str]:
