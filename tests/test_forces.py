@@ -129,8 +129,9 @@ def test_a_list_with_little_room_grows_and_misses_nothing():
     expected = energies(engine, state)
     terms = engine.terms
     for name, term in terms.items():
+        blocks = len(term.pairs.entries)
         cramped = term.pairs._replace(
-            partner=np.empty((len(term.pairs.partner), 3), np.int32), counters=np.zeros(2, np.int64)
+            entries=np.empty((blocks, 3), np.int32), masked=np.empty((blocks, 1, 2), np.int32)
         )
         terms[name] = term._replace(pairs=cramped)
     assert energies(Engine(engine.model, terms), state) == expected

@@ -312,7 +312,9 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
         law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing)
         if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
             raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
-        terms["lennard_jones"] = pair_forces(law, space, _taking_part(species, index, chosen), forces.skin_A, scene.precision)
+        terms["lennard_jones"] = pair_forces(
+            law, space, _taking_part(species, index, chosen), forces.skin_A, scene.precision
+        )
         if forces.tail_correction:
             constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
     chosen = [np.flatnonzero(m.charges != 0) for m in species]

@@ -318,9 +318,7 @@ def select(typing, mask, x, y):
     """x where the mask is set, y elsewhere; y may be a number."""
 
     def emit(context, builder, signature, arguments):
-        return builder.select(
-            arguments[0], arguments[1], _filled(context, builder, arguments[2], signature.args[2], x)
-        )
+        return builder.select(arguments[0], arguments[1], _filled(context, builder, arguments[2], signature.args[2], x))
 
     return x(mask, x, y), emit
 

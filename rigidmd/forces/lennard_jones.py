@@ -9,7 +9,16 @@ from scipy.integrate import quad
 from rigidmd.forces import pairs
 from rigidmd.forces.lanes import inverse_root, load
 from rigidmd.forces.truncation import (
-    Bent, Name, Polynomial, Shape, Switched, added, ended, ending, shape_of, switching,
+    Bent,
+    Name,
+    Polynomial,
+    Shape,
+    Switched,
+    added,
+    ended,
+    ending,
+    shape_of,
+    switching,
 )  # fmt: skip
 from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 
@@ -167,7 +176,11 @@ def _lost(law: LennardJones, end: np.ndarray, p: int) -> float:
     inside = -end[0] * law.cutoff**3 / 3
 
     if isinstance(law.shape, Switched):
-        return beyond + inside + quad(lambda r: (1 - switching(law.shape, r)[0]) * r ** (2 - p), law.shape.start, law.cutoff)[0]
+        return (
+            beyond
+            + inside
+            + quad(lambda r: (1 - switching(law.shape, r)[0]) * r ** (2 - p), law.shape.start, law.cutoff)[0]
+        )
     if isinstance(law.shape, Bent):
         start = law.shape.start
         inside += quad(lambda r: -(r**2) * added(end, r - start)[0], start, law.cutoff)[0]
