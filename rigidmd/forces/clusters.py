@@ -1,8 +1,8 @@
 """Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
 
 A slot is a place in that order. Positions are kept relative to the origin of their cluster, where a float32 has digits
-enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three vectors
-one after the other; slot k of cluster c has its x at `3 * width * c + k`.
+enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three
+vectors one after the other; slot k of cluster c has its x at `3 * width * c + k`.
 """
 
 from math import ceil, floor, inf
@@ -150,8 +150,5 @@ def follow_block(clusters, position, limit2, block):
         dy = load(local, at + width) - load(reference, at + width)
         dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
         d2 = dx * dx + dy * dy + dz * dz
-        if bits(d2 <= limit2) != full:
-            worst = inf
-        else:
-            worst = max(worst, largest(d2))
+        worst = max(worst, largest(d2)) if bits(d2 <= limit2) == full else inf
     return worst

@@ -6,8 +6,8 @@ stand in shells by their distance, and what sites have moved so far says how man
 worked through as if it had no skin.
 
 Each pair of clusters stands in one of its two rows: that of the one behind, clusters being thought of as a ring. The
-list is cut into blocks of rows, filled by whichever thread takes them, so the list and everything summed from it has the
-same bits for any number of threads.
+list is cut into blocks of rows, filled by whichever thread takes them, so the list and everything summed from it has
+the same bits for any number of threads.
 """
 
 from math import ceil, inf, sqrt

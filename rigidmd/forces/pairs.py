@@ -80,11 +80,11 @@ def pair_forces(
 
 
 def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with its machine code, and as much room as its last neighbour list asked for; other terms as they are."""
+    """The term with its machine code and as much room as its last list asked for; other terms as they are."""
     if not isinstance(term, PairForces):
         return term
     term = term._replace(pairs=neighbors.with_room(term.pairs))
-    if (room := _room(term)) > term.sums.others.shape[1]:
+    if (room := _room(term.pairs)) > term.sums.others.shape[1]:
         others = np.zeros((len(term.sums.others), int(1.1 * room)), term.sums.others.dtype)
         term = term._replace(sums=term.sums._replace(others=others))
     if term.parts.forces == 0:
@@ -94,15 +94,17 @@ def with_room(term: NamedTuple) -> NamedTuple:
 
 
 @kernel
-def _room(term):
+def _room(pairs):
     """Room that a block needs for forces on the sites of others."""
-    return 3 * width_of(term.pairs.clusters.local) * term.pairs.needed[:, 2].max()
+    return 3 * width_of(pairs.clusters.local) * pairs.needed[:, 2].max()
 
 
-def forget_list(term: NamedTuple) -> None:
-    """Have the term's neighbour list built anew at its next use, in place."""
-    if isinstance(term, PairForces):
-        term.pairs.counters[0] = 0
+def with_own_list(term: NamedTuple) -> NamedTuple:
+    """The term with work arrays that it shares with no other; other terms as they are."""
+    if not isinstance(term, PairForces):
+        return term
+    precision = next(name for name, dtype in PRECISIONS.items() if dtype == term.sums.others.dtype)
+    return pair_forces(term.law, term.space, term.sites, term.pairs.skin, precision)
 
 
 def pair(law, i, j, r2):
@@ -134,7 +136,7 @@ def _add_pair_forces(term, state, load, tally):
         status = update_list(pairs)
         if status != OK:
             return status
-        if _room(term) > sums.others.shape[1]:
+        if _room(pairs) > sums.others.shape[1]:
             pairs.counters[0] = 0
             return LIST_FULL
         if pairs.counters[1] != builds:
