@@ -48,6 +48,6 @@ def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engi
     return system, Engine(system.model, system.terms), state
 
 
-def built(counts, edge, seed=0, **sections):
+def built(counts, edge, seed=0, spread=0.4, **sections):
     """`shaken` of `small_scene`."""
-    return shaken(build(small_scene(counts, edge, **sections)), seed)
+    return shaken(build(small_scene(counts, edge, **sections)), seed, spread)

@@ -11,7 +11,7 @@ from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import answer
-from rigidmd.forces.pairs import forget_list, with_room
+from rigidmd.forces.pairs import with_own_list, with_room
 from rigidmd.forces.terms import ASK, LIST_FULL, NOT_FINITE, TALLY_SIZE, Load, NoForce, State, add_term, no_load
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
@@ -41,9 +41,8 @@ class Engine:
     ):
         self.model = model
         self.names = list(terms)
-        self._terms = tuple(terms.values()) or (NoForce(),)
-        for term in self._terms:
-            forget_list(term)  # a list left by another engine has its pairs in another order, and sums other last bits
+        # a list that another engine has left would have its pairs in another order, and sum other last bits
+        self._terms = tuple(with_own_list(term) for term in terms.values()) or (NoForce(),)
         self._applied = applied or {}
         self.load: Load | None = None
         self._probe: Probe | None = None

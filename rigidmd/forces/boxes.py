@@ -54,7 +54,7 @@ def grow(tree, clusters):
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
 def within_reach(tree, low, high, radius2, stack, found, count):
-    """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,), in ascending order.
+    """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,); ascending.
 
     Returns the new count, which may exceed the room; stack (levels, 2) is scratch.
     """

@@ -1,14 +1,15 @@
 """Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
 
 A slot is a place in that order. Positions are kept relative to the origin of their cluster, where a float32 has digits
-enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three vectors
-one after the other; slot k of cluster c has its x at `3 * width * c + k`.
+enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three
+vectors one after the other; slot k of cluster c has its x at `3 * width * c + k`.
 """
 
 from math import ceil, floor, inf
 from typing import NamedTuple
 
 import numpy as np
+
 from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of
 from rigidmd.jit import PAIR_FLAGS, kernel
 
@@ -50,8 +51,8 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
 
 
 @kernel
-def sort_into_clusters(clusters, space, position):
-    """Sort sites at positions (s, 3) into clusters; they must then be settled there.
+def sort_into_clusters(clusters, edges, position):
+    """Sort sites at positions (s, 3) in a box with these edges (3,) into clusters; they must then be settled there.
 
     Columns along z as wide as a cluster, up one and down the next, so that a cluster that begins in one column and ends
     in the next is compact too.
@@ -60,12 +61,11 @@ def sort_into_clusters(clusters, space, position):
     width = width_of(clusters.local)
     low = np.full(3, inf)
     high = np.full(3, -inf)
-    lengths = (space.x, space.y, space.z)
     wrapped = clusters.wrapped
     for i in range(s):
         for k in range(3):
-            boxes = floor(position[i, k] / lengths[k]) if lengths[k] < inf else 0.0
-            wrapped[i, k] = position[i, k] - boxes * lengths[k] if boxes != 0.0 else position[i, k]
+            boxes = floor(position[i, k] / edges[k]) if edges[k] < inf else 0.0
+            wrapped[i, k] = position[i, k] - boxes * edges[k] if boxes != 0.0 else position[i, k]
             low[k] = min(low[k], wrapped[i, k])
             high[k] = max(high[k], wrapped[i, k])
     extent = high - low
@@ -150,8 +150,5 @@ def follow_block(clusters, position, limit2, block):
         dy = load(local, at + width) - load(reference, at + width)
         dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
         d2 = dx * dx + dy * dy + dz * dz
-        if bits(d2 <= limit2) != full:
-            worst = inf
-        else:
-            worst = max(worst, largest(d2))
+        worst = max(worst, largest(d2)) if bits(d2 <= limit2) == full else inf
     return worst

@@ -6,24 +6,35 @@ stand in shells by their distance, and what sites have moved so far says how man
 worked through as if it had no skin.
 
 Each pair of clusters stands in one of its two rows: that of the one behind, clusters being thought of as a ring. The
-list is cut into blocks of rows, filled by whichever thread takes them, so the list and everything summed from it has the
-same bits for any number of threads.
+list is cut into blocks of rows, filled by whichever thread takes them, so the list and everything summed from it has
+the same bits for any number of threads.
 """
 
 from math import ceil, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from rigidmd.forces.boxes import BoxTree, box_tree, within_reach
-from rigidmd.forces.clusters import Clusters, clusters_of, sort_into_clusters
+
+from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
+from rigidmd.forces.clusters import Clusters, clusters_of, follow_block, settle_block, sort_into_clusters
 from rigidmd.forces.lanes import bits, fill, load, load_beside, lowest_bit, smaller, width_of
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
-from rigidmd.jit import PAIR_FLAGS, kernel
+from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, work
 
 SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
+
+
+class Parts(NamedTuple):
+    """Addresses of the works that keep a list; 0 until they are needed."""
+
+    follow: int = 0
+    prepare: int = 0
+    settle: int = 0
+    grow: int = 0
+    fill: int = 0
 
 
 class PairList(NamedTuple):
@@ -35,6 +46,8 @@ class PairList(NamedTuple):
     cutoff: float  # Å
     skin: float  # Å
     group: np.ndarray  # (s,) pairs inside one group are left out
+    position: np.ndarray  # (s, 3) where the sites are now, lab frame, Å
+    edges: np.ndarray  # (3,) of the box, Å
     clusters: Clusters
     tree: BoxTree
     shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
@@ -42,8 +55,9 @@ class PairList(NamedTuple):
     entries: np.ndarray  # (blocks, capacity) int32
     special: np.ndarray  # (slots, 2) entries with a mask: masked[b, special[i, 0]:special[i, 1]]
     masked: np.ndarray  # (blocks, capacity, 2) entry, and as bits the lanes that count
-    needed: np.ndarray  # (blocks, 3) room the last build asked for: entries, masked entries, window
-    counters: np.ndarray  # (3,) usable (0 or 1); builds so far; shells that matter now
+    needed: np.ndarray  # (blocks, 3) room the last build asked for: entries, masked entries, clusters from the first on
+    counters: np.ndarray  # (4,) usable (0 or 1); builds so far; shells that matter now; status of the preparation
+    parts: Parts
 
 
 def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtype: type) -> PairList:
@@ -54,6 +68,8 @@ def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtyp
         cutoff=cutoff,
         skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
         group=group,
+        position=np.zeros((len(group), 3)),
+        edges=np.array(space),
         clusters=clusters,
         tree=box_tree(len(clusters.origin) // 4),
         shift=np.zeros(4 * 27),
@@ -62,17 +78,50 @@ def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtyp
         special=np.zeros((slots, 2), np.int32),
         masked=np.empty((blocks, 0, 2), np.int32),
         needed=np.zeros((blocks, 3), np.int64),
-        counters=np.zeros(3, np.int64),
+        counters=np.zeros(4, np.int64),
+        parts=Parts(),
     )
 
 
-def enlarged(pairs: PairList) -> PairList:
-    """The same list with the room its last build asked for, and a tenth more."""
-    entries, masked, _ = (int(1.1 * n) + 16 for n in pairs.needed.max(axis=0))
+def with_room(pairs: PairList) -> PairList:
+    """The same list with its machine code and, with a tenth to spare, the room its last build asked for."""
+    if pairs.parts.fill == 0:
+        pairs = pairs._replace(
+            parts=Parts(*(part.address(pairs) for part in (_follow, _prepare, _settle, _grow, _fill)))
+        )
     blocks = len(pairs.needed)
-    return pairs._replace(
-        entries=np.empty((blocks, entries), np.int32), masked=np.empty((blocks, masked, 2), np.int32)
-    )
+    entries, masked, _ = pairs.needed.max(axis=0)
+    if entries > pairs.entries.shape[1]:
+        pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.int32))
+    if masked > pairs.masked.shape[1]:
+        pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
+    return pairs
+
+
+@kernel
+def update_list(pairs):
+    """Bring clusters to the site positions, and build the list anew if it is no longer good. A status code."""
+    blocks = len(pairs.needed)
+    parcel = packed(pairs)
+    if pairs.parts.fill == 0:
+        return LIST_FULL
+    if pairs.counters[0] == 1:
+        call_blocks(pairs.parts.follow, parcel, blocks)
+        if still_good(pairs):
+            return OK
+    pairs.counters[0] = 0
+    call(pairs.parts.prepare, parcel, 0)
+    if pairs.counters[3] != OK:
+        return pairs.counters[3]
+    call_blocks(pairs.parts.settle, parcel, blocks)
+    call(pairs.parts.grow, parcel, 0)
+    call_blocks(pairs.parts.fill, parcel, blocks)
+    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
+        return LIST_FULL
+    pairs.counters[0] = 1
+    pairs.counters[1] += 1
+    pairs.counters[2] = 1
+    return OK
 
 
 @kernel
@@ -85,33 +134,44 @@ def still_good(pairs):
     return True
 
 
-@kernel
-def prepare(pairs, space, position):
-    """Sort the sites for a new list. A status code."""
-    pairs.counters[0] = 0
-    for x in position.flat:
+@work(counted=False)
+def _follow(parcel, block):
+    pairs = opened(parcel)
+    moved2 = follow_block(pairs.clusters, pairs.position, (0.5 * pairs.skin) ** 2, block)
+    pairs.clusters.moved2[block] = moved2
+
+
+@work()
+def _prepare(parcel, block):
+    """Sort the sites for a new list; a status code into counters[3]."""
+    pairs = opened(parcel)
+    pairs.counters[3] = OK
+    for x in pairs.position.flat:
         if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
-            return NOT_FINITE
-    sort_into_clusters(pairs.clusters, space, position)
+            pairs.counters[3] = NOT_FINITE
+            return
+    sort_into_clusters(pairs.clusters, pairs.edges, pairs.position)
     for image in range(27):
-        for k, length in enumerate((space.x, space.y, space.z)):
+        for k in range(3):
             boxes = image // 3 ** (2 - k) % 3 - 1
-            pairs.shift[4 * image + k] = boxes * length if boxes != 0 else 0.0
-    return OK
+            pairs.shift[4 * image + k] = boxes * pairs.edges[k] if boxes != 0 else 0.0
 
 
-@kernel
-def conclude(pairs, others):
-    """Whether a new list had all the room it needs, and the forces (blocks, room) of blocks on others have. A status."""
-    window = pairs.needed[:, 2].max() * 3 * width_of(pairs.clusters.local)
-    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
-        return LIST_FULL
-    if window > others.shape[1]:
-        return LIST_FULL
-    pairs.counters[0] = 1
-    pairs.counters[1] += 1
-    pairs.counters[2] = 1
-    return OK
+@work(counted=False)
+def _settle(parcel, block):
+    pairs = opened(parcel)
+    settle_block(pairs.clusters, pairs.position, pairs.group, block)
+
+
+@work(counted=False)
+def _grow(parcel, block):
+    pairs = opened(parcel)
+    grow(pairs.tree, pairs.clusters)
+
+
+@work()
+def _fill(parcel, block):
+    fill_block(opened(parcel), block)
 
 
 class Scratch(NamedTuple):
@@ -133,9 +193,11 @@ def _scratch(pairs, room):
     width = width_of(pairs.clusters.local)
     bounds2 = np.empty(SHELLS)
     for k in range(SHELLS):
-        bounds2[k] = ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2 if k else (
-            pairs.cutoff * (1 + ROUNDING)
-        ) ** 2
+        bounds2[k] = (
+            ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2
+            if k
+            else (pairs.cutoff * (1 + ROUNDING)) ** 2
+        )
     return Scratch(
         bounds2,
         np.empty((len(pairs.tree.level), 2), np.int64),
@@ -150,16 +212,16 @@ def _scratch(pairs, room):
 
 
 @kernel
-def fill_block(pairs, space, block):
+def fill_block(pairs, block):
     """Rows of one block. Entries beyond the room are counted, not stored."""
     clusters = pairs.clusters
     scratch = _scratch(pairs, 256)
     entries = masked = window = 0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        candidates = _find_candidates(pairs, space, c, scratch)
+        candidates = _find_candidates(pairs, c, scratch)
         if candidates > len(scratch.entry):
             scratch = _scratch(pairs, 2 * candidates)
-            candidates = _find_candidates(pairs, space, c, scratch)
+            candidates = _find_candidates(pairs, c, scratch)
         entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
         window = max(window, ahead + c - clusters.bounds[block] + 1)
     pairs.needed[block, 0] = entries
@@ -168,14 +230,13 @@ def fill_block(pairs, space, block):
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
-def _find_candidates(pairs, space, c, scratch):
+def _find_candidates(pairs, c, scratch):
     """Clusters and images that stand in a cluster's rows and whose box is within reach of its box; how many.
 
     There may be more than there is room for.
     """
     tree = pairs.tree
     count = len(pairs.clusters.origin) // 4
-    lengths = (space.x, space.y, space.z)
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
     entry = scratch.entry
     candidates = 0
@@ -186,7 +247,7 @@ def _find_candidates(pairs, space, c, scratch):
             scratch.low[k] = tree.low[k, c] - shift
             scratch.high[k] = tree.high[k, c] - shift
             if shift != 0.0:
-                reaches &= abs(shift) < inf and scratch.high[k] > -radius and scratch.low[k] < lengths[k] + radius
+                reaches &= abs(shift) < inf and scratch.high[k] > -radius and scratch.low[k] < pairs.edges[k] + radius
         if not reaches:
             continue
         first = candidates
@@ -197,7 +258,7 @@ def _find_candidates(pairs, space, c, scratch):
             ahead = entry[n] - c
             if ahead < 0:
                 ahead += count
-            if 2 * ahead < count or 2 * ahead == count and c < entry[n]:
+            if 2 * ahead < count or (2 * ahead == count and c < entry[n]):
                 entry[candidates] = 32 * entry[n] + image
                 candidates += 1
     return candidates

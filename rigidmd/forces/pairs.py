@@ -8,32 +8,47 @@ images, sums energies, virial and forces, and hands the forces to the bodies.
 from typing import NamedTuple
 
 import numpy as np
-from rigidmd.forces import terms
-from rigidmd.forces.boxes import grow
-from rigidmd.forces.clusters import follow_block, settle_block
+
+from rigidmd.forces import neighbors, terms
 from rigidmd.forces.lanes import (
-    double, fill, four, lane, load, load_beside, load_four, mask_of, narrowed, select, store, total, width_of,
+    double,
+    fill,
+    four,
+    lane,
+    load,
+    load_beside,
+    load_four,
+    mask_of,
+    narrowed,
+    select,
+    store,
+    total,
+    width_of,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, conclude, empty_list, enlarged, fill_block, prepare, still_good
+from rigidmd.forces.neighbors import PairList, empty_list, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.jit import PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
 
 
-class Addresses(NamedTuple):
-    """Where the machine code of the parts of the work is; 0 until it is needed."""
+class Parts(NamedTuple):
+    """Addresses of the works that evaluate a law; 0 until they are needed."""
 
-    follow: int = 0
-    prepare: int = 0
-    settle: int = 0
-    grow: int = 0
-    fill: int = 0
     forces: int = 0
     forces_and_energies: int = 0
     gather: int = 0
+
+
+class Sums(NamedTuple):
+    """Where forces and energies are added up."""
+
+    force: np.ndarray  # (s, 3) lab frame
+    own: np.ndarray  # (3 slots,) what its own row does to each site, stored as Clusters.local
+    others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
+    tallies: np.ndarray  # (blocks, 10)
 
 
 class PairForces(NamedTuple):
@@ -44,13 +59,8 @@ class PairForces(NamedTuple):
     space: Space
     sites: BodySites | CentralSites
     pairs: PairList
-    position: np.ndarray  # (s, 3) lab frame
-    force: np.ndarray  # (s, 3) lab frame
-    own: np.ndarray  # (3 slots,) what its own row does to each site, stored as Clusters.local
-    others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
-    tallies: np.ndarray  # (blocks, 10)
-    status: np.ndarray  # (1,) what preparing the list said
-    addresses: Addresses
+    sums: Sums
+    parts: Parts
 
 
 def pair_forces(
@@ -68,42 +78,41 @@ def pair_forces(
     dtype = PRECISIONS[precision]
     pairs = empty_list(space, sites.molecule if group is None else group, law.cutoff, skin, dtype)
     blocks, slots = len(pairs.needed), len(pairs.clusters.order)
-    return PairForces(
-        law=law,
-        arranged=law.room(slots, dtype),
-        space=space,
-        sites=sites,
-        pairs=pairs,
-        position=np.zeros((len(sites.molecule), 3)),
+    sums = Sums(
         force=np.zeros((len(sites.molecule), 3)),
         own=np.zeros(3 * slots),
         others=np.zeros((blocks, 0), dtype),
         tallies=np.zeros((blocks, TALLY_SIZE)),
-        status=np.zeros(1, np.int64),
-        addresses=Addresses(),
     )
+    return PairForces(law, law.room(slots, dtype), space, sites, pairs, sums, Parts())
 
 
 def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with its machine code, and as much room as its last neighbour list asked for; other terms as they are."""
+    """The term with its machine code and as much room as its last list asked for; other terms as they are."""
     if not isinstance(term, PairForces):
         return term
-    if term.addresses.forces == 0:
-        return term._replace(addresses=Addresses(*(part.address(term) for part in PARTS)))
-    pairs, others = term.pairs, term.others
-    entries, masked, window = pairs.needed.max(axis=0)
-    if entries > pairs.entries.shape[1] or masked > pairs.masked.shape[1]:
-        pairs = enlarged(pairs)
-    cluster = len(pairs.clusters.local) // (len(pairs.clusters.origin) // 4)
-    if window * cluster > others.shape[1]:
-        others = np.zeros((len(others), int(1.1 * window + 1) * cluster), others.dtype)
-    return term._replace(pairs=pairs, others=others)
+    term = term._replace(pairs=neighbors.with_room(term.pairs))
+    if (room := _room(term.pairs)) > term.sums.others.shape[1]:
+        others = np.zeros((len(term.sums.others), int(1.1 * room)), term.sums.others.dtype)
+        term = term._replace(sums=term.sums._replace(others=others))
+    if term.parts.forces == 0:
+        content = (term.arranged, term.pairs, term.sums)
+        term = term._replace(parts=Parts(*(part.address(content) for part in (_forces, _forces_and_energies, _gather))))
+    return term
 
 
-def forget_list(term: NamedTuple) -> None:
-    """Have the term's neighbour list built anew at its next use, in place."""
-    if isinstance(term, PairForces):
-        term.pairs.counters[0] = 0
+@kernel
+def _room(pairs):
+    """Room that a block needs for forces on the sites of others."""
+    return 3 * width_of(pairs.clusters.local) * pairs.needed[:, 2].max()
+
+
+def with_own_list(term: NamedTuple) -> NamedTuple:
+    """The term with work arrays that it shares with no other; other terms as they are."""
+    if not isinstance(term, PairForces):
+        return term
+    precision = next(name for name, dtype in PRECISIONS.items() if dtype == term.sums.others.dtype)
+    return pair_forces(term.law, term.space, term.sites, term.pairs.skin, precision)
 
 
 def pair(law, i, j, r2):
@@ -125,92 +134,55 @@ def _add_pair_forces(term, state, load, tally):
         return None
 
     def add_pair_forces(term, state, load, tally):
-        blocks = len(term.tallies)
-        at = term.addresses
-        if at.forces == 0:
+        pairs = term.pairs
+        sums = term.sums
+        place_sites(term.sites, state, pairs.position)
+        builds = pairs.counters[1]
+        pairs.edges[0] = term.space.x
+        pairs.edges[1] = term.space.y
+        pairs.edges[2] = term.space.z
+        status = update_list(pairs)
+        if status != OK:
+            return status
+        if _room(pairs) > sums.others.shape[1]:
+            pairs.counters[0] = 0
             return LIST_FULL
-        parcel = packed(term)
-        place_sites(term.sites, state, term.position)
-        if term.pairs.counters[0] == 1:
-            call_blocks(at.follow, parcel, blocks)
-        if term.pairs.counters[0] == 0 or not still_good(term.pairs):
-            call(at.prepare, parcel, 0)
-            if term.status[0] != OK:
-                return term.status[0]
-            call_blocks(at.settle, parcel, blocks)
-            call(at.grow, parcel, 0)
-            call_blocks(at.fill, parcel, blocks)
-            status = conclude(term.pairs, term.others)
-            if status != OK:
-                return status
+        if pairs.counters[1] != builds:
+            arrange(term.law, term.arranged, pairs.clusters.order)
+        blocks = len(sums.tallies)
+        parcel = packed((term.arranged, pairs, sums))
         if tally is None:
-            call_blocks(at.forces, parcel, blocks)
+            call_blocks(term.parts.forces, parcel, blocks)
+            call_blocks(term.parts.gather, parcel, blocks)
         else:
-            call_blocks(at.forces_and_energies, parcel, blocks)
-        call_blocks(at.gather, parcel, blocks)
-        if tally is not None:
+            call_blocks(term.parts.forces_and_energies, parcel, blocks)
+            call_blocks(term.parts.gather, parcel, blocks)
             for block in range(blocks):
                 for k in range(len(tally)):
-                    tally[k] += term.tallies[block, k]
-            virial_of_offsets(term.sites, state, term.position, term.force, tally)
-        load_from_sites(term.sites, state, load, term.force)
+                    tally[k] += sums.tallies[block, k]
+            virial_of_offsets(term.sites, state, pairs.position, sums.force, tally)
+        load_from_sites(term.sites, state, load, sums.force)
         return OK
 
     return add_pair_forces
 
 
-@work(counted=False)
-def _follow(parcel, block):
-    term = opened(parcel)
-    clusters = term.pairs.clusters
-    clusters.moved2[block] = follow_block(clusters, term.position, (0.5 * term.pairs.skin) ** 2, block)
-
-
-@work()
-def _prepare(parcel, block):
-    term = opened(parcel)
-    term.status[0] = prepare(term.pairs, term.space, term.position)
-    if term.status[0] == OK:
-        arrange(term.law, term.arranged, term.pairs.clusters.order)
-
-
-@work(counted=False)
-def _settle(parcel, block):
-    term = opened(parcel)
-    settle_block(term.pairs.clusters, term.position, term.pairs.group, block)
-
-
-@work(counted=False)
-def _grow(parcel, block):
-    pairs = opened(parcel).pairs
-    grow(pairs.tree, pairs.clusters)
-
-
-@work()
-def _fill(parcel, block):
-    term = opened(parcel)
-    fill_block(term.pairs, term.space, block)
-
-
 @work(fastmath=PAIR_FLAGS, counted=False)
 def _forces(parcel, block):
-    term = opened(parcel)
-    block_forces(term.arranged, term.pairs, term.own, term.others, None, block)
+    law, pairs, sums = opened(parcel)
+    block_forces(law, pairs, sums.own, sums.others, None, block)
 
 
 @work(fastmath=PAIR_FLAGS, counted=False)
 def _forces_and_energies(parcel, block):
-    term = opened(parcel)
-    block_forces(term.arranged, term.pairs, term.own, term.others, term.tallies, block)
+    law, pairs, sums = opened(parcel)
+    block_forces(law, pairs, sums.own, sums.others, sums.tallies, block)
 
 
 @work(fastmath=PAIR_FLAGS, counted=False)
 def _gather(parcel, block):
-    term = opened(parcel)
-    gather_block(term.pairs, term.own, term.others, term.force, block)
-
-
-PARTS = (_follow, _prepare, _settle, _grow, _fill, _forces, _forces_and_energies, _gather)
+    _, pairs, sums = opened(parcel)
+    gather_block(pairs, sums.own, sums.others, sums.force, block)
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)

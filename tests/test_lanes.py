@@ -1,0 +1,166 @@
+"""Vectors: what they compute, that pair loops are made of them, and what float32 in their place costs."""
+
+import os
+import platform
+import re
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+from conftest import ROOT, built, small_scene
+from numba import types
+
+from rigidmd.build.system import build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.forces import lanes, pairs
+from rigidmd.jit import SIMD_BITS, Parcel, kernel
+
+PRECISIONS = {"double": np.float64, "mixed": np.float32}
+W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}
+
+
+@kernel
+def every_operation(a, b, out, sums):
+    width = lanes.width_of(a)
+    x, y = lanes.load(a, 0), lanes.load(b, 0)
+    results = (
+        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, lanes.larger(x, y), lanes.smaller(x, 1.5), lanes.inverse_root(x),
+        lanes.select(x < y, x, 0.0), lanes.select(lanes.mask_of(5, x), y, x),
+    )  # fmt: skip
+    for k in range(11):
+        lanes.store(out, k * width, results[k])
+    sums[0] = lanes.total(x)
+    sums[1] = lanes.largest(x)
+    sums[2] = lanes.bits((x > 1.0) & (y <= 2.0))
+    sums[3] = lanes.lowest_bit(40)
+    sums[4] = lanes.lane(lanes.narrowed(lanes.load_four(sums, 0), a), 1)
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS.values())
+def test_vectors_compute_as_arrays_do(dtype):
+    width = lanes.lane_count(dtype)
+    assert width * np.dtype(dtype).itemsize * 8 == SIMD_BITS
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0.1, 3, (2, width)).astype(dtype)
+    out, sums = np.zeros(11 * width, dtype), np.zeros(5)
+    every_operation(x, y, out, sums)
+    fives = np.array([k in (0, 2) for k in range(width)])
+    expected = [
+        x + y, x - y, x * y, x / y, 2 - x, x * 3, np.maximum(x, y), np.minimum(x, 1.5), 1 / np.sqrt(x.astype(float)),
+        np.where(x < y, x, 0), np.where(fives, y, x),
+    ]  # fmt: skip
+    assert out.reshape(11, width) == pytest.approx(np.array(expected), rel=4 * np.finfo(dtype).eps)
+    assert sums[0] == pytest.approx(x.sum(dtype=float), rel=1e-14)
+    assert sums[1] == sums[4] == x.max()
+    assert sums[2] == sum(1 << k for k in range(width) if x[k] > 1 and y[k] <= 2)
+    assert sums[3] == 3
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_the_pair_loops_of_water_are_vectorised(precision):
+    _, engine, state = built({"spce": 30}, 20.0, forces=W1, precision=precision)
+    engine.evaluate(state)
+    kind = {"double": "double", "mixed": "float"}[precision]
+    for term in engine.terms.values():
+        parcel = Parcel(numba.typeof((term.arranged, term.pairs, term.sums)))
+        fresh = numba.cfunc(types.void(parcel, types.intp), **pairs._forces.options)(pairs._forces.function)
+        vector = f"<{SIMD_BITS // (64 if kind == 'double' else 32)} x {kind}>"
+        code = fresh.inspect_llvm()
+        assert "NRT" not in code  # nothing in it counts references
+        for operation in ("fmul", "fadd", "fsub", r"fcmp \w*", "select"):
+            assert re.search(
+                rf"{operation}[ \w]* {re.escape(vector)}|select <\d+ x i1> %\S+, {re.escape(vector)}", code
+            )
+        if platform.machine() in ("x86_64", "AMD64"):
+            register = {512: "zmm", 256: "ymm", 128: "xmm"}[SIMD_BITS]
+            suffix = "pd" if kind == "double" else "ps"
+            assembly = fresh._library.get_asm_str()
+            assert len(re.findall(rf"v?mul{suffix}\s.*%{register}", assembly)) > 10
+            assert not re.search(r"v?sqrts[sd]|v?divs[sd]", assembly)  # no pair by itself
+
+
+@pytest.mark.parametrize("ending", ["plain", "shift", "force_shift", "force_switch", "switch"])
+@pytest.mark.parametrize(
+    ("counts", "edge"), [({"tip4p2005": 60, "nitrogen": 30, "argon": 20}, 18.0), ({"spce": 60}, None)]
+)
+def test_mixed_precision_costs_less_than_a_hundred_thousandth(counts, edge, ending):
+    start = {"switch_start_A": 5.0} if ending in ("force_switch", "switch") else {}
+    forces = {"cutoff_A": 7.0, "truncation": ending} | start
+    loads = []
+    for precision in PRECISIONS:
+        _, engine, state = built(counts, edge, 3, 0.1, forces=forces, precision=precision)
+        load, tallies = engine.evaluate(state)
+        loads.append((load, sum(t.energy for t in tallies.values()), sum(t.virial for t in tallies.values())))
+    (double, energy, virial), (mixed, energy_mixed, virial_mixed) = loads
+    for a, b in zip(double, mixed, strict=True):
+        assert np.sqrt(np.mean((a - b) ** 2)) < 1e-5 * np.sqrt(np.mean(a**2))
+    assert energy_mixed == pytest.approx(energy, rel=1e-5)
+    assert virial_mixed == pytest.approx(virial, abs=1e-5 * np.abs(virial).max())
+
+
+SAME_BITS = """
+import hashlib, sys
+sys.path.insert(0, "tests")
+from conftest import small_scene
+from rigidmd.scene import Scene
+from rigidmd.simulation import Simulation
+stage = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.1}
+for precision in ("double", "mixed"):
+    scene = small_scene({"spce": 700, "nitrogen": 500}, 40.0, stages=[stage], precision=precision)
+    state = Simulation(scene).run().state
+    print(hashlib.sha256(b"".join(a.tobytes() for a in state)).hexdigest())
+"""
+
+
+def test_the_same_bits_for_any_number_of_threads():
+    ends = set()
+    for threads in ("1", "2", "16"):
+        environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            [sys.executable, "-c", SAME_BITS], cwd=ROOT, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        ends.add(done.stdout)
+    assert len(ends) == 1
+
+
+def all_pairs(system, state):
+    """Energy of SPC/E water with shifted endings by all pairs, NumPy, no list."""
+    x = system.site_positions(state)
+    owner = system.sites.molecule
+    charge = np.tile(system.species[0].charges, len(state.position))
+    edges, cutoff = np.array(system.space), system.cutoff
+    field = (78.5 - 1) / (2 * 78.5 + 1) / cutoff**3
+    energy = 0.0
+    for i in range(len(x)):
+        d = x[i] - x[i + 1 :]
+        d -= edges * np.round(d / edges)
+        r2 = (d**2).sum(axis=1)
+        near = (r2 < cutoff**2) & (owner[i + 1 :] != owner[i])
+        r = np.sqrt(r2[near])
+        u = 1 / r + field * r**2 - 1 / cutoff - field * cutoff**2
+        energy += 138935.457644 * charge[i] * (charge[i + 1 :][near] * u).sum()
+        if i % 3 == 0:
+            r = r[np.arange(i + 1, len(x))[near] % 3 == 0]
+            s6, c6 = (3.166 / r) ** 6, (3.166 / cutoff) ** 6
+            energy += 4 * system.species[0].epsilon[0] * ((s6**2 - s6) - (c6**2 - c6)).sum()
+    return energy
+
+
+def test_no_pair_is_missed_in_a_long_run():
+    """Wherever the list stands in its life: forces are those of a list built then and there, energies of all pairs."""
+    system = build(small_scene({"spce": 400}, 23.0, forces=W1, start={"temperature_K": 600.0}))
+    engine, state = Engine(system.model, system.terms), system.state.copy()
+    assert system.species[0].sigma[0] == 3.166
+    for round in range(60):
+        engine.advance(state, SCHEMES["velocity_verlet"], 0.001, 7, NoThermostat(), 7 * round)
+        load, tallies = engine.evaluate(state)
+        fresh, _ = Engine(system.model, system.terms).evaluate(state)
+        assert load.force == pytest.approx(fresh.force, abs=1e-11 * np.abs(fresh.force).max())
+        if round % 15 == 14:
+            assert sum(t.energy for t in tallies.values()) == pytest.approx(all_pairs(system, state), rel=1e-11)
+    assert min(term.pairs.counters[1] for term in engine.terms.values()) > 5
