@@ -375,9 +375,7 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
         charge = np.concatenate([species[k].charges[chosen[k]] for k in index])
         law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
         sites = _taking_part(species, index, chosen)
-        terms["coulomb"] = pair_forces(
-            law, space, sites, forces.skin_A, scene.precision, _groups(sites, frozen[index])
-        )
+        terms["coulomb"] = pair_forces(law, space, sites, forces.skin_A, scene.precision, _groups(sites, frozen[index]))
         if cutoff < inf:
             constants["reaction_field_self"] = sum(
                 int((index == k).sum())

@@ -9,7 +9,16 @@ from scipy.integrate import quad
 from rigidmd.forces import pairs
 from rigidmd.forces.lanes import inverse_root, load
 from rigidmd.forces.truncation import (
-    POLYNOMIALS, Bent, Name, Plain, Polynomial, Shape, added, ended, ending, shape_of,
+    POLYNOMIALS,
+    Bent,
+    Name,
+    Plain,
+    Polynomial,
+    Shape,
+    added,
+    ended,
+    ending,
+    shape_of,
 )  # fmt: skip
 from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 

@@ -112,7 +112,7 @@ def with_own_list(term: NamedTuple) -> NamedTuple:
     if not isinstance(term, PairForces):
         return term
     precision = next(name for name, dtype in PRECISIONS.items() if dtype == term.sums.others.dtype)
-    return pair_forces(term.law, term.space, term.sites, term.pairs.skin, precision)
+    return pair_forces(term.law, term.space, term.sites, term.pairs.skin, precision, term.pairs.group)
 
 
 def pair(law, i, j, r2):

@@ -29,6 +29,7 @@ from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 Name = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 NAMES: tuple[str, ...] = get_args(Name)
 
+
 class Plain(NamedTuple):
     """Nothing happens before the cut-off; `plain` and `shift`."""
 
