@@ -22,6 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
 from numba import types
+from numba.core.caching import IndexDataCacheFile
 from numba.extending import overload
 
 PACKAGE = Path(__file__).parent
@@ -70,6 +71,19 @@ def _cache_folder() -> str:
 CACHE_FOLDER = _cache_folder()
 
 
+class Index(IndexDataCacheFile):
+    """What is compiled, by the types of the arguments. One with types of a module that is not there counts as absent.
+
+    A term of somebody's own would otherwise leave an index that nobody else can read.
+    """
+
+    def _load_index(self):
+        try:
+            return super()._load_index()
+        except (ImportError, AttributeError):
+            return {}
+
+
 def kernel(function=None, *, parallel=False, fastmath=False, inline=False):
     """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder.
 
@@ -82,9 +96,11 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False):
     numba.config.CACHE_DIR = CACHE_FOLDER
     options = _options(fastmath, inline) | ({"parallel": True} if parallel else {})
     try:
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **options)(function)
     finally:
         numba.config.CACHE_DIR = before
+    compiled._cache._cache_file.__class__ = Index
+    return compiled
 
 
 def implements(stub, fastmath=False, inline=False):
