@@ -208,7 +208,7 @@ def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stabl
     if stable is not None and stable < dt:
         shorter = f"timestep_fs below {stable / FEMTOSECOND:.2g}, where the stiffest motion is stable"
     elif finding.shorter is not None and finding.shorter < 1 / ROUNDING:
-        shorter = f"timestep_fs = {dt / finding.shorter / FEMTOSECOND:.1g} or less"
+        shorter = f"timestep_fs = {dt / finding.shorter / FEMTOSECOND:.2g} or less"
     if pair is not None and pair.bare:
         a, b = system.sites.name[[pair.first, pair.second]]
         return Cause(
@@ -228,7 +228,7 @@ def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stabl
         if share.min() < THIN:
             return Cause(
                 f"bad inertia: a moment of {species.name} is {species.inertia[share.argmin()]:.2g} u Å², "
-                f"{share.min():.1g} of what its mass would have as far out as its sites are, so that torques turn it at once",
+                f"{share.min():.1g} of what its mass would have as far out as its sites are: torques turn it at once",
                 f"more of its mass on the outer sites, or {shorter}",
             )
     if finding.unturned:
@@ -294,7 +294,7 @@ class BodyCheck:
         if stable is not None and stable < dt:
             shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
         elif finding.shorter is not None:
-            shorter = f"timestep_s = {dt / finding.shorter:.1g} or less"
+            shorter = f"timestep_s = {dt / finding.shorter:.2g} or less"
         inertia = system.inertia
         if finding.unturned:
             cause = Cause(
