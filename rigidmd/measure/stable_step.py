@@ -114,8 +114,8 @@ def is_worth_it(system: System, evaluations: int) -> bool:
 def body_rate(system: BodySystem) -> float:
     """The fastest of what a body's steps have to follow at its start, rad/s: the swing of its weight, and its spin.
 
-    About an axis of symmetry that the weight lies on, a spin is felt as nutation only. A body on which nothing acts may
-    spin as it likes, unless a split rotor turns it.
+    Rotors turn a body on which nothing acts however it spins, the split one unless it is asymmetric; about an axis of
+    symmetry that the weight lies on, they leave of a spin the nutation. General solvers have to follow it all.
     """
     if not system.turns:
         return 0.0
@@ -125,11 +125,12 @@ def body_rate(system: BodySystem) -> float:
     for term in weights:
         arms = np.sqrt(np.maximum(term.point @ term.point - term.point**2, 0.0))
         stiffness += np.linalg.norm(term.force) * np.divide(arms, inertia, out=np.zeros(3), where=inertia > 0)
-    split = isinstance(system.method, Scheme) and isinstance(system.engine().model_for(system.method).rotor, SplitRotor)
-    for k in range(3):
+    flows = isinstance(system.method, Scheme)
+    followed = not flows or isinstance(system.engine().model_for(system.method).rotor, SplitRotor)
+    for k in range(3) if flows else ():
         i, j = (k + 1) % 3, (k + 2) % 3
         if inertia[i] == inertia[j] > 0 and len(weights) == len(system.terms) and not stiffness[k]:
-            split = False
+            followed = False
             spins = momentum / inertia[i]
-    held = stiffness.any() or len(weights) < len(system.terms)
-    return max(sqrt(stiffness.max()), float(np.linalg.norm(spins)) if held or split else 0.0)
+    followed = followed or stiffness.any() or len(weights) < len(system.terms)
+    return max(sqrt(stiffness.max()), float(np.linalg.norm(spins)) if followed else 0.0)

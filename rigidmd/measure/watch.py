@@ -13,6 +13,7 @@ from rigidmd.build.body import BodySystem
 from rigidmd.build.relief import kicks
 from rigidmd.build.system import OVERLAP, System, close_pairs
 from rigidmd.dynamics.engine import NotFiniteError
+from rigidmd.dynamics.odes import Solver
 from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import SteadyForce
@@ -32,7 +33,7 @@ THIN = 0.01
 #: Rounding may take this fraction of a potential energy: half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
 #: A step is checked at least every so many moves of molecules; a body's, evaluations of its forces, and looks.
-PATIENCE, BODY_PATIENCE, LOOKS = 100_000, 1_000_000, 256
+PATIENCE, BODY_PATIENCE, LOOKS = 100_000, 1_000_000, 512
 
 
 class Finding(SimulationError):
@@ -260,7 +261,7 @@ class BodyCheck:
     def finding(self, state: State, dt: float) -> Finding | None:
         """What is wrong with a state of the run."""
         system, limits = self.system, self.limits
-        largest = limits.orthogonality or (1e-9 if isinstance(system.method, Scheme) else 0.1)
+        largest = limits.orthogonality or (0.1 if isinstance(system.method, Solver) else 1e-9)
         if limits.orthogonality is not False and not (worst := orthogonality_error(state.rotation)) <= largest:
             seen = f"Q is no rotation any more: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
             return Finding(seen, unturned=True)
@@ -298,8 +299,10 @@ class BodyCheck:
         inertia = system.inertia
         if finding.unturned:
             cause = Cause(
-                "the start was no rotation, or the solver's tolerance is too wide",
-                f"integrator = 'srkn_6', or {shorter}",
+                f"nothing but accuracy keeps Q a rotation under {system.method.name}"
+                if isinstance(system.method, Solver)
+                else "Q was changed from outside: the run itself only multiplies rotations",
+                f"integrator = 'srkn_6', which keeps Q, or {shorter}",
             )
         elif system.turns and inertia[inertia > 0].min() < THIN * inertia.max():
             least = inertia[inertia > 0].min()

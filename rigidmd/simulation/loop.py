@@ -142,6 +142,7 @@ class Simulation(ABC):
         self._observers = [observers] if isinstance(observers, Every) else list(observers)
         self._say = say
         self._warn = warn
+        self._warnings: list[str] = []
         self._interrupted = False
 
     def run(self, progress: bool = False) -> Results:
@@ -151,7 +152,7 @@ class Simulation(ABC):
         if self.folder is not None:
             check_folder(self.folder, self._force, inputs)
         self._interrupted = False
-        self._warnings: list[str] = []
+        self._warnings.clear()
         self._reset()
         began = clock.perf_counter()
         self._prepare()
