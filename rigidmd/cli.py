@@ -158,7 +158,7 @@ def _run(options: argparse.Namespace) -> int:
     check_folder(folder, options.force)  # before anything slow is imported
     from rigidmd.simulation import Simulation
 
-    simulation = Simulation(scene, folder, options.force, say=_say)
+    simulation = Simulation(scene, folder, options.force, say=_say, warn=_warn)
     print(simulation.introduction())
     results = simulation.run(progress=True)
     print(simulation.conclusion(results))
@@ -170,6 +170,10 @@ def _say(sentence: str) -> None:
     """On a terminal only: what takes a moment."""
     if sys.stderr.isatty():
         print(f"  {sentence} ...", file=sys.stderr)
+
+
+def _warn(sentence: str) -> None:
+    print(f"rigidmd: warning: {sentence}", file=sys.stderr)
 
 
 def _energy(options: argparse.Namespace) -> int:

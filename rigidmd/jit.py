@@ -24,6 +24,7 @@ import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.caching import IndexDataCacheFile
 from numba.core.codegen import get_host_cpu_features
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic, models, overload, register_model
@@ -86,6 +87,19 @@ def _cache_folder() -> str:
 CACHE_FOLDER = _cache_folder()
 
 
+class Index(IndexDataCacheFile):
+    """What is compiled, by the types of the arguments. One with types of a module that is not there counts as absent.
+
+    A term of somebody's own would otherwise leave an index that nobody else can read.
+    """
+
+    def _load_index(self):
+        try:
+            return super()._load_index()
+        except (ImportError, AttributeError):
+            return {}
+
+
 def kernel(function=None, *, parallel=False, fastmath=False, inline=False, counted=True):
     """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder.
 
@@ -98,7 +112,9 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False, count
         return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted)
     options = _options(fastmath, inline) | ({"parallel": True} if parallel else {}) | _counting(counted)
     with _own_cache():
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **options)(function)
+    compiled._cache._cache_file.__class__ = Index
+    return compiled
 
 
 @contextlib.contextmanager

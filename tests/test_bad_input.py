@@ -432,10 +432,12 @@ def test_a_molecule_from_a_geometry_file(tmp_path):
 
 
 def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
-    simulation = Simulation(small_scene({"spce": 20}, 20.0), tmp_path / "out")
+    simulation = Simulation(small_scene({"spce": 20}, 20.0, watch={"move": False}), tmp_path / "out")
     good = simulation.system.state.position.copy()
     simulation.system.state.velocity[7] = 1e150  # gone within a step
-    with pytest.raises(SimulationError, match=r"after step 0 .* molecule 8 is nowhere.*timestep_fs.*last_good_state"):
+    with pytest.raises(
+        SimulationError, match=r"step 1 .*molecule 8 \(spce\) is nowhere.*timestep_fs.*step 0 .*last_good_state"
+    ):
         simulation.run()
     with np.load(tmp_path / "out" / "last_good_state.npz") as saved:
         assert saved["position"] == pytest.approx(good, abs=1.0)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.momenta import mobile
+from rigidmd.dynamics.advance import Model
 from rigidmd.dynamics.engine import Engine
 from rigidmd.forces.terms import Load, State
 from rigidmd.mechanics.rotation import from_vector
@@ -20,18 +21,18 @@ class Relief(NamedTuple):
     excess: float  # largest kick of a first step over its thermal momentum; fine at 1 or below
 
 
-def excess(engine: Engine, load: Load, thermal: float, dt: float) -> float:
-    """How violent the first step would be: the largest kick on any momentum over that momentum's thermal size.
+def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
+    """How violent a step would be to each molecule (n,): its largest kick over the thermal size of that momentum.
 
     A kick F dt beyond sqrt(m kT), or n dt beyond sqrt(I kT), comes from an overlap, not from a liquid. The measure is
     relative to the scene's own masses, temperature and time step.
     """
-    model = engine.model
     with np.errstate(divide="ignore", invalid="ignore"):
-        push = np.abs(load.force).max(axis=1) * dt * np.sqrt(model.inverse_mass[model.species] / thermal)
+        found = np.abs(load.force).max(axis=1) * dt * np.sqrt(model.inverse_mass[model.species] / thermal)
         turn = np.abs(load.torque_body) * dt / np.sqrt(model.inertia[model.species] * thermal)[: len(load.torque_body)]
     turn = np.where((model.inertia[model.species] > 0)[: len(turn)], turn, 0.0)
-    return float(max(push.max(initial=0.0), turn.max(initial=0.0)))
+    found[: len(turn)] = np.maximum(found[: len(turn)], turn.max(axis=1, initial=0.0))
+    return found
 
 
 def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, thermal: float, dt: float) -> Relief:
@@ -42,7 +43,7 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
     back and halved.
     """
     load, tallies = engine.evaluate(state)
-    left = excess(engine, load, thermal, dt)
+    left = float(kicks(engine.model, load, thermal, dt).max())
     if left <= 1:
         return Relief(0, left)
     energy = sum(tally.energy for tally in tallies.values())
@@ -65,7 +66,7 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
         new_energy = sum(tally.energy for tally in tallies.values())
         if new_energy < energy:
             load, energy, length = new_load, new_energy, min(1.2 * length, LONGEST_MOVE * scale)
-            left = excess(engine, load, thermal, dt)
+            left = float(kicks(engine.model, load, thermal, dt).max())
             if left <= 1:
                 break
         else:

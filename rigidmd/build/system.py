@@ -1,5 +1,6 @@
 """A scene becomes what runs: species, space, start, terms. Everything that can be wrong with that is said at once."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
@@ -79,6 +80,11 @@ class System:
     def residue_names(self) -> np.ndarray:
         """What each molecule (n,) is called in topology files."""
         return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
+
+    def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
+        """What `of` gives for the sites of a molecule, for all sites (s,)."""
+        values = [of(m) for m in self.species]
+        return np.concatenate([values[k] for k in self.model.species])
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
@@ -424,34 +430,34 @@ def _set_momenta(system: System, arrangement: Arrangement) -> None:
 
 def _overlaps(system: System) -> list[str]:
     """Molecules of a structure that stand in one another: at most five named."""
-    from scipy.spatial import cKDTree
-
-    faults = []
-    positions = system.site_positions(system.state)
-    boxed = system.space.volume < inf
-    if boxed:
-        edges = np.array(system.space)
-        positions = np.mod(positions, edges)
-        positions[positions >= edges] = 0.0
-    sigma = np.concatenate([np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species])
-    start = np.concatenate([[0], np.cumsum([len(m.masses) for m in system.species])])
-    which = np.concatenate([np.arange(start[k], start[k + 1]) for k in system.model.species])
-    diameter = sigma[which]
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
-    free = mobile(system.model)
-    tree = cKDTree(positions, boxsize=np.array(system.space) if boxed else None)
-    for i, j in sorted(tree.query_pairs(max(OVERLAP * sigma.max(), inside))):
+    sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
+    faults = []
+    for i, j, distance in close_pairs(system, system.state, max(OVERLAP * sigma.max(), inside)):
         a, b = system.sites.molecule[[i, j]]
-        if a == b or not (free[a] or free[b]):
-            continue
-        step = positions[i] - positions[j]
-        if boxed:
-            step -= edges * np.round(step / edges)
-        distance = float(np.linalg.norm(step))
-        both = diameter[i] > 0 and diameter[j] > 0
-        if distance <= max(inside, OVERLAP * (diameter[i] + diameter[j]) / 2 if both else 0.0):
+        both = sigma[i] > 0 and sigma[j] > 0
+        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
             faults.append(
                 f"molecules {a + 1} and {b + 1} overlap: {system.sites.name[i]} and {system.sites.name[j]} "
                 f"are {distance:.3f} Å apart"
             )
     return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
+
+
+def close_pairs(system: System, state: State, radius: float) -> list[tuple[int, int, float]]:
+    """Sites (i, j) of different molecules, not both frozen, no further apart than `radius`; their distances, Å."""
+    from scipy.spatial import cKDTree
+
+    positions, edges = system.site_positions(state), None
+    if system.space.volume < inf:
+        edges = np.array(system.space)
+        positions = np.mod(positions, edges)
+        positions[positions >= edges] = 0.0
+    found = cKDTree(positions, boxsize=edges).query_pairs(radius, output_type="ndarray")
+    a, b = system.sites.molecule[found].T
+    free = mobile(system.model)
+    found = found[(a != b) & (free[a] | free[b])]
+    step = positions[found[:, 0]] - positions[found[:, 1]]
+    if edges is not None:
+        step -= edges * np.round(step / edges)
+    return sorted((int(i), int(j), float(d)) for (i, j), d in zip(found, np.linalg.norm(step, axis=1), strict=True))

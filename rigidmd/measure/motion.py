@@ -52,7 +52,7 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     columns = {"t": times} | _vector(("x", "y", "z"), position) | _vector(("vx", "vy", "vz"), velocity)
     if system.turns:
         columns |= _rotation_columns(system, times, states, rotation, omega)
-    columns |= _energies(system, times, states)
+    columns |= energies(system, times, states)
     errors = _errors(system, columns)
     columns |= {f"{name}_error": error for name, error in errors.items()}
     if system.turns:
@@ -87,7 +87,13 @@ def _continuous(quaternions: np.ndarray) -> np.ndarray:
     return quaternions * np.concatenate([[1.0], np.cumprod(np.where(turned < 0, -1.0, 1.0))])[:, None]
 
 
-def _energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
+def is_balanced(system: BodySystem) -> bool:
+    """Whether its energy less the work done is conserved: in axes that do not turn, or turn evenly."""
+    frame = system.body.frame
+    return isinstance(frame, Inertial) or is_steady(frame.angular_velocity)
+
+
+def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
     """Kinetic energy (less Omega . J in a turning frame), potential, their sum, and the work of what is neither."""
     n = len(times)
     kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
@@ -120,7 +126,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
     lossless = isinstance(body.resistance, NoResistance)
     inertial = isinstance(body.frame, Inertial)
     errors = {}
-    if inertial or is_steady(body.frame.angular_velocity):
+    if is_balanced(system):
         balance = columns["energy"] - columns["work"]
         errors["energy"] = _relative(balance - balance[0], np.abs(columns["kinetic"]).max() or np.abs(balance[0]))
     if not system.turns:

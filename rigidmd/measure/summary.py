@@ -26,14 +26,18 @@ def summarise(
     computing: list[float],
     interrupted: bool,
     choices: dict[int, str],
+    stable: dict[int, float],
+    warnings: list[str],
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
 
     choices : of stages that left their integrator open, what was chosen and why
+    stable : the longest stable step (ps) of stages, as estimated at their start
     """
     scene = system.scene
     stages = [
-        _stage(system, samples.rows, k, computing[k]) | {"choice": choices.get(k)}
+        _stage(system, samples.rows, k, computing[k])
+        | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
         for k in range(len(computing))
         if any(sample.stage == k for sample in samples.rows)
     ]
@@ -61,7 +65,7 @@ def summarise(
         "momentum_u_A_ps": samples.rows[-1].momentum,
         "momentum_relative": _relative_momentum(system, state, samples.rows[-1].momentum),
         "stages": stages,
-        "notes": system.notes,
+        "notes": [*system.notes, *warnings],
     }
 
 

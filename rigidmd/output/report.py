@@ -39,6 +39,7 @@ def summary_text(summary: dict) -> str:
         f"  {'momentum':<16}|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, "
         f"{summary['momentum_relative']:.1e} of the sum of |m v|"
     )
+    lines += [f"\n  note: {note}" for note in summary["notes"]]
     if summary["interrupted"]:
         lines += ["", "  interrupted: the figures are those so far"]
     return "\n".join(lines)

@@ -35,6 +35,7 @@ from rigidmd.scene.actions import (
     Wheel,
 )
 from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.watch import BodyWatch
 from rigidmd.validation import Flag, Number, Positive, Section, Vector, line_of
 
 Matrix = tuple[Vector, Vector, Vector]
@@ -355,6 +356,7 @@ class BodyScene(Scene):
     changing_inertia: ChangingInertia | None = None
     run: Run
     output: BodyOutput = BodyOutput()
+    watch: BodyWatch = BodyWatch()
 
     @property
     def interval(self) -> float:

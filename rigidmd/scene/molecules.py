@@ -9,6 +9,7 @@ from pydantic import Field, Strict, field_validator, model_validator
 from rigidmd.dynamics.schemes import AUTO, SCHEMES, Rotor, Scheme, auto_faults, rotor_fault
 from rigidmd.molecules import Site, SiteName, available_models
 from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.watch import Watch
 from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
 
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
@@ -281,6 +282,7 @@ class MolecularScene(Scene):
     start: Start = Start()
     stages: tuple[Stage, ...] = Field(min_length=1)
     output: Output = Output()
+    watch: Watch = Watch()
 
     @property
     def inputs(self) -> dict[str, Path]:

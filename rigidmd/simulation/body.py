@@ -8,12 +8,13 @@ from math import ceil
 import numpy as np
 
 from rigidmd.build.body import Pose, build_body
-from rigidmd.dynamics.engine import NotFiniteError
 from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.errors import SimulationError
 from rigidmd.forces.frame import Inertial
 from rigidmd.measure.body_summary import summarise_body
 from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
+from rigidmd.measure.stable_step import body_rate, stable_angle
+from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
 from rigidmd.mechanics.rotor import SplitRotor
 from rigidmd.output.folder import SCENE_FILE
 from rigidmd.scene import BodyScene
@@ -58,6 +59,15 @@ class BodySimulation(Simulation):
         self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0, NoThermostat())
         self._reset()
         self._stretches = self._phases()
+        self._watch = BodyCheck(self.system, self.scene.watch)
+        rate = body_rate(self.system)
+        self._stable = stable_angle(self.system.method) / rate if self.scene.watch.stable_step and rate else None
+        if self._stable is not None and self.scene.run.timestep_s > self._stable:
+            self._note(
+                f"timestep_s = {self.scene.run.timestep_s:g} is longer than what is stable: at its start the body "
+                f"swings or spins at {rate:.3g} rad/s, which {self.scene.run.integrator} can follow "
+                f"up to {self._stable:.3g} s"
+            )
 
     def _durations(self) -> list[float]:
         return [phase.steps * phase.dt for phase in self._stretches]
@@ -85,6 +95,14 @@ class BodySimulation(Simulation):
     def _advance(self, k: int, steps: int, done: int) -> None:
         self.engine.advance(self.state, self.system.method, self._stretches[k].dt, steps, NoThermostat(), done)
 
+    def _patience(self, k: int) -> int:
+        """Half a second or less of computing."""
+        return BODY_PATIENCE // getattr(self.system.method, "force_evaluations", 1)
+
+    def _check(self, k: int, dt: float) -> None:
+        if finding := self._watch.finding(self.state, dt):
+            raise finding
+
     def _file_names(self) -> list[str]:
         from rigidmd.output.body_figures import FIGURES
 
@@ -98,6 +116,8 @@ class BodySimulation(Simulation):
 
         def sample(moment: Moment) -> None:
             self._snapshots.append(Snapshot(moment.time, self.state.copy()))
+            if len(self._snapshots) % LOOKS == 0:
+                self._check(moment.stage, self._stretches[moment.stage].dt)
 
         interval = self.scene.interval
         return [Every(interval, sample), *(Every(interval, write) for write in self._writers(stack, results))]
@@ -132,6 +152,8 @@ class BodySimulation(Simulation):
             self.system, results.samples, sum(p.steps for p in self._stretches), prepared, wall, sum(computing),
             self._interrupted,
         )  # fmt: skip
+        results.summary["stable_timestep_s"] = self._stable
+        results.summary["notes"] += self._warnings
         if self._choice:
             results.summary["notes"].insert(0, self._choice)
         if self.folder is None:
@@ -166,18 +188,16 @@ class BodySimulation(Simulation):
             "gravity": self.scene.gravity and self.scene.gravity.acceleration_m_s2,
         }
 
-    def _explain(self, error: SimulationError) -> SimulationError:
-        if isinstance(error, NotFiniteError):
-            error = SimulationError(
-                f"after t = {self._snapshots[-1].time:g} s: position or momentum of the body is no finite number any "
-                "more; timestep_s is too long, or a force grows without bound"
-            )
+    def _explain(self, error: SimulationError, dt: float) -> str:
+        return self._watch.explained(error, dt, self._stable)
+
+    def _save(self) -> str:
         if self.folder is None:
-            return error
+            return ""
         from rigidmd.output.motion_file import write_csv
 
         write_csv(self.folder / MOTION_FILE, motion(self.system, self._snapshots).columns)
-        return SimulationError(f"{error}. The motion so far: {self.folder / MOTION_FILE}")
+        return f". The motion so far: {self.folder / MOTION_FILE}"
 
     def introduction(self) -> str:
         """One line, before the run."""

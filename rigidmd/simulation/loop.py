@@ -114,6 +114,7 @@ class Simulation(ABC):
     force : replace an earlier run in that folder
     observers : `Every` objects of your own, called between steps
     say : called with a sentence when something begins that takes a moment (compiling, relieving)
+    warn : called with a sentence that whoever runs this should know before it is done; the summary has it too
     applied : of a single body, forces by Python functions: see `BodySimulation`
     """
 
@@ -133,12 +134,15 @@ class Simulation(ABC):
         force: bool = False,
         observers: Every | tuple[Every, ...] | list[Every] = (),
         say: Callable[[str], None] = lambda sentence: None,
+        warn: Callable[[str], None] = lambda sentence: None,
     ):
         self.scene = scene
         self.folder = None if folder is None else Path(folder)
         self._force = force
         self._observers = [observers] if isinstance(observers, Every) else list(observers)
         self._say = say
+        self._warn = warn
+        self._warnings: list[str] = []
         self._interrupted = False
 
     def run(self, progress: bool = False) -> Results:
@@ -148,6 +152,7 @@ class Simulation(ABC):
         if self.folder is not None:
             check_folder(self.folder, self._force, inputs)
         self._interrupted = False
+        self._warnings.clear()
         self._reset()
         began = clock.perf_counter()
         self._prepare()
@@ -162,7 +167,7 @@ class Simulation(ABC):
             try:
                 computing = self._run_phases(observers, progress)
             except SimulationError as error:
-                raise self._explain(error) from None
+                raise self._failed(error) from None
             wall = clock.perf_counter() - began
         results.interrupted = self._interrupted
         self._conclude(results, prepared, wall, computing)
@@ -215,23 +220,52 @@ class Simulation(ABC):
         """Summary and last files; times in s."""
 
     @abstractmethod
-    def _explain(self, error: SimulationError) -> SimulationError:
-        """When, where and what to do."""
+    def _patience(self, k: int) -> int:
+        """Steps of stretch k after which `_check` is asked though no observer looks."""
+
+    @abstractmethod
+    def _check(self, k: int, dt: float) -> None:
+        """Raise a `Finding` if the state cannot be what the scene means."""
+
+    @abstractmethod
+    def _explain(self, error: SimulationError, dt: float) -> str:
+        """What was seen, why, what to try."""
+
+    @abstractmethod
+    def _save(self) -> str:
+        """Save what is good of a run that failed; a sentence that says where, or nothing."""
+
+    def _note(self, warning: str) -> None:
+        self._warnings.append(warning)
+        self._warn(warning)
+
+    def _failed(self, error: SimulationError) -> SimulationError:
+        """The error with when it happened and all that can be said about it."""
+        step, time, dt = self._began
+        now = float(self.state.time[0])
+        step += round((now - time) / dt)
+        return SimulationError(
+            f"stopped at step {step} ({now:g} {self.time_unit}): {self._explain(error, dt)}{self._save()}"
+        )
 
     def _run_phases(self, observers: list[Every], progress: bool) -> list[float]:
         """Advance through all phases; seconds of computing in each."""
+        self._began = (0, float(self.state.time[0]), 1.0)
         computing = []
         step, time = 0, 0.0
         durations = self._durations()
         with _bar(sum(durations), self.time_unit, progress) as bar:
-            self._show(observers, Moment(self, 0, 0.0, 0), [True] * len(observers))
             for k in range(len(durations)):
                 phase = self._begin(k)
+                self._began = (step, float(self.state.time[0]), phase.dt)
+                if k == 0:
+                    self._show(observers, Moment(self, 0, 0.0, 0), [True] * len(observers))
+                checked, patience = 0, self._patience(k)
                 intervals = [max(1, round(observer.interval / phase.dt)) for observer in observers]
                 seconds, done = 0.0, 0
                 while done < phase.steps and not self._interrupted:
                     ahead = [interval - (phase.counted + done) % interval for interval in intervals]
-                    to = min(phase.steps, done + min(ahead))
+                    to = min(phase.steps, done + min(ahead), checked + patience)
                     began = clock.perf_counter()
                     self._advance(k, to - done, done)
                     seconds += clock.perf_counter() - began
@@ -239,6 +273,9 @@ class Simulation(ABC):
                         raise NotFiniteError(self.state)
                     bar.update(phase.dt * (to - done))
                     done = to
+                    if done in (checked + patience, phase.steps):
+                        self._check(k, phase.dt)
+                        checked = done
                     last = done == phase.steps or self._interrupted
                     due = [(phase.counted + done) % interval == 0 for interval in intervals]
                     due[0] = due[0] or last
@@ -257,7 +294,7 @@ class Simulation(ABC):
 
     @contextlib.contextmanager
     def _stops_at_ctrl_c(self) -> Iterator[None]:
-        """The first Ctrl-C ends the run at the next observation, the second at once."""
+        """The first Ctrl-C ends the run at the next look, the second at once."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return

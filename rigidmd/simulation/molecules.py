@@ -13,8 +13,11 @@ from rigidmd.build.system import build
 from rigidmd.dynamics.engine import Engine
 from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.forces.terms import Load, State
+from rigidmd.measure import watch
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
+from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.summary import summarise
 from rigidmd.output.folder import SCENE_FILE
 from rigidmd.scene import MolecularScene
@@ -99,6 +102,10 @@ class MolecularSimulation(Simulation):
         self.engine.forget()
         self._relief = relief
         self._choices: dict[int, str] = {}
+        self._stable: dict[int, float] = {}
+        self._stage = 0
+        self._last_good: tuple[int, float, State] | None = None
+        self._thermal = 0.0
         self._thermostats = [self._thermostat(k) for k in range(len(self.scene.stages))]
 
     def _thermostat(self, k: int) -> NamedTuple:
@@ -125,10 +132,31 @@ class MolecularSimulation(Simulation):
     def _begin(self, k: int) -> Phase:
         if self.scene.stages[k].is_open:
             self._choose(k)
+        self._stage = k
+        self._estimate(k)
         # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
         self.engine = Engine(self.system.model, self.system.terms)
         stage = self.scene.stages[k]
         return Phase(stage.timestep_fs * FEMTOSECOND, stage.steps)
+
+    def _estimate(self, k: int) -> None:
+        """Longest stable step (ps) of stage k from where it starts, and a warning where its own is longer."""
+        stage = self.scene.stages[k]
+        if not self.scene.watch.stable_step or not is_worth_it(
+            self.system, stage.steps * stage.scheme.force_evaluations
+        ):
+            return
+        found = stiffest(self.system, self.state)
+        if found is None:
+            return
+        self._stable[k] = stable_angle(stage.scheme) / found.rate
+        if stage.timestep_fs * FEMTOSECOND > self._stable[k]:
+            self._note(
+                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
+                f"at its start, of {watch.named(self.system, found.molecule)}, has a period of "
+                f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
+                f"{self._stable[k] / FEMTOSECOND:.3g} fs"
+            )
 
     def _choose(self, k: int) -> None:
         """Find integrator and step of a stage on the present state, and put them into the scene."""
@@ -155,14 +183,14 @@ class MolecularSimulation(Simulation):
         return [Every(self.scene.output.log_interval_ps, self._sampler(results.samples, log)), *writers]
 
     def _sampler(self, samples: Samples, log: Callable[[Sample], None]) -> Callable[[Moment], None]:
-        """An observer that turns moments into samples, logs them, and keeps the last good state."""
-        origin = {}
+        """An observer that turns moments into samples, logs and checks them, and keeps the last good state."""
+        begins: dict[int, int] = {}  # of each stage, the row of the sample at which it began
 
         def sample(moment: Moment) -> None:
             seen = moment.observation
             conserved = seen.energy - self._heat(moment.stage)
-            if moment.stage not in origin:  # the stage began where the last sample was taken
-                origin[moment.stage] = samples.rows[-1].energy if samples.rows else conserved
+            begin = begins.setdefault(moment.stage, max(0, len(samples.rows) - 1))
+            origin = samples.rows[begin].energy if samples.rows else conserved
             samples.rows.append(
                 Sample(
                     moment.step,
@@ -179,15 +207,50 @@ class MolecularSimulation(Simulation):
                     seen.temperature_rotation_unbiased,
                     seen.pressure_bar,
                     conserved,
-                    conserved - origin[moment.stage],
+                    conserved - origin,
                     float(np.linalg.norm(seen.momentum)),
                     seen.orthogonality,
                 )
             )
             log(samples.rows[-1])
+            self._check_sample(samples.rows, begin, seen.load)
             self._last_good = (moment.step, moment.time, self.state.copy())
 
         return sample
+
+    def _check_sample(self, rows: list[Sample], begin: int, load: Load) -> None:
+        now = rows[-1]
+        since = begin
+        if self.scene.stages[now.stage].ensemble == "nvt":
+            memory = self.scene.stages[now.stage].thermostat_time_ps
+            since = len(rows) - 1
+            while since > begin and rows[since].time > now.time - memory:
+                since -= 1
+        self._thermal = self._thermal or watch.thermal_energy(self.system, now.kinetic)
+        self._check_step(now.stage, load)
+        if finding := watch.sample_finding(self.system, self.scene.watch, rows[since], now):
+            raise finding
+        self._thermal = watch.thermal_energy(self.system, now.kinetic)
+
+    def _check_step(self, k: int, load: Load) -> None:
+        stage = self.scene.stages[k]
+        finding = watch.step_finding(
+            self.system,
+            self.scene.watch,
+            self.state,
+            load,
+            stage.scheme,
+            stage.timestep_fs * FEMTOSECOND,
+            self._thermal,
+        )
+        if finding:
+            raise finding
+
+    def _patience(self, k: int) -> int:
+        return watch.patience(self.system)
+
+    def _check(self, k: int, dt: float) -> None:
+        self._check_step(k, self.engine.load)
 
     def _writers(self, stack: contextlib.ExitStack, results: Results) -> tuple[Callable[[Sample], None], list[Every]]:
         """What logs a sample, and the observers that write frames, or keep them where there is no folder."""
@@ -226,7 +289,7 @@ class MolecularSimulation(Simulation):
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
         results.summary = summarise(
             self.system, results.samples, self.state, self._relief, self.threads, prepared, wall, computing,
-            self._interrupted, self._choices,
+            self._interrupted, self._choices, self._stable, self._warnings,
         )  # fmt: skip
         if self.folder is None:
             return
@@ -242,19 +305,20 @@ class MolecularSimulation(Simulation):
         results.summary["files"] = [str(path) for path in results.files]
         write_summary(self.folder / "summary.json", results.summary)
 
-    def _explain(self, error: SimulationError) -> SimulationError:
-        """When, where and what to do; the last good state is saved."""
-        step, time, state = self._last_good
-        where = ""
-        if self.folder is not None:
-            from rigidmd.output.state import write_state
+    def _explain(self, error: SimulationError, dt: float) -> str:
+        states = [("", self.state)]
+        if self._last_good is not None:
+            states.append((f"at step {self._last_good[0]}, ", self._last_good[2]))
+        return watch.explained(self.system, error, states, dt, self._stable.get(self._stage))
 
-            write_state(self.folder / LAST_GOOD_STATE, self.system, state)
-            where = f" Last good state: {self.folder / LAST_GOOD_STATE}"
-        return SimulationError(
-            f"after step {step} ({time:g} ps): {error}. Molecules overlap or timestep_fs is too long; "
-            f"try a shorter one, or an nvt stage first.{where}"
-        )
+    def _save(self) -> str:
+        if self.folder is None or self._last_good is None:
+            return ""
+        from rigidmd.output.state import write_state
+
+        step, time, state = self._last_good
+        write_state(self.folder / LAST_GOOD_STATE, self.system, state)
+        return f". Last good state, of step {step} ({time:g} ps): {self.folder / LAST_GOOD_STATE}"
 
     def introduction(self) -> str:
         """What is about to run."""

@@ -1,0 +1,136 @@
+"""The longest stable time step, estimated before the first one from the stiffest motion that a state shows."""
+
+from functools import cache
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.build.body import BodySystem
+from rigidmd.build.system import System
+from rigidmd.dynamics.engine import Engine
+from rigidmd.dynamics.odes import RK4, Solver
+from rigidmd.dynamics.schemes import Scheme
+from rigidmd.forces.fields import SteadyForce
+from rigidmd.forces.terms import Load, State
+from rigidmd.mechanics.rotation import from_vector
+from rigidmd.mechanics.rotor import SplitRotor
+
+#: Evaluations of forces for the stiffest motion; its frequency is then good to a few percent.
+DIRECTIONS = 16
+#: Displacement for a difference of forces, in smallest diameters.
+SMALL = 1e-5
+#: Larger systems are estimated only where that costs less than 1 % of the stage.
+SMALL_SYSTEM = 1000
+
+
+@cache
+def stable_angle(method: Scheme | Solver) -> float:
+    """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and all smaller steps.
+
+    A step of a scheme multiplies (x, v/w) by a matrix of determinant 1, bounded while |trace| <= 2. Inf of solvers
+    that choose their own steps.
+    """
+    if isinstance(method, Solver):
+        return 2 * sqrt(2) if method.name == RK4 else inf
+    angle = np.linspace(0, 30, 30_001)
+    z = angle**2
+    gradients = method.gradients or (0.0,) * len(method.kicks)
+    one, none = np.ones_like(z), np.zeros_like(z)
+    x, v = (one, none), (none, one)  # rows of the matrix, of (x, v dt)
+    for k, (kick, gradient) in enumerate(zip(method.kicks, gradients, strict=True)):
+        push = kick * z * (1 - gradient * z)
+        v = tuple(b - push * a for a, b in zip(x, v, strict=True))
+        if k < len(method.drifts):
+            x = tuple(a + method.drifts[k] * b for a, b in zip(x, v, strict=True))
+    beyond = np.abs(x[0] + v[1]) > 2 + 1e-9
+    return float(angle[beyond.argmax()]) if beyond.any() else inf
+
+
+class Stiffest(NamedTuple):
+    """The fastest small motion about a state."""
+
+    rate: float  # angular frequency, rad/ps
+    molecule: int  # that takes the largest part in it
+
+
+def stiffest(system: System, state: State) -> Stiffest | None:
+    """The fastest small motion of all molecules together; None where none of them is held.
+
+    The largest eigenvalue of the mass-weighted matrix of force differences, in the space that it makes of one random
+    vector (Arnoldi); the state is left alone. One evaluation of forces for each of `DIRECTIONS` directions.
+    """
+    model, engine = system.model, Engine(system.model, system.terms)
+    mass = np.sqrt(model.inverse_mass[model.species])[:, None]
+    inertia = np.sqrt(model.inverse_inertia[model.species])[: len(state.rotation)]
+    radius = np.array([m.radius for m in system.species])[model.species][: len(state.rotation), None]
+
+    def parts(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shifts and turns of molecules along a mass-weighted vector."""
+        cut = state.position.size
+        return mass * vector[:cut].reshape(-1, 3), inertia * vector[cut:].reshape(-1, 3)
+
+    def weighted(load: Load) -> np.ndarray:
+        return np.concatenate([(mass * load.force).ravel(), (inertia * load.torque_body).ravel()])
+
+    here = weighted(engine.evaluate(state)[0])
+    vector = np.random.default_rng(0).standard_normal(here.size)
+    vector *= np.concatenate([np.broadcast_to(mass, state.position.shape).ravel(), inertia.ravel()]) > 0
+    basis, matrix = [vector / np.linalg.norm(vector)], np.zeros((DIRECTIONS, DIRECTIONS))
+    for k in range(DIRECTIONS):
+        shift, turn = parts(basis[k])
+        reach = max(np.abs(shift).max(initial=0.0), np.abs(radius * turn).max(initial=0.0))
+        h = SMALL * system.smallest_diameter / reach
+        moved = state.copy()
+        moved.position[:] += h * shift
+        if len(turn):
+            moved.rotation[:] = state.rotation @ from_vector(h * turn)
+        image = (here - weighted(engine.evaluate(moved)[0])) / h
+        for j, other in enumerate(basis):
+            matrix[j, k] = other @ image
+            image = image - matrix[j, k] * other
+        size = np.linalg.norm(image)
+        if k + 1 == DIRECTIONS or not size > 1e-6 * np.abs(matrix).max():
+            break
+        matrix[k + 1, k] = size
+        basis.append(image / size)
+    matrix = matrix[: len(basis), : len(basis)]
+    if not np.isfinite(matrix).all():
+        return None
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    if values[-1] <= 0:
+        return None
+    mode = (np.array(basis).T @ vectors[:, -1]) ** 2
+    share = mode[: state.position.size].reshape(-1, 3).sum(axis=1)
+    share[: len(state.rotation)] += mode[state.position.size :].reshape(-1, 3).sum(axis=1)
+    return Stiffest(sqrt(values[-1]), int(share.argmax()))
+
+
+def is_worth_it(system: System, evaluations: int) -> bool:
+    """Whether an estimate costs next to nothing, compared with the forces that a stage evaluates."""
+    return len(system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
+
+
+def body_rate(system: BodySystem) -> float:
+    """The fastest of what a body's steps have to follow at its start, rad/s: the swing of its weight, and its spin.
+
+    Rotors turn a body on which nothing acts however it spins, the split one unless it is asymmetric; about an axis of
+    symmetry that the weight lies on, they leave of a spin the nutation. General solvers have to follow it all.
+    """
+    if not system.turns:
+        return 0.0
+    inertia, momentum = system.inertia, system.state.angular_momentum_body[0]
+    weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+    stiffness, spins = np.zeros(3), np.divide(momentum, inertia, out=np.zeros(3), where=inertia > 0)
+    for term in weights:
+        arms = np.sqrt(np.maximum(term.point @ term.point - term.point**2, 0.0))
+        stiffness += np.linalg.norm(term.force) * np.divide(arms, inertia, out=np.zeros(3), where=inertia > 0)
+    flows = isinstance(system.method, Scheme)
+    followed = not flows or isinstance(system.engine().model_for(system.method).rotor, SplitRotor)
+    for k in range(3) if flows else ():
+        i, j = (k + 1) % 3, (k + 2) % 3
+        if inertia[i] == inertia[j] > 0 and len(weights) == len(system.terms) and not stiffness[k]:
+            followed = False
+            spins = momentum / inertia[i]
+    followed = followed or stiffness.any() or len(weights) < len(system.terms)
+    return max(sqrt(stiffness.max()), float(np.linalg.norm(spins)) if followed else 0.0)

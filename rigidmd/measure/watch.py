@@ -1,0 +1,316 @@
+"""What shows that the numbers of a run no longer mean what its scene says, and the words for it.
+
+Nothing here costs an evaluation of forces: states, loads and samples are looked at as the run has them anyway. Only a
+finding starts a search for the pair of sites behind it.
+"""
+
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.build.body import BodySystem
+from rigidmd.build.relief import kicks
+from rigidmd.build.system import OVERLAP, System, close_pairs
+from rigidmd.dynamics.engine import NotFiniteError
+from rigidmd.dynamics.odes import Solver
+from rigidmd.dynamics.schemes import Scheme
+from rigidmd.errors import SimulationError
+from rigidmd.forces.fields import SteadyForce
+from rigidmd.forces.terms import Load, State
+from rigidmd.measure.motion import energies, is_balanced
+from rigidmd.measure.samples import Sample
+from rigidmd.mechanics.rotation import orthogonality_error
+from rigidmd.molecules import Molecule
+from rigidmd.scene.watch import BodyWatch, Watch
+from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+
+#: Opposite charges that no repulsion of their own keeps apart, closer than this fraction of the smallest diameter, are
+#: on one another: the hydrogen of a hydrogen bond stays at half of it. Of molecules without any repulsion, all of it.
+BARE, NAKED = 0.3, 1.0
+#: A moment of inertia below this fraction of the largest is that of a body which is all but linear.
+THIN = 0.01
+#: Rounding may take this fraction of a potential energy: half of its digits.
+ROUNDING = sqrt(np.finfo(float).eps)
+#: A step is checked at least every so many moves of molecules; a body's, evaluations of its forces, and looks.
+PATIENCE, BODY_PATIENCE, LOOKS = 100_000, 1_000_000, 512
+
+
+class Finding(SimulationError):
+    """What was seen, as a sentence.
+
+    molecule : which one shows it (from 0), if one does; shorter : by which factor the step would have to be shorter to
+    stay within the limit, where one can tell; unturned : whether it is Q that is wrong
+    """
+
+    def __init__(self, seen: str, molecule: int | None = None, shorter: float | None = None, unturned: bool = False):
+        super().__init__(seen)
+        self.molecule = molecule
+        self.shorter = shorter
+        self.unturned = unturned
+
+
+class Cause(NamedTuple):
+    """What a finding probably comes from, and what to try."""
+
+    likely: str
+    advice: str
+
+
+def patience(system: System) -> int:
+    """Steps after which molecules are looked at though nobody asks: so many that a look is below 1 % of them."""
+    return max(20, PATIENCE // len(system.model.species))
+
+
+def thermal_energy(system: System, kinetic: float) -> float:
+    """kT of this kinetic energy, or the deepest well where that is more: the scale of momenta, u Å²/ps²."""
+    wells = max((m.epsilon.max() for m in system.species), default=0.0)
+    return max(2 * kinetic / max(system.freedom.total, 1), wells)
+
+
+def step_finding(
+    system: System, limits: Watch, state: State, load: Load, scheme: Scheme, dt: float, thermal: float
+) -> Finding | None:
+    """What is wrong with the next step of a state: no finite force, too large a kick, too long a way or turn.
+
+    load : at this state, or where the last kick was; thermal : see `thermal_energy`
+    """
+    for what, values in (("force", load.force), ("torque", load.torque_body)):
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            m = int(bad.argmax())
+            return Finding(f"the {what} on {named(system, m)} is no finite number", m)
+    model = system.model
+    if limits.kick and thermal > 0:
+        size = kicks(model, load, thermal, dt * max(map(abs, scheme.kicks)))
+        if size.max() > limits.kick:
+            m = int(size.argmax())
+            seen = f"one kick changes a momentum of {named(system, m)} by {size[m]:.3g} times its thermal size"
+            return Finding(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
+    stride = dt * max(map(abs, scheme.drifts))
+    if limits.move:
+        way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
+        m, diameter = int(way.argmax()), system.smallest_diameter
+        if way[m] > limits.move * diameter:
+            seen = f"{named(system, m)} moves {way[m]:.3g} Å from force to force, {way[m] / diameter:.3g} of the "
+            seen += f"smallest diameter (watch.move = {limits.move:g})"
+            return Finding(seen, m, shorter=way[m] / diameter / limits.move)
+    if limits.turn_rad and len(state.rotation):
+        # sites on the axis of a spin do not feel it: what counts is how far the spin takes them, in radii
+        arms = np.array([axis_distances(m) / (m.radius or 1.0) for m in system.species])
+        omega = state.angular_momentum_body * (model.inverse_inertia * arms)[model.species]
+        angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
+        m = int(angle.argmax())
+        if angle[m] > limits.turn_rad:
+            seen = f"{named(system, m)} turns by {angle[m]:.3g} rad from force to force"
+            return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
+    return None
+
+
+def axis_distances(molecule: Molecule) -> np.ndarray:
+    """How far from each principal axis (3,) the sites of a molecule reach, Å."""
+    square = molecule.positions_body**2
+    return np.sqrt((square.sum(axis=1, keepdims=True) - square).max(axis=0))
+
+
+def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) -> Finding | None:
+    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
+
+    The kinetic energy that the change is held against is that of the earlier one, and what the potential has given
+    since; that of a thermostat's temperature where that is more.
+    """
+    if limits.orthogonality and not now.orthogonality <= limits.orthogonality:
+        seen = f"|QᵀQ - 1| is {now.orthogonality:.2g} (watch.orthogonality = {limits.orthogonality:g})"
+        return Finding(f"a matrix Q is no rotation any more: {seen}", unturned=True)
+    if not limits.energy:
+        return None
+    stage, share = system.scene.stages[now.stage], 1.0
+    kinetic = since.kinetic
+    if stage.ensemble == "nvt":
+        kinetic = max(kinetic, 0.5 * BOLTZMANN * stage.temperature_K * system.freedom.total)
+        share = min(1.0, stage.thermostat_time_ps / (now.time - since.time)) if now.time > since.time else 1.0
+    drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
+    scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
+    if abs(drift) * share <= limits.energy * scale:
+        return None
+    n = len(system.model.species) * KJ_PER_MOL
+    return Finding(
+        f"the conserved energy changed by {drift / n:.3g} kJ/mol per molecule in {now.time - since.time:g} ps, "
+        f"{abs(drift) * share / scale if scale else inf:.3g} kinetic energies (watch.energy = {limits.energy:g})"
+    )
+
+
+def named(system: System, molecule: int) -> str:
+    """A molecule by its number (from 1) and species."""
+    return f"molecule {molecule + 1} ({system.species[system.model.species[molecule]].name})"
+
+
+class Pair(NamedTuple):
+    """Two sites inside one another's core."""
+
+    first: int
+    second: int
+    distance: float  # Å
+    share: float  # of their diameter; of the smallest one of the scene where they have none
+    bare: bool  # opposite charges without a repulsion of their own
+
+
+def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | None:
+    """The pair of sites deepest inside one another, of this molecule if it has such a pair; None where none is."""
+    if not np.abs(state.position).max() * np.finfo(float).eps < 1e-3 * system.smallest_diameter:
+        return None  # where a coordinate has no digits left for distances
+    sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
+    near = system.of_sites(lambda m: np.full(len(m.epsilon), BARE if m.epsilon.any() else NAKED))
+    charge = system.of_sites(lambda m: m.charges) if "coulomb" in system.terms else np.zeros(len(sigma))
+    found = []
+    reach = max(OVERLAP * sigma.max(), near.max() * system.smallest_diameter)
+    for i, j, distance in close_pairs(system, state, reach):
+        repel = sigma[i] > 0 and sigma[j] > 0
+        size = (sigma[i] + sigma[j]) / 2 if repel else system.smallest_diameter
+        bare = not repel and charge[i] * charge[j] < 0
+        if (repel or bare) and distance <= (OVERLAP if repel else max(near[i], near[j])) * size:
+            found.append(Pair(i, j, distance, distance / size, bare))
+    own = [pair for pair in found if molecule in system.sites.molecule[[pair.first, pair.second]]]
+    return min(own or found, key=lambda pair: pair.share, default=None)
+
+
+def explained(
+    system: System, error: SimulationError, states: list[tuple[str, State]], dt: float, stable: float | None
+) -> str:
+    """The finding in full: what was seen, the likely cause, what to try.
+
+    states : where to look for sites inside one another, and what to say of each place; dt, stable : the step taken and
+    the longest stable one, as far as known, ps
+    """
+    finding = error
+    if isinstance(error, NotFiniteError):
+        seen = f"{named(system, error.molecule)} is nowhere: its position or momentum is no finite number"
+        finding = Finding(seen, error.molecule)
+    elif not isinstance(error, Finding):
+        return str(error)
+    text, pair = str(finding), None
+    for where, state in states:
+        if all(np.isfinite(array).all() for array in state):
+            pair = pair_in_core(system, state, finding.molecule)
+        if pair:
+            a, b = (
+                f"{system.sites.name[site]} of {named(system, system.sites.molecule[site])}"
+                for site in (pair.first, pair.second)
+            )
+            whose = "the smallest" if pair.bare else "their"
+            text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.share:.2g} of {whose} diameter"
+            break
+    likely, advice = _cause(system, finding, pair, dt, stable)
+    return f"{text}. Likely cause: {likely}. Try {advice}"
+
+
+def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stable: float | None) -> Cause:
+    shorter = f"a shorter timestep_fs than {dt / FEMTOSECOND:g}"
+    if stable is not None and stable < dt:
+        shorter = f"timestep_fs below {stable / FEMTOSECOND:.2g}, where the stiffest motion is stable"
+    elif finding.shorter is not None and finding.shorter < 1 / ROUNDING:
+        shorter = f"timestep_fs = {dt / finding.shorter / FEMTOSECOND:.2g} or less"
+    if pair is not None and pair.bare:
+        a, b = system.sites.name[[pair.first, pair.second]]
+        return Cause(
+            "a charge on a site without repulsion has fallen onto an opposite one: nothing stops it",
+            f"giving one of these sites sigma_A and epsilon_kJ_mol, or the pair an entry [[forces.pairs]] with sites = "
+            f'["{a}", "{b}"]',
+        )
+    if pair is not None:
+        return Cause(
+            "these sites overlap: they were put there, or too long a step carried them there",
+            f"a start without overlaps, an nvt stage with a short step first, or {shorter}",
+        )
+    if finding.molecule is not None:
+        species = system.species[system.model.species[finding.molecule]]
+        even = species.mass * axis_distances(species) ** 2
+        share = np.divide(species.inertia, even, out=np.ones(3), where=species.inertia > 0)
+        if share.min() < THIN:
+            return Cause(
+                f"bad inertia: a moment of {species.name} is {species.inertia[share.argmin()]:.2g} u Å², "
+                f"{share.min():.1g} of what its mass would have as far out as its sites are: torques turn it at once",
+                f"more of its mass on the outer sites, or {shorter}",
+            )
+    if finding.unturned:
+        return Cause(
+            "Q was no rotation at the start or was changed from outside: the run itself only multiplies rotations",
+            "the start from which the last good state came; a very long run may raise watch.orthogonality",
+        )
+    return Cause("timestep_fs is too long for this motion", f"{shorter}, or an nvt stage first")
+
+
+class BodyCheck:
+    """Looks at a body's run now and then.
+
+    The scale of its energy is the largest that has moved so far, so that has to be remembered.
+    """
+
+    def __init__(self, system: BodySystem, limits: BodyWatch):
+        self.system = system
+        self.limits = limits
+        self._start = self._energies(system.state)
+        weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+        swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
+        self._moved = abs(self._start["kinetic"]) + (0.0 if system.flies else 2 * swing)
+
+    def _energies(self, state: State) -> dict[str, float]:
+        columns = energies(self.system, state.time, State(*(array[None] for array in state)))
+        return {name: float(values[0]) for name, values in columns.items()}
+
+    def finding(self, state: State, dt: float) -> Finding | None:
+        """What is wrong with a state of the run."""
+        system, limits = self.system, self.limits
+        largest = limits.orthogonality or (0.1 if isinstance(system.method, Solver) else 1e-9)
+        if limits.orthogonality is not False and not (worst := orthogonality_error(state.rotation)) <= largest:
+            seen = f"Q is no rotation any more: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            return Finding(seen, unturned=True)
+        if system.turns and limits.turn_rad:
+            omega = system.pose(float(state.time[0]), state).angular_velocity_body
+            angle = dt * float(np.linalg.norm(omega))
+            if angle > limits.turn_rad:
+                seen = f"the body turns by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
+                return Finding(seen, shorter=angle / limits.turn_rad)
+        if not limits.energy or not is_balanced(system):
+            return None
+        start, now = self._start, self._energies(state)
+        self._moved = max(self._moved, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
+        error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
+        scale = self._moved + ROUNDING * abs(now["energy"])
+        if error <= limits.energy * scale:
+            return None
+        return Finding(
+            f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
+            f"energy that has moved (watch.energy = {limits.energy:g})"
+        )
+
+    def explained(self, error: SimulationError, dt: float, stable: float | None) -> str:
+        """The finding in full: what was seen, the likely cause, what to try."""
+        finding, system = error, self.system
+        if isinstance(error, NotFiniteError):
+            finding = Finding("position or momentum of the body is no finite number any more")
+        elif not isinstance(error, Finding):
+            return str(error)
+        shorter = f"a shorter timestep_s than {dt:g}"
+        if stable is not None and stable < dt:
+            shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
+        elif finding.shorter is not None:
+            shorter = f"timestep_s = {dt / finding.shorter:.2g} or less"
+        inertia = system.inertia
+        if finding.unturned:
+            cause = Cause(
+                f"nothing but accuracy keeps Q a rotation under {system.method.name}"
+                if isinstance(system.method, Solver)
+                else "Q was changed from outside: the run itself only multiplies rotations",
+                f"integrator = 'srkn_6', which keeps Q, or {shorter}",
+            )
+        elif system.turns and inertia[inertia > 0].min() < THIN * inertia.max():
+            least = inertia[inertia > 0].min()
+            cause = Cause(
+                f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "
+                "and the body spins about that axis faster than the step can follow",
+                f"{shorter}, or a moment of 0",
+            )
+        else:
+            cause = Cause("timestep_s is too long for this motion, or a force grows without bound", shorter)
+        return f"{finding}. Likely cause: {cause.likely}. Try {cause.advice}"
