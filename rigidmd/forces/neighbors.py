@@ -127,7 +127,9 @@ def update_list(pairs):
 @kernel
 def still_good(pairs):
     """Whether the list is good for sites that have moved as `clusters.moved2` says, and which shells matter then."""
-    moved2 = pairs.clusters.moved2.max()
+    moved2 = 0.0
+    for block in range(len(pairs.needed)):
+        moved2 = max(moved2, pairs.clusters.moved2[block])
     if not moved2 < inf:
         return False
     pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)

@@ -136,10 +136,10 @@ def _add_pair_forces(term, state, load, tally):
         status = update_list(pairs)
         if status != OK:
             return status
-        if _room(pairs) > sums.others.shape[1]:
-            pairs.counters[0] = 0
-            return LIST_FULL
         if pairs.counters[1] != builds:
+            if _room(pairs) > sums.others.shape[1]:
+                pairs.counters[0] = 0
+                return LIST_FULL
             arrange(term.law, term.arranged, pairs.clusters.order)
         blocks = len(sums.tallies)
         parcel = packed((term.arranged, pairs, sums))
