@@ -25,7 +25,7 @@ from rigidmd.forces.lanes import (
     total,
     width_of,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, empty_list, update_list
+from rigidmd.forces.neighbors import PairList, empty_list, most_needed, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
@@ -96,7 +96,7 @@ def with_room(term: NamedTuple) -> NamedTuple:
 @kernel
 def _room(pairs):
     """Room that a block needs for forces on the sites of others."""
-    return 3 * width_of(pairs.clusters.local) * pairs.needed[:, 2].max()
+    return 3 * width_of(pairs.clusters.local) * most_needed(pairs, 2)
 
 
 def with_own_list(term: NamedTuple) -> NamedTuple:
@@ -120,7 +120,7 @@ def arrange(law, arranged, order):
     raise TypeError("compiled code only")
 
 
-@implements(terms.add_forces)
+@implements(terms.add_forces, counted=False)
 def _add_pair_forces(term, state, load, tally):
     if not is_a(term, PairForces):
         return None
