@@ -110,7 +110,7 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False, count
     """
     if function is None:
         return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted)
-    options = _options(fastmath, inline) | ({"parallel": True} if parallel else {}) | _counting(counted)
+    options = _options(fastmath, inline) | ({"parallel": True, "_nrt": True} if parallel else _counting(counted))
     with _own_cache():
         compiled = numba.njit(cache=True, **options)(function)
     compiled._cache._cache_file.__class__ = Index
@@ -127,9 +127,9 @@ def _own_cache():
         numba.config.CACHE_DIR = before
 
 
-def implements(stub, fastmath=False, inline=False):
+def implements(stub, fastmath=False, inline=False, counted=True):
     """`numba.extending.overload` with the options of `kernel`, which an overload does not inherit from its caller."""
-    return overload(stub, jit_options=_options(fastmath, inline))
+    return overload(stub, jit_options=_options(fastmath, inline) | _counting(counted))
 
 
 def _options(fastmath, inline: bool) -> dict:

@@ -53,7 +53,7 @@ def test_vectors_compute_as_arrays_do(dtype):
         x + y, x - y, x * y, x / y, 2 - x, x * 3, np.maximum(x, y), np.minimum(x, 1.5), 1 / np.sqrt(x.astype(float)),
         np.where(x < y, x, 0), np.where(fives, y, x),
     ]  # fmt: skip
-    assert out.reshape(11, width) == pytest.approx(np.array(expected), rel=4 * np.finfo(dtype).eps)
+    assert out.reshape(11, width) == pytest.approx(np.array(expected), rel=4 * float(np.finfo(dtype).eps))
     assert sums[0] == pytest.approx(x.sum(dtype=float), rel=1e-14)
     assert sums[1] == sums[4] == x.max()
     assert sums[2] == sum(1 << k for k in range(width) if x[k] > 1 and y[k] <= 2)

@@ -98,7 +98,7 @@ def with_room(pairs: PairList) -> PairList:
     return pairs
 
 
-@kernel
+@kernel(counted=False)
 def update_list(pairs):
     """Bring clusters to the site positions, and build the list anew if it is no longer good. A status code."""
     blocks = len(pairs.needed)
@@ -116,7 +116,7 @@ def update_list(pairs):
     call_blocks(pairs.parts.settle, parcel, blocks)
     call(pairs.parts.grow, parcel, 0)
     call_blocks(pairs.parts.fill, parcel, blocks)
-    if pairs.needed[:, 0].max() > pairs.entries.shape[1] or pairs.needed[:, 1].max() > pairs.masked.shape[1]:
+    if most_needed(pairs, 0) > pairs.entries.shape[1] or most_needed(pairs, 1) > pairs.masked.shape[1]:
         return LIST_FULL
     pairs.counters[0] = 1
     pairs.counters[1] += 1
@@ -125,9 +125,20 @@ def update_list(pairs):
 
 
 @kernel
+def most_needed(pairs, k):
+    """The most that any block needs of what `needed[:, k]` counts."""
+    most = 0
+    for block in range(len(pairs.needed)):
+        most = max(most, pairs.needed[block, k])
+    return most
+
+
+@kernel
 def still_good(pairs):
     """Whether the list is good for sites that have moved as `clusters.moved2` says, and which shells matter then."""
-    moved2 = pairs.clusters.moved2.max()
+    moved2 = 0.0
+    for block in range(len(pairs.needed)):
+        moved2 = max(moved2, pairs.clusters.moved2[block])
     if not moved2 < inf:
         return False
     pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)

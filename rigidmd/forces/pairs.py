@@ -25,7 +25,7 @@ from rigidmd.forces.lanes import (
     total,
     width_of,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, empty_list, update_list
+from rigidmd.forces.neighbors import PairList, empty_list, most_needed, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
@@ -104,7 +104,7 @@ def with_room(term: NamedTuple) -> NamedTuple:
 @kernel
 def _room(pairs):
     """Room that a block needs for forces on the sites of others."""
-    return 3 * width_of(pairs.clusters.local) * pairs.needed[:, 2].max()
+    return 3 * width_of(pairs.clusters.local) * most_needed(pairs, 2)
 
 
 def with_own_list(term: NamedTuple) -> NamedTuple:
@@ -128,7 +128,7 @@ def arrange(law, arranged, order):
     raise TypeError("compiled code only")
 
 
-@implements(terms.add_forces)
+@implements(terms.add_forces, counted=False)
 def _add_pair_forces(term, state, load, tally):
     if not is_a(term, PairForces):
         return None
@@ -144,10 +144,10 @@ def _add_pair_forces(term, state, load, tally):
         status = update_list(pairs)
         if status != OK:
             return status
-        if _room(pairs) > sums.others.shape[1]:
-            pairs.counters[0] = 0
-            return LIST_FULL
         if pairs.counters[1] != builds:
+            if _room(pairs) > sums.others.shape[1]:
+                pairs.counters[0] = 0
+                return LIST_FULL
             arrange(term.law, term.arranged, pairs.clusters.order)
         blocks = len(sums.tallies)
         parcel = packed((term.arranged, pairs, sums))
