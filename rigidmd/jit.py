@@ -25,6 +25,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.caching import IndexDataCacheFile
+from numba.core.ccallback import CFunc
 from numba.core.codegen import get_host_cpu_features
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic, models, overload, register_model
@@ -197,9 +198,11 @@ class Work:
         parcel = Parcel(numba.typeof(content))
         if parcel not in self.compiled:
             with _own_cache():
-                self.compiled[parcel] = numba.cfunc(types.void(parcel, types.intp), cache=True, **self.options)(
-                    self.function
-                )
+                code = CFunc(self.function, ((parcel, types.intp), types.void), locals={}, options=self.options)
+                code.enable_caching()
+                code._cache._cache_file.__class__ = Index
+                code.compile()
+            self.compiled[parcel] = code
         return self.compiled[parcel].address
 
 
