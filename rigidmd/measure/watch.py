@@ -28,7 +28,8 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 #: Opposite charges that no repulsion of their own keeps apart, closer than this fraction of the smallest diameter, are
 #: on one another: the hydrogen of a hydrogen bond stays at half of it. Of molecules without any repulsion, all of it.
 BARE, NAKED = 0.3, 1.0
-#: A moment of inertia below this fraction of the largest is that of a body which is all but linear.
+#: A moment of inertia below this fraction of that of the whole mass as far out as the sites are (of a body: of its
+#: largest moment) is one that torques turn at once. Of water it is 0.05.
 THIN = 0.01
 #: Rounding may take this fraction of a potential energy: half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
@@ -68,6 +69,7 @@ def thermal_energy(system: System, kinetic: float) -> float:
     return max(2 * kinetic / max(system.freedom.total, 1), wells)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def step_finding(
     system: System, limits: Watch, state: State, load: Load, scheme: Scheme, dt: float, thermal: float
 ) -> Finding | None:
@@ -258,6 +260,7 @@ class BodyCheck:
         columns = energies(self.system, state.time, State(*(array[None] for array in state)))
         return {name: float(values[0]) for name, values in columns.items()}
 
+    @np.errstate(over="ignore", invalid="ignore")
     def finding(self, state: State, dt: float) -> Finding | None:
         """What is wrong with a state of the run."""
         system, limits = self.system, self.limits

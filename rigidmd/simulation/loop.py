@@ -239,6 +239,7 @@ class Simulation(ABC):
         self._warnings.append(warning)
         self._warn(warning)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _failed(self, error: SimulationError) -> SimulationError:
         """The error with when it happened and all that can be said about it."""
         step, time, dt = self._began
