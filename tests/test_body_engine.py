@@ -644,9 +644,10 @@ def test_quadratic_resistance_never_lets_go(strength):
     ).run()
     speed = np.sqrt(sum(results[k] ** 2 for k in ("vx", "vy", "vz")))
     known = speed[0] / (1 + strength * speed[0] * results["t"])
-    assert (np.diff(speed) < 0).all() or strength > 1e3
+    assert (np.diff(speed) <= 0).all()
+    assert speed[-1] < speed[0]
     assert (speed[1:] <= 1.2 * known[1:]).all()
-    assert (np.diff(np.sign(results["vx"])) == 0).all()
+    assert (results["vx"] >= 0).all()
     fixed = point | {
         "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 1.0], "pinned": True},
         "start": {"angular_velocity_body_rad_s": [1.0, -2.0, 0.5]},

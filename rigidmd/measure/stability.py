@@ -19,7 +19,7 @@ VERDICTS = {
 #: A run whose conserved quantities are off by this much of the kinetic energy is no longer bounded.
 BOUND = 0.1
 #: The step is doubled until it is no longer bounded, so often at most; then bisected to this ratio.
-DOUBLINGS, RATIO = 10, 1.05
+DOUBLINGS, RATIO = 10, 1.1
 
 
 class Outcome(NamedTuple):

@@ -150,8 +150,8 @@ def picture(finding: Finding) -> bytes:
     """A small figure of a case, PNG: errors over what was varied, and what was conserved over the step."""
     from matplotlib.figure import Figure
 
-    left = [t for t in finding.trials if isfinite(t.x) and isfinite(t.outcome.error)]
-    panels = [kind for kind, has in (("trials", left), ("limits", finding.limits)) if has]
+    varied = len({t.x for t in finding.trials if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
+    panels = [kind for kind, has in (("trials", varied), ("limits", finding.limits)) if has]
     if not panels:
         return b""
     figure = Figure(figsize=(4.6 * len(panels), 3.0), layout="constrained")
@@ -188,7 +188,8 @@ def _draw_trials(axis, finding: Finding, family: str, color: str) -> None:
         [t.x for t in right],
         [max(t.outcome.error, FLOOR) for t in right],
         "o",
-        ms=3.5,
+        ms=3 + 1.5 * finding.families.index(family),
+        mfc="none",
         color=color,
         label=family or None,
     )

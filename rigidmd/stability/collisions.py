@@ -1,13 +1,17 @@
 """Molecules that meet too hard, too close, or with nothing to keep them apart."""
 
+import tempfile
 from math import sqrt
+from pathlib import Path
 
 import numpy as np
 
 from rigidmd.build.system import build
 from rigidmd.forces.terms import State
 from rigidmd.measure.stability import REFUSED, RIGHT, TOLD, Finding, Outcome, longest_step
+from rigidmd.output.state import write_state
 from rigidmd.scene import Scene
+from rigidmd.simulation import Simulation
 from rigidmd.stability.cases import case
 from rigidmd.stability.runs import SPLIT, attempt, energy_error, families, molecules_scene, run_molecules, simulate
 from rigidmd.units import BOLTZMANN
@@ -102,27 +106,18 @@ def overlaps(find: Finding, quick: bool) -> None:
 
 def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
     """A scene started from a file with the molecules of a state, as a user would."""
-    import tempfile
-    from pathlib import Path
-
-    from rigidmd.output.state import write_state
 
     def run() -> Outcome:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "start.npz"
-            write_state(path, build(Scene.from_dict(data)), state)
-            results = simulation_in(data | {"structure": {"file": path.name, "velocities": velocities}}, folder)
+            template = data | {"start": {"temperature_K": 0.0}}
+            write_state(path, build(Scene.from_dict(template)), state)
+            started = data | {"structure": {"file": path.name, "velocities": velocities}}
+            results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
         told = energy_error(results)
         return Outcome(told, told)
 
     return attempt(run)
-
-
-def simulation_in(data: dict, folder: str):
-    """Run a scene whose files are in a folder."""
-    from rigidmd.simulation import Simulation
-
-    return Simulation(Scene.from_dict(data, folder)).run()
 
 
 @case(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
@@ -139,7 +134,7 @@ def bare_charges(find: Finding, quick: bool) -> None:
         ],
     }
     for family in families(quick):
-        data = molecules_scene([bare], BOX, 1.0, 500 if quick else 5000, family, 300.0, None, FORCES, looks=100)
+        data = molecules_scene([bare], BOX, 1.0, 500, family, 300.0, None, FORCES, looks=100)
         find.add("arms longer than sigma/2", run_molecules(data), 0.1, family, 0.0, 1.0, (REFUSED, TOLD))
     data = molecules_scene([bare | {"count": 2}], BOX, 1.0, 100, SPLIT, 300.0, None, FORCES)
     state = build(Scene.from_dict(data)).state

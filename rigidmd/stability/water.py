@@ -10,12 +10,12 @@ from rigidmd.measure.summary import mean
 from rigidmd.stability.cases import case
 from rigidmd.stability.collisions import bent
 from rigidmd.stability.runs import (
+    QUICK,
     SPLIT,
     WATER_BOX,
     WATER_FORCES,
     WATERS,
     attempt,
-    families,
     liquid,
     molecules_scene,
     run_molecules,
@@ -39,8 +39,8 @@ def water_steps(find: Finding, quick: bool) -> None:
         step = min(0.5, 0.5 * (1000.0 / max(temperature, 1.0)) ** 0.5)
         state = frozen() if temperature == 0 else warm("spce", temperature, step)
         scale = 0.5 * FREEDOM * BOLTZMANN * max(temperature, 1.0)
-        for family in families(quick):
-            span = (500 if quick else 2000) * step
+        for family in QUICK:
+            span = (500 if quick else 1000) * step
 
             def at(h: float, family=family, state=state, scale=scale, span=span) -> Outcome:
                 return moved("spce", h, max(200, round(span / h)), family, state, scale)
@@ -54,10 +54,10 @@ def tip4p_steps(find: Finding, quick: bool) -> None:
     """TIP4P at 300 K at 0.5 to 12 fs; published for it: unstable near 10 fs."""
     state = warm("tip4p", 300.0, 1.0)
     scale = 0.5 * FREEDOM * BOLTZMANN * 300.0
-    for family in families(quick):
+    for family in (SPLIT,) if quick else QUICK:
 
         def at(h: float, family=family) -> Outcome:
-            return moved("tip4p", h, 300 if quick else 5000, family, state, scale)
+            return moved("tip4p", h, 300 if quick else 1000, family, state, scale)
 
         for step in STEPS[:1] if quick else STEPS:
             find.add(
@@ -123,7 +123,7 @@ def equipartition(find: Finding, quick: bool) -> None:
     )
     for words, molecules in settings.items():
         for step in (2.0, 8.0):
-            steps = 4000 if quick else 50000
+            steps = 4000 if quick else 40000
             heat = {"temperature_K": 400.0, "thermostat_time_ps": 0.1}
             data = molecules_scene(
                 molecules, {"lengths_A": 16.0}, step, steps, SPLIT, 400.0, heat, {"cutoff_A": 8.0}, looks=steps // 10
