@@ -33,7 +33,10 @@ def main(arguments: list[str] | None = None) -> int:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
     except MemoryError:
-        print(f"rigidmd: {options.scene}: not enough memory; take fewer molecules or samples", file=sys.stderr)
+        print(
+            f"rigidmd: {options.scene}: not enough memory; take fewer molecules or samples",
+            file=sys.stderr,
+        )
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         sys.stderr.close()
@@ -92,6 +95,19 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     precision.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-precision)")
     precision.add_argument("--force", action="store_true", help="replace earlier results in that folder")
+
+    stability = _command(
+        commands,
+        "stability",
+        _stability,
+        "try to break the engine: named cases, each held against what is known; exit code 1 if any is silently wrong",
+        "rigidmd stability --quick --case near_linear --case water_steps",
+    )
+    stability.add_argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes")
+    stability.add_argument("--case", action="append", metavar="NAME", help="only this case; may be repeated")
+    stability.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/stability)")
+    stability.add_argument("--force", action="store_true", help="replace earlier results in that folder")
+    stability.set_defaults(scene="stability")
 
     _command(commands, "models", _models, "list the molecules that come with rigidmd", "rigidmd models")
     _command(
@@ -262,6 +278,32 @@ def _precision(options: argparse.Namespace) -> int:
     written = write_precision(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
+
+
+def _stability(options: argparse.Namespace) -> int:
+    import platform
+    import shlex
+
+    from tqdm import tqdm
+
+    from rigidmd.output.folder import check_folder, make_folder
+    from rigidmd.output.stability_report import FILES, failed, table_text, words, write_stability
+    from rigidmd.stability.cases import battery, chosen
+
+    folder = Path(options.output) if options.output else Path("runs") / "stability"
+    check_folder(folder, options.force)
+    total = len(chosen(options.case))
+    with tqdm(total=total, disable=None, leave=False, bar_format="{l_bar}{bar}| {desc} [{elapsed}]") as bar:
+        findings = []
+        for finding in battery(options.case, options.quick, bar.set_description_str):
+            findings.append(finding)
+            bar.update()
+    print(table_text(findings), "", *words(findings), sep="\n")
+    make_folder(folder, options.force, FILES)
+    machine = platform.processor() or platform.machine()
+    written = write_stability(folder, findings, shlex.join(["rigidmd", *sys.argv[1:]]), machine)
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    return FAILED if failed(findings) else 0
 
 
 def _models(options: argparse.Namespace) -> int:

@@ -628,3 +628,46 @@ def test_a_gradient_is_not_asked_of_forces_that_have_none():
             simulate(FREE | more, run__integrator="chin_4a")
     with pytest.raises(SceneError, match="chin_4a asks for the gradient"):
         simulate(FREE, applied={"push": lambda pose: ([0, 0, 0], [0, 0, 0])}, run__integrator="chin_4a")
+
+
+@pytest.mark.parametrize("strength", [1e-6, 1.0, 1e3, 1e6, 1e12])
+def test_quadratic_resistance_never_lets_go(strength):
+    """However strong, it brakes, and never past zero: |v| at the middle of a kick is that of the resistance itself."""
+    point = {
+        "body": {"mass_kg": 1.0},
+        "start": {"velocity_m_s": [1.0, -2.0, 0.5]},
+        "run": {"duration_s": 4.0, "timestep_s": 0.5},
+    }
+    point["fluid"] = {"quadratic_resistance_kg_m": [strength] * 3}
+    results = Simulation(
+        Scene.from_dict(point | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
+    ).run()
+    speed = np.sqrt(sum(results[k] ** 2 for k in ("vx", "vy", "vz")))
+    known = speed[0] / (1 + strength * speed[0] * results["t"])
+    assert (np.diff(speed) <= 0).all()
+    assert speed[-1] < speed[0]
+    assert (speed[1:] <= 1.2 * known[1:]).all()
+    assert (results["vx"] >= 0).all()
+    fixed = point | {
+        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 1.0], "pinned": True},
+        "start": {"angular_velocity_body_rad_s": [1.0, -2.0, 0.5]},
+    }
+    fixed["fluid"] = {"quadratic_rotational_resistance_N_m_s2": [strength] * 3}
+    turning = Simulation(
+        Scene.from_dict(fixed | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
+    ).run()
+    spin = np.sqrt(sum(turning[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
+    assert spin == pytest.approx(speed, rel=1e-9, abs=1e-12)
+
+
+def test_a_stone_let_go_in_a_stiff_fluid_falls_at_its_terminal_speed():
+    stone = {
+        "body": {"mass_kg": 1.0},
+        "gravity": {},
+        "fluid": {"quadratic_resistance_kg_m": [1e8] * 3},
+        "run": {"duration_s": 3.0, "timestep_s": 0.5},
+    }
+    results = Simulation(
+        Scene.from_dict(stone | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
+    ).run()
+    assert results["vz"][1:] == pytest.approx(-np.sqrt(9.81 / 1e8), rel=1e-9)

@@ -195,3 +195,13 @@ def test_a_body_that_does_not_turn_or_is_no_number_stays_so():
     l[:] = [np.nan, 1.0, 1.0]
     spin(rotor, q, l, 0.01, 3)
     assert np.isnan(l).any()
+
+
+def test_a_turn_too_long_to_mean_anything_becomes_no_number_at_once():
+    rotor = ExactRotor(*split_rotor(np.array([[0.6, 1.1, 1.7]])))
+    q, l = np.eye(3)[None].copy(), np.array([[1e15, 2e15, 3e15]])  # noqa: E741
+    spin(rotor, q, l, 1.0, 1)  # in parts of half a radian it would take a year
+    assert np.isnan(l).all()
+    l[:] = [1.0, 2.0, 3.0]
+    spin(rotor, q, l, 1000.0, 1)
+    assert np.linalg.norm(l) == pytest.approx(14**0.5, rel=1e-12)

@@ -15,6 +15,9 @@ from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.flight import Pinned, along, inertial_mass
 from rigidmd.mechanics.rotor import NoRotor, moments
 
+MOST_TRIALS = 100  # of |v|; some six are needed
+SAME_SIZE = 1e-14
+
 
 class NoResistance(NamedTuple):
     """Nothing is lost."""
@@ -68,34 +71,73 @@ def _push(resistance, flight, rotor, frame, state, load, h):
 
 @kernel
 def push_spin(resistance, rotor, frame, state, load, h):
-    """L under torque and resistance; |w| is that of the middle of the kick, from a first try with that of its start."""
+    """L under torque and resistance; |w| is that of the middle of the kick."""
     W = frame_rate(frame, state.time[0])
     q = state.rotation[0]
     L = state.angular_momentum_body[0]
-    size = 0.0
-    for trial in range(2):
-        squares = 0.0
-        for k in range(3):
-            inverse, carried = moments(rotor, state.time[0], k)
-            before = (L[k] - carried) * inverse - along(q, W, k)
-            if trial == 0:
-                squares += before * before
-            elif inverse > 0.0:
-                linear = inverse * (resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size)
-                push_k, dry = inverse * load.torque_body[0, k], inverse * resistance.rotation_dry[k]
-                middle, _ = pushed(before, push_k, dry, linear, 0.5 * h)
-                squares += middle * middle
-        size = sqrt(squares)
+    i0, h0 = moments(rotor, state.time[0], 0)
+    i1, h1 = moments(rotor, state.time[0], 1)
+    i2, h2 = moments(rotor, state.time[0], 2)
+    inverse, carried = (i0, i1, i2), (h0, h1, h2)
+    dragged = (along(q, W, 0), along(q, W, 1), along(q, W, 2))
+    before = ((L[0] - h0) * i0 - dragged[0], (L[1] - h1) * i1 - dragged[1], (L[2] - h2) * i2 - dragged[2])
+    torque = load.torque_body[0]
+    pushes = (i0 * torque[0], i1 * torque[1], i2 * torque[2])
+    dry, linear, quadratic = resistance.rotation_dry, resistance.rotation_linear, resistance.rotation_quadratic
+    dries = (i0 * dry[0], i1 * dry[1], i2 * dry[2])
+    size = middle_size(before, pushes, dries, inverse, linear, quadratic, h)
     for k in range(3):
-        inverse, carried = moments(rotor, state.time[0], k)
-        if inverse > 0.0:
-            dragged = along(q, W, k)
-            before = (L[k] - carried) * inverse - dragged
-            linear = inverse * (resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size)
-            push_k, dry = inverse * load.torque_body[0, k], inverse * resistance.rotation_dry[k]
-            after, turned = pushed(before, push_k, dry, linear, h)
-            L[k] = (after + dragged) / inverse + carried
-            state.work[0] += (0.5 * (after - before) * (after + before) - push_k * turned) / inverse
+        if inverse[k] > 0.0:
+            rate = inverse[k] * (linear[k] + quadratic[k] * size)
+            after, turned = pushed(before[k], pushes[k], dries[k], rate, h)
+            L[k] = (after + dragged[k]) / inverse[k] + carried[k]
+            state.work[0] += (0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned) / inverse[k]
+
+
+@kernel
+def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
+    """|v| at the middle of a kick whose resistance is that of this very |v|, v its start, per unit inertia.
+
+    Between 0 and the most that the push can make of v, |v| found less |v| assumed changes sign: a root by regula falsi
+    (Illinois). A first guess alone would brake a fast body to nothing at the middle, and then not at all.
+    """
+    if quadratic[0] == 0.0 and quadratic[1] == 0.0 and quadratic[2] == 0.0:
+        return 0.0
+    low, high = 0.0, 0.0
+    for k in range(3):
+        high += (abs(before[k]) + 0.5 * h * abs(pushes[k])) ** 2
+    high = sqrt(high)
+    above = size_found(before, pushes, dries, inverse, linear, quadratic, h, low)
+    below = size_found(before, pushes, dries, inverse, linear, quadratic, h, high) - high
+    if not above > 0.0 or not below < 0.0:
+        return low if not above > 0.0 else high
+    side = 0
+    for _ in range(MOST_TRIALS):
+        size = (low * below - high * above) / (below - above)
+        found = size_found(before, pushes, dries, inverse, linear, quadratic, h, size) - size
+        if abs(found) <= SAME_SIZE * size or high - low <= SAME_SIZE * high:
+            return size
+        if found > 0.0:
+            low, above = size, found
+            below *= 0.5 if side == 1 else 1.0
+            side = 1
+        else:
+            high, below = size, found
+            above *= 0.5 if side == -1 else 1.0
+            side = -1
+    return size
+
+
+@kernel
+def size_found(before, pushes, dries, inverse, linear, quadratic, h, size):
+    """|v| after half of h with the resistance of a |v|."""
+    squares = 0.0
+    for k in range(3):
+        if inverse[k] > 0.0:
+            rate = inverse[k] * (linear[k] + quadratic[k] * size)
+            middle, _ = pushed(before[k], pushes[k], dries[k], rate, 0.5 * abs(h))
+            squares += middle * middle
+    return sqrt(squares)
 
 
 def push_flight(resistance, flight, rotor, frame, state, load, h):
@@ -113,34 +155,31 @@ def _push_flight(resistance, flight, rotor, frame, state, load, h):
         V = state.velocity[0]
         F = load.force[0]
         wind = (W[1] * x[2] - W[2] * x[1], W[2] * x[0] - W[0] * x[2], W[0] * x[1] - W[1] * x[0])
-        size = 0.0
-        for trial in range(3):
-            squares = 0.0
-            for k in range(3):
-                mass = inertial_mass(flight, k)
-                if turns:
-                    q = state.rotation[0]
-                    before = flight.mass * along(q, V, k) / mass - along(q, wind, k)
-                    pull = along(q, F, k) / mass
-                else:
-                    before = V[k] - wind[k]
-                    pull = F[k] / mass
-                linear = (resistance.linear[k] + resistance.quadratic[k] * size) / mass
-                if trial == 0:
-                    squares += before * before
-                elif trial == 1:
-                    middle, _ = pushed(before, pull, 0.0, linear, 0.5 * h)
-                    squares += middle * middle
-                else:
-                    after, flown = pushed(before, pull, 0.0, linear, h)
-                    state.work[0] += mass * (0.5 * (after - before) * (after + before) - pull * flown)
-                    gain = (after - before) * mass / flight.mass
-                    if turns:
-                        for i in range(3):  # along axis k only: what the other axes see stays as it was
-                            V[i] += state.rotation[0, i, k] * gain
-                    else:
-                        V[k] += gain
-            size = sqrt(squares)
+        mass = (inertial_mass(flight, 0), inertial_mass(flight, 1), inertial_mass(flight, 2))
+        inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
+        if turns:
+            q = state.rotation[0]
+            share = (flight.mass * inverse[0], flight.mass * inverse[1], flight.mass * inverse[2])
+            before = (
+                share[0] * along(q, V, 0) - along(q, wind, 0),
+                share[1] * along(q, V, 1) - along(q, wind, 1),
+                share[2] * along(q, V, 2) - along(q, wind, 2),
+            )
+            pulls = (along(q, F, 0) * inverse[0], along(q, F, 1) * inverse[1], along(q, F, 2) * inverse[2])
+        else:
+            before = (V[0] - wind[0], V[1] - wind[1], V[2] - wind[2])
+            pulls = (F[0] * inverse[0], F[1] * inverse[1], F[2] * inverse[2])
+        linear, quadratic = resistance.linear, resistance.quadratic
+        size = middle_size(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
+        for k in range(3):
+            after, flown = pushed(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
+            state.work[0] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
+            gain = (after - before[k]) * mass[k] / flight.mass
+            if turns:
+                for i in range(3):  # along axis k only: what the other axes see stays as it was
+                    V[i] += state.rotation[0, i, k] * gain
+            else:
+                V[k] += gain
 
     return push_flight
 

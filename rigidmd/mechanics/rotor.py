@@ -3,7 +3,7 @@
 A rotor is a term: `turn(rotor, ...)` is chosen by its type when compiled, so a scene of points compiles no rotation.
 """
 
-from math import cos, inf, sin, sqrt
+from math import cos, inf, nan, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +53,9 @@ class ExactRotor(NamedTuple):
 
 NONE, ROUND = -1, 3  # of SplitRotor.symmetry
 MOST_TERMS = 30
+#: rad in one drift. A body that blows up would otherwise be turned part by part for hours; it becomes no number, which
+#: stops the run.
+LONGEST_TURN = 1e4
 LONGEST_PART = 0.5  # rad; 0.3 rad takes 14 terms, 1 rad 26
 
 
@@ -144,6 +147,9 @@ def turn_by_series(rotation, angular_momentum_body, m, inverse, h):
     L = angular_momentum_body[m]
     fastest = abs(L[0] * inverse[0]) + abs(L[1] * inverse[1]) + abs(L[2] * inverse[2])
     if not 0.0 < fastest * abs(h) < inf:
+        return
+    if fastest * abs(h) > LONGEST_TURN:
+        L[:] = nan
         return
     parts = int(fastest * abs(h) / LONGEST_PART) + 1
     part = h / parts

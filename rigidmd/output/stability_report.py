@@ -1,0 +1,249 @@
+"""What `rigidmd stability` found: a table, what failed in words, stability.csv, stability.md and a page by itself."""
+
+import base64
+import csv
+import html
+import io
+from collections import Counter
+from math import inf, isfinite, isnan
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
+from rigidmd.output.folder import whole_file
+from rigidmd.output.report import COOL, FAINT, INK, WARM
+
+FILES = ("stability.csv", "stability.html", "stability.md")
+HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
+COLORS = (COOL, WARM, "#4f8a5b", "#7a5ca3", "#b8862d", INK, FAINT, "#8fb4cf", "#e2a08f", "#9bbf9f", "#c8a2c8")
+
+
+def rows(finding: Finding) -> list[list[str]]:
+    """Lines of the table: one for each integrator of a case."""
+    return [_row(finding, family) for family in finding.families]
+
+
+def _row(finding: Finding, family: str) -> list[str]:
+    trials = [t for t in finding.trials if t.family == family]
+    limits = [limit for limit in finding.limits if limit.family == family]
+    verdicts = Counter(t.verdict for t in trials)
+    # the worst of those that came to an end, by what was allowed
+    ended = [t for t in trials if isfinite(t.outcome.error)]
+    worst = max(ended, key=_share, default=None)
+    # the least of its limits, where there are several settings
+    least = min(limits, key=lambda limit: limit.longest, default=None)
+    seconds = sum(t.outcome.seconds for t in trials) + sum(limit.seconds for limit in limits)
+    return [
+        finding.name,
+        family or "-",
+        str(len(trials)),
+        ", ".join(f"{verdicts[v]} {v}" for v in VERDICTS if verdicts[v]),
+        _short(worst.outcome.error) if worst else "-",
+        _short(worst.allowed) if worst else "-",
+        _limit(least, finding.step_unit) if least else "-",
+        (least.beyond or "-") if least else "-",
+        f"{seconds:.1f}",
+    ]
+
+
+def _share(trial: Trial) -> float:
+    return trial.outcome.error / trial.allowed if trial.allowed > 0 else trial.outcome.error and inf
+
+
+def _limit(limit: Limit, unit: str) -> str:
+    if limit.longest == inf:
+        return f"> {_short(max(step for step, _ in limit.curve))} {unit}"
+    return f"{_short(limit.longest)} {unit}"
+
+
+def _short(x: float) -> str:
+    return f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
+
+
+def table_text(findings: list[Finding]) -> str:
+    """The table as a person reads it."""
+    lines = [list(HEADERS), *(line for finding in findings for line in rows(finding))]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(HEADERS))]
+    return "\n".join(
+        "  ".join(
+            x.ljust(w) if k in (0, 1, 3, 7) else x.rjust(w) for k, (x, w) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def words(findings: list[Finding]) -> list[str]:
+    """Sentences: what failed, what ended otherwise than expected, and the outcome of all."""
+    silent = [line for finding in findings for line in finding.silent]
+    others = [
+        f"{f.name}, {t.setting} {t.family}: {t.verdict}, expected {' or '.join(t.expected)}"
+        + (f" ({t.outcome.message})" if t.outcome.message else "")
+        for f in findings
+        for t in f.unexpected
+        if t.verdict not in ("SILENT", "crash")
+    ]
+    counts = Counter(t.verdict for finding in findings for t in finding.trials)
+    total = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
+    limits = sum(len(finding.limits) for finding in findings)
+    return [
+        *silent,
+        *others,
+        f"{len(findings)} cases, {sum(counts.values())} runs: {total}; {limits} longest steps bisected",
+    ]
+
+
+def failed(findings: list[Finding]) -> bool:
+    """Whether anything was silently wrong, or crashed."""
+    return any(finding.silent for finding in findings)
+
+
+def write_stability(folder: Path, findings: list[Finding], command: str, machine: str) -> list[Path]:
+    """All files; the paths written."""
+    with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(
+            ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
+             "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]
+        )  # fmt: skip
+        writer.writerows(line for finding in findings for line in _csv_lines(finding))
+    with whole_file(folder / FILES[1]) as temporary:
+        temporary.write_text(page(findings, command, machine), encoding="utf-8")
+    with whole_file(folder / FILES[2]) as temporary:
+        temporary.write_text(markdown(findings, command, machine), encoding="utf-8")
+    return [folder / name for name in FILES]
+
+
+def _csv_lines(finding: Finding) -> list[list]:
+    lines = [
+        [finding.name, finding.group, "run", t.setting, t.family, t.step, finding.step_unit, t.outcome.error,
+         t.allowed, t.outcome.told, t.verdict, " or ".join(t.expected), "", t.outcome.seconds,
+         t.outcome.message or t.outcome.crash]
+        for t in finding.trials
+    ]  # fmt: skip
+    lines += [
+        [finding.name, finding.group, "longest step", limit.setting, limit.family, limit.longest, finding.step_unit, "",
+         "", "", "", "", limit.beyond, limit.seconds, limit.message]
+        for limit in finding.limits
+    ]  # fmt: skip
+    return [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
+
+
+def markdown(findings: list[Finding], command: str, machine: str) -> str:
+    """The table and the sentences as Markdown."""
+    lines = ["# Stability", "", f"`{command}` on {machine}; {sum(f.seconds for f in findings):.0f} s.", ""]
+    lines += [f"- *{verdict}*: {meaning}" for verdict, meaning in VERDICTS.items()]
+    lines += [
+        f"- *longest step*: at which conserved quantities stay within {BOUND:g} of the kinetic energy, bisected",
+        "",
+    ]
+    lines += ["| " + " | ".join(HEADERS) + " |", "|" + "---|" * len(HEADERS)]
+    lines += ["| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for f in findings for line in rows(f)]
+    lines += ["", "## Cases", ""]
+    for f in findings:
+        lines.append(f"- **{f.name}** ({f.group}): {f.sentence}.")
+        lines += [f"  - {note}" for note in f.notes]
+    return "\n".join([*lines, "", *(f"- {line}" for line in words(findings)), ""])
+
+
+def picture(finding: Finding) -> bytes:
+    """A small figure of a case, PNG: errors over what was varied, and what was conserved over the step."""
+    from matplotlib.figure import Figure
+
+    varied = len({t.x for t in finding.trials if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
+    panels = [kind for kind, has in (("trials", varied), ("limits", finding.limits)) if has]
+    if not panels:
+        return b""
+    figure = Figure(figsize=(4.6 * len(panels), 3.0), layout="constrained")
+    for axis, kind in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
+        for k, family in enumerate(finding.families):
+            color = COLORS[k % len(COLORS)]
+            (_draw_trials if kind == "trials" else _draw_limits)(axis, finding, family, color)
+        axis.set_xscale("log" if _positive(axis) else "linear")
+        axis.set_yscale("log")
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=7, colors=INK)
+        axis.xaxis.label.set_size(8), axis.yaxis.label.set_size(8)
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(frameon=False, fontsize=6.5, loc="best")
+    stream = io.BytesIO()
+    figure.savefig(stream, dpi=110)
+    return stream.getvalue()
+
+
+def _positive(axis) -> bool:
+    data = np.concatenate([line.get_xdata() for line in axis.get_lines()])
+    return data.min(initial=inf) > 0 and data.max(initial=0) > 20 * data.min(initial=inf)
+
+
+#: Errors of nothing at all are drawn here.
+FLOOR = 1e-17
+
+
+def _draw_trials(axis, finding: Finding, family: str, color: str) -> None:
+    own = sorted((t for t in finding.trials if t.family == family and isfinite(t.x)), key=lambda t: t.x)
+    right = [t for t in own if t.verdict == RIGHT]
+    wrong = [t for t in own if t.verdict != RIGHT and isfinite(t.outcome.error)]
+    axis.plot(
+        [t.x for t in right],
+        [max(t.outcome.error, FLOOR) for t in right],
+        "o",
+        ms=3 + 1.5 * finding.families.index(family),
+        mfc="none",
+        color=color,
+        label=family or None,
+    )
+    axis.plot([t.x for t in wrong], [max(t.outcome.error, FLOOR) for t in wrong], "x", ms=6, color=color)
+    bound = [t for t in own if t.allowed > 0 and isfinite(t.allowed)]
+    axis.plot([t.x for t in bound], [t.allowed for t in bound], "_", ms=6, color=color, alpha=0.6)
+    axis.set_xlabel(finding.x_title)
+    axis.set_ylabel(finding.error_title + "\n(dashes: allowed)")
+
+
+def _draw_limits(axis, finding: Finding, family: str, color: str) -> None:
+    for n, limit in enumerate(one for one in finding.limits if one.family == family):
+        points = [(step, min(max(told, FLOOR), 1e6)) for step, told in limit.curve if not isnan(told)]
+        if points:
+            axis.plot(
+                *zip(*points, strict=True), "-", marker=".", lw=0.9, ms=3, color=color, label=None if n else family
+            )
+        if isfinite(limit.longest) and limit.longest > 0:
+            axis.axvline(limit.longest, color=color, lw=0.6, ls=":")
+    axis.set_xlabel(f"step ({finding.step_unit}); dotted: longest bounded")
+    axis.set_ylabel("largest error of what is conserved")
+
+
+def page(findings: list[Finding], command: str, machine: str) -> str:
+    """A page that needs no other file."""
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in HEADERS)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in line) + "</tr>\n" for f in findings for line in rows(f)
+    )
+    said = "".join(f"<li>{html.escape(line)}</li>\n" for line in words(findings))
+    meanings = "".join(f"<li><b>{v}</b>: {html.escape(meaning)}</li>\n" for v, meaning in VERDICTS.items())
+    cases = "".join(_section(finding) for finding in findings)
+    return f"""<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>rigidmd: stability</title>
+<style>body{{font:15px/1.5 system-ui,sans-serif;color:{INK};max-width:1100px;margin:2em auto;padding:0 1em}}
+img{{max-width:100%}}table{{border-collapse:collapse;font-size:13px}}td,th{{padding:2px 8px;text-align:left}}
+tr:nth-child(even){{background:#f4f5f7}}code{{color:{FAINT}}}h2{{font-size:17px;margin:1.6em 0 .2em}}</style>
+<h1>Stability</h1>
+<ul>
+{said}</ul>
+<ul>
+{meanings}</ul>
+<table><tr>{head}</tr>
+{body}</table>
+{cases}<p><code>{html.escape(command)}</code> on {html.escape(machine)}</p></html>
+"""
+
+
+def _section(finding: Finding) -> str:
+    drawn = picture(finding)
+    image = ""
+    if drawn:
+        image = f'<img alt="{finding.name}" src="data:image/png;base64,{base64.b64encode(drawn).decode()}">\n'
+    notes = "".join(f"<li>{html.escape(note)}</li>\n" for note in finding.notes)
+    messages = dict.fromkeys(t.outcome.message for t in finding.trials if t.outcome.message)
+    notes += "".join(f"<li><code>{html.escape(message)}</code></li>\n" for message in list(messages)[:3])
+    return f"<h2>{finding.name}</h2><p>{html.escape(finding.sentence)}.</p>\n{image}<ul>\n{notes}</ul>\n"
