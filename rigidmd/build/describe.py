@@ -84,7 +84,7 @@ def _molecules(system: System) -> str:
     for name, term in system.terms.items():
         reach = f"cut-off {system.cutoff:g} Å, {scene.forces.truncation}" if system.cutoff < inf else "no cut-off"
         skin = f"neighbour list with a skin of {scene.forces.skin_A:g} Å"
-        lines.append(f"  {name.replace('_', ' ')}: {len(term.sites.molecule)} sites, {reach}, {skin}")
+        lines.append(f"  {name.replace('_', ' ')}: {len(term.pairs.group)} sites, {reach}, {skin}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if any(stage.ensemble == "nvt" for stage in scene.stages):
