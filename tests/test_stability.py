@@ -146,6 +146,13 @@ def test_the_help_has_an_example(capsys):
     assert "rigidmd stability --quick --case" in capsys.readouterr().out
 
 
+def test_what_was_refused_far_away_does_not_stretch_a_figure():
+    finding = Finding("made_up", 1, "A case", "x", "error")
+    for x in (1.0, 10.0, 1e300):
+        finding.add("once", Outcome(1e-9, 0.0) if x < 1e9 else Outcome(message="too far"), x, "a family", x)
+    assert picture(finding).startswith(b"\x89PNG")
+
+
 def test_a_case_without_numbers_has_no_figure():
     finding = Finding("made_up", 1, "A case")
     finding.add("once", Outcome(message="no"), 0.0, expected=(REFUSED,))

@@ -194,7 +194,7 @@ def _draw_trials(axis, finding: Finding, family: str, color: str) -> None:
         label=family or None,
     )
     axis.plot([t.x for t in wrong], [max(t.outcome.error, FLOOR) for t in wrong], "x", ms=6, color=color)
-    bound = [t for t in own if t.allowed > 0 and isfinite(t.allowed)]
+    bound = [t for t in own if t.allowed > 0 and isfinite(t.allowed) and isfinite(t.outcome.error)]
     axis.plot([t.x for t in bound], [t.allowed for t in bound], "_", ms=6, color=color, alpha=0.6)
     axis.set_xlabel(finding.x_title)
     axis.set_ylabel(finding.error_title + "\n(dashes: allowed)")

@@ -123,7 +123,7 @@ def equipartition(find: Finding, quick: bool) -> None:
     )
     for words, molecules in settings.items():
         for step in (2.0, 8.0):
-            steps = 4000 if quick else 40000
+            steps = 4000 if quick else 10000
             heat = {"temperature_K": 400.0, "thermostat_time_ps": 0.1}
             data = molecules_scene(
                 molecules, {"lengths_A": 16.0}, step, steps, SPLIT, 400.0, heat, {"cutoff_A": 8.0}, looks=steps // 10
