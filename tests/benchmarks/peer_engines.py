@@ -96,7 +96,9 @@ class Rigidmd:
             if job["every"]:
                 look()
         lists = [term.pairs for term in engine.terms.values()]
-        settings = f"list {lists[0].cutoff + lists[0].skin:.4g} Å, rebuilt when a site has moved {lists[0].skin / 2:g} Å"
+        settings = (
+            f"list {lists[0].cutoff + lists[0].skin:.4g} Å, rebuilt when a site has moved {lists[0].skin / 2:g} Å"
+        )
         return series(job, looks) | {"seconds": seconds, "timed_steps": done, "settings": settings}
 
 
