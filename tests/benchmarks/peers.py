@@ -66,6 +66,7 @@ SAME_ENERGY = 1e-2  # kJ/mol per molecule: single precision leaves 0.003 of wate
 DISTURBED = 0.05  # share of its cores that other programs took, from which on a run is a disturbed one
 LONGEST_RUN = 1800  # s, after which an engine is taken to hang
 SWITCH = 1.0  # Å before the cut-off, where a switch begins
+PRECISIONS = {"mixed": "pairs float32, sums and state float64"}  # of rigidmd, other than what is usual
 COPIES = 2  # the start is grown from this many copies along each edge of a small box that has come to rest
 
 NITROGEN_14 = {  # two centres of 14 u
@@ -129,27 +130,39 @@ class Curve:
     engine: str
     color: str
     options: dict
-    lennard_jones: str = "shift"  # plain, shift or switch
-    coulomb: str = "RF"  # RF; RF switched; RF without the constant energy of a molecule in its own field; or DSF
+    lennard_jones: str = "shift"  # plain, shift, switch or smooth_switch
+    coulomb: str = "RF"  # RF, RF switched, RF smooth, DSF, or RF without the constant energy of a molecule in its field
     stretch: float = 1.0  # its time steps are longer by this, because each has several force evaluations
     timed: bool = True  # whether it is a row of the speed table
 
+    @property
+    def precision(self) -> str:
+        """What it computes in."""
+        return PRECISIONS.get(self.options.get("precision")) or ENGINES[self.engine].precision
+
     def treatment(self, work: Workload) -> str:
         """How its forces end at the cut-off, in words."""
-        ending = {"plain": "LJ cut", "shift": "LJ potential-shift", "switch": "LJ switched over the last Å"}
+        ending = {
+            "plain": "LJ cut", "shift": "LJ potential-shift", "switch": "LJ switched over the last Å",
+            "smooth_switch": "LJ smoothly switched over the last 0.4 of the cut-off",
+        }  # fmt: skip
         charges = {
             "DSF": f"no reaction field there: damped shifted Coulomb, alpha {DSF_ALPHA}/Å",
             "RF switched": "reaction field too",
+            "RF smooth": "reaction field too",
         }
         return ending[self.lennard_jones] + (f", {charges.get(self.coulomb, 'reaction field')}" if work.charged else "")
 
 
 CURVES = (
     Curve("rigidmd velocity_verlet", "rigidmd", "#123d5c", {"integrator": "velocity_verlet"}),
-    Curve("rigidmd two_stage", "rigidmd", "#2b7fb8", {"integrator": "two_stage"}, stretch=2, timed=False),
-    Curve("rigidmd srkn_4", "rigidmd", "#8fb4cf", {"integrator": "srkn_4"}, stretch=3, timed=False),
-    Curve("rigidmd srkn_4, switched", "rigidmd", "#b8862d", {"integrator": "srkn_4", "truncation": "switch"}, "switch",
-          "RF switched", stretch=3, timed=False),
+    Curve("rigidmd velocity_verlet, mixed", "rigidmd", "#2b7fb8",
+          {"integrator": "velocity_verlet", "precision": "mixed"}),
+    Curve("rigidmd two_stage, mixed", "rigidmd", "#8fb4cf", {"integrator": "two_stage", "precision": "mixed"},
+          stretch=2, timed=False),
+    Curve("rigidmd srkn_4, smooth_switch", "rigidmd", "#b8862d",
+          {"integrator": "srkn_4", "truncation": "smooth_switch"}, "smooth_switch", "RF smooth", stretch=3,
+          timed=False),
     Curve("GROMACS, buffer tolerance 0.005 (default)", "gromacs", "#e2a08f", {"buffer": 0.005}),
     Curve("GROMACS, buffer tolerance 1e-5", "gromacs", "#c8553d", {"buffer": 1e-5}),
     Curve("OpenMM", "openmm", "#9bbf9f", {}, "plain", "RF without self"),
@@ -232,9 +245,9 @@ def start_of(name: str, source: str) -> Start:
 
 def describe(work: Workload, folder: Path) -> Start:
     """Sites, velocities and what the forces add to them, for the other engines; potential energies by treatment."""
-    charges = {"switch": "RF switched", "shift": "RF"}
+    charges = {"switch": "RF switched", "smooth_switch": "RF smooth", "shift": "RF"}
     potentials = {"DSF": 0.0}
-    for ending in ("plain", "switch", "shift"):  # as the workload says comes last, and is what goes on
+    for ending in ("plain", "switch", "smooth_switch", "shift"):  # as the workload says comes last, and is what goes on
         simulation = Simulation(Scene.from_dict(work.scene(ending), folder))
         seen = observe(simulation.system, simulation.engine, simulation.state)
         energies = {name: energy / KJ_PER_MOL / work.count for name, energy in seen.components.items()}
@@ -323,11 +336,13 @@ class Bench:
             if busy(self.cpus[:cores]) - worked < DISTURBED * cores:
                 break
         work = WORKLOADS[name]
+        precision = curve.options.get("precision", "double")
+        scene = work.scene(curve.options.get("truncation", "shift"), threads=cores, precision=precision)
         job = {
             "engine": curve.engine, "options": curve.options, "cores": cores, "cpus": self.cpus[:cores],
             "timestep_fs": timestep, "steps": steps, "every": every, "sites": str(self.starts[name].sites_file),
             "workload": asdict(work) | {"charged": work.charged},
-            "scene": work.scene(curve.options.get("truncation", "shift"), threads=cores),
+            "scene": scene,
         }  # fmt: skip
         environment = os.environ | {"NUMBA_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "ACTIVE"}
         if curve.engine != "rigidmd":
@@ -367,7 +382,7 @@ class Bench:
         found, expected = result["potential"][0] / count, self.starts[name].expected(curve)
         row = {
             "workload": name, "curve": curve.name, "treatment": curve.treatment(WORKLOADS[name]),
-            "precision": ENGINES[curve.engine].precision, "potential": found, "potential_expected": expected,
+            "precision": curve.precision, "potential": found, "potential_expected": expected,
             "same": abs(found - expected) < SAME_ENERGY,
             "kinetic": result["kinetic"][0] / count, "kinetic_expected": self.starts[name].kinetic,
         }  # fmt: skip
@@ -520,7 +535,7 @@ def label(curve: Curve, rows: list[dict], name: str) -> str:
     settings = list(dict.fromkeys(row["settings"].partition(", constraint")[0] for row in rows))
     if len(settings) > 1:  # the list depends on the step
         settings = [f"{settings[0]} ... {settings[-1].removeprefix('list ')}"]
-    return "\n".join([curve.name, ENGINES[curve.engine].precision, curve.treatment(WORKLOADS[name]), *settings])
+    return "\n".join([curve.name, curve.precision, curve.treatment(WORKLOADS[name]), *settings])
 
 
 def caption(rows: list[dict], found: dict) -> str:
