@@ -131,12 +131,22 @@ def test_a_list_with_little_room_grows_and_misses_nothing():
     for term in engine.terms.values():
         blocks = len(term.pairs.entries)
         cramped = term.pairs._replace(
-            entries=np.empty((blocks, 3), np.int32), masked=np.empty((blocks, 1, 2), np.int32)
+            entries=np.empty((blocks, 3), np.int32), masked=np.empty((blocks, 1, 3), np.int32)
         )
         cramped.counters[0] = 0
         terms.append(term._replace(pairs=cramped, sums=term.sums._replace(others=term.sums.others[:, :8].copy())))
     engine._terms = tuple(terms)
     assert energies(engine, state) == expected
+
+
+@pytest.mark.parametrize("edge", [31.1, None])
+def test_lists_begin_with_about_the_room_they_need(edge):
+    _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)
+    begun = [term.pairs.entries.shape[1] for term in engine.terms.values() if isinstance(term, PairForces)]
+    engine.evaluate(state)
+    needed = [term.pairs.needed[:, 0].max() for term in engine.terms.values() if isinstance(term, PairForces)]
+    for room, most in zip(begun, needed, strict=True):
+        assert most <= room * 1.1 and room < 1.6 * most + 16
 
 
 def test_the_list_is_rebuilt_for_moves_and_for_turns():

@@ -111,6 +111,7 @@ def settle_block(clusters, position, group, block):
     """Origins, anchors and places of newly sorted clusters; their origin is the middle of their box."""
     width = width_of(clusters.local)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        _bring_mates_together(clusters, width * c, min(width * (c + 1), len(clusters.wrapped)))
         for k in range(3):
             low, high = inf, -inf
             for slot in range(width * c, width * (c + 1)):
@@ -126,6 +127,23 @@ def settle_block(clusters, position, group, block):
                 clusters.anchor[slot, k] = position[i, k] - (clusters.wrapped[i, k] - clusters.origin[4 * c + k])
                 clusters.local[at] = position[i, k] - clusters.anchor[slot, k]
                 clusters.reference[at] = clusters.local[at]
+
+
+@kernel(inline=True)
+def _bring_mates_together(clusters, first, end):
+    """Change the order of slots first ... end - 1 so that the two sites of each row are near one another."""
+    order, wrapped = clusters.order, clusters.wrapped
+    for a in range(first, end - 2, 2):
+        i = order[a]
+        nearest, nearest2 = a + 1, inf
+        for b in range(a + 1, end):
+            j = order[b]
+            d2 = 0.0
+            for k in range(3):
+                d2 += (wrapped[i, k] - wrapped[j, k]) ** 2
+            if d2 < nearest2:
+                nearest, nearest2 = b, d2
+        order[a + 1], order[nearest] = order[nearest], order[a + 1]
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)

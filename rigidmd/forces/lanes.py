@@ -172,20 +172,6 @@ def load_four(typing, array, index):
 
 
 @intrinsic
-def four(typing, x, y, z):
-    """(x, y, z, 0) as a vector of float64."""
-    lanes = Lanes(types.float64, 4)
-
-    def emit(context, builder, signature, arguments):
-        vector = ir.Constant(context.get_value_type(lanes), [0.0] * 4)
-        for k, value in enumerate(arguments):
-            vector = builder.insert_element(vector, value, ir.IntType(32)(k))
-        return vector
-
-    return lanes(types.float64, types.float64, types.float64), emit
-
-
-@intrinsic
 def store(typing, array, index, lanes):
     """Write a vector to array[index], array[index + 1], ..."""
 

@@ -1,4 +1,6 @@
-"""Neighbour lists: for each site of one law the clusters that may hold a site inside its cut-off.
+"""Neighbour lists: for each row of sites of one law the clusters that may hold a site inside their cut-off.
+
+A row is two sites that are near one another, so that what is loaded of a cluster serves both of them.
 
 A list is good until any site has moved more than half the skin since it was built, whether its body shifted or turned.
 That is checked at every force evaluation, before the list is used, so no pair is ever missed. In each row the clusters
@@ -10,7 +12,7 @@ list is cut into blocks of rows, filled by whichever thread takes them, so the l
 the same bits for any number of threads.
 """
 
-from math import ceil, inf, sqrt
+from math import ceil, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -51,19 +53,21 @@ class PairList(NamedTuple):
     clusters: Clusters
     tree: BoxTree
     shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
-    row: np.ndarray  # (slots, SHELLS + 1) shell k of slot i: entries[b, row[i, k]:row[i, k + 1]]
+    row: np.ndarray  # (rows, SHELLS + 1) shell k of slots 2 r, 2 r + 1: entries[b, row[r, k]:row[r, k + 1]]
     entries: np.ndarray  # (blocks, capacity) int32
-    special: np.ndarray  # (slots, 2) entries with a mask: masked[b, special[i, 0]:special[i, 1]]
-    masked: np.ndarray  # (blocks, capacity, 2) entry, and as bits the lanes that count
+    special: np.ndarray  # (rows, 2) entries with a mask: masked[b, special[r, 0]:special[r, 1]]
+    masked: np.ndarray  # (blocks, capacity, 3) entry, and as bits the lanes that count for either site of the row
     needed: np.ndarray  # (blocks, 3) room the last build asked for: entries, masked entries, clusters from the first on
     counters: np.ndarray  # (4,) usable (0 or 1); builds so far; shells that matter now; status of the preparation
     parts: Parts
 
 
 def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtype: type) -> PairList:
-    """A list that will be built at its first use, which finds out how much room it needs."""
+    """A list that will be built at its first use, with about the room that sites spread evenly would need."""
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.moved2), len(clusters.order)
+    rows = slots // 2
+    room = ceil(_clusters_met(space, len(clusters.origin) // 4, cutoff + skin) * rows / blocks)
     return PairList(
         cutoff=cutoff,
         skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
@@ -73,14 +77,25 @@ def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtyp
         clusters=clusters,
         tree=box_tree(len(clusters.origin) // 4),
         shift=np.zeros(4 * 27),
-        row=np.zeros((slots, SHELLS + 1), np.int32),
-        entries=np.empty((blocks, 0), np.int32),
-        special=np.zeros((slots, 2), np.int32),
-        masked=np.empty((blocks, 0, 2), np.int32),
+        row=np.zeros((rows, SHELLS + 1), np.int32),
+        entries=np.empty((blocks, room), np.int32),
+        special=np.zeros((rows, 2), np.int32),
+        masked=np.empty((blocks, 0, 3), np.int32),
         needed=np.zeros((blocks, 3), np.int64),
         counters=np.zeros(4, np.int64),
         parts=Parts(),
     )
+
+
+def _clusters_met(space: Space, count: int, radius: float) -> float:
+    """Entries of a row to be expected; 0 where nobody knows the density, so that the first build finds out."""
+    if radius == inf:
+        return count / 2 + 1
+    if space.volume == inf:
+        return 0.0
+    edge = np.cbrt(space.volume / count)
+    near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3  # Steiner's formula
+    return min(0.42 * near / edge**3, count / 2) + 1  # half of them, a sixth less: measured, cubes touch with corners
 
 
 def with_room(pairs: PairList) -> PairList:
@@ -94,7 +109,7 @@ def with_room(pairs: PairList) -> PairList:
     if entries > pairs.entries.shape[1]:
         pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.int32))
     if masked > pairs.masked.shape[1]:
-        pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
+        pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 3), np.int32))
     return pairs
 
 
@@ -193,10 +208,10 @@ class Scratch(NamedTuple):
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     entry: np.ndarray  # (room,) candidates
-    inside: np.ndarray  # (room, SHELLS + 1) for each candidate the sites, as bits, with it in each shell or with a mask
-    special: np.ndarray  # (room,) candidates that need a mask for some site
-    row: np.ndarray  # (sites of a cluster, room)
-    ends: np.ndarray  # (sites of a cluster,) of their rows so far
+    inside: np.ndarray  # (room, SHELLS + 1) for each candidate the rows, as bits, with it in each shell or with a mask
+    special: np.ndarray  # (room,) candidates that need a mask for some row
+    row: np.ndarray  # (rows of a cluster, room)
+    ends: np.ndarray  # (rows of a cluster,) so far
 
 
 @kernel
@@ -217,8 +232,8 @@ def _scratch(pairs, room):
         np.empty(room, np.int64),
         np.empty((room, SHELLS + 1), np.int64),
         np.empty(room, np.int64),
-        np.empty((width, room), np.int32),
-        np.empty(width, np.int64),
+        np.empty((width // 2, room), np.int32),
+        np.empty(width // 2, np.int64),
     )
 
 
@@ -277,12 +292,12 @@ def _find_candidates(pairs, c, scratch):
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
 def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
-    """Rows of the sites of a cluster from its candidates.
+    """Rows of a cluster from its candidates.
 
     Entries and masked entries of the block so far, and how far ahead on the ring the farthest cluster is.
     """
     clusters = pairs.clusters
-    width = width_of(clusters.local)
+    rows = width_of(clusters.local) // 2
     count = len(clusters.origin) // 4
     entries, masked = pairs.entries[block], pairs.masked[block]
     farthest = specials = 0
@@ -295,42 +310,44 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
     scratch.ends[:] = 0
     for k in range(SHELLS):
         for n in range(candidates):
-            sites = scratch.inside[n, k]
-            while sites != 0:
-                own = lowest_bit(sites)
-                sites &= sites - 1
+            inside = scratch.inside[n, k]
+            while inside != 0:
+                own = lowest_bit(inside) >> 1
+                inside &= inside - 1
                 scratch.row[own, scratch.ends[own]] = scratch.entry[n]
                 scratch.ends[own] += 1
-        for own in range(width):
-            pairs.row[width * c + own, k + 1] = scratch.ends[own]
-    for own in range(width):
-        i = width * c + own
+        for own in range(rows):
+            pairs.row[rows * c + own, k + 1] = scratch.ends[own]
+    for own in range(rows):
+        r = rows * c + own
         enough = filled + scratch.ends[own] <= len(entries)
-        pairs.row[i, 0] = 0
+        pairs.row[r, 0] = 0
         for k in range(SHELLS + 1):
-            pairs.row[i, k] = pairs.row[i, k] + filled if enough else 0
+            pairs.row[r, k] = pairs.row[r, k] + filled if enough else 0
         if enough:
             for n in range(scratch.ends[own]):
                 entries[filled + n] = scratch.row[own, n]
         filled += scratch.ends[own]
-        pairs.special[i, 0] = min(filled_masked, len(masked))
-        for n in range(specials if i < len(pairs.group) else 0):
-            entry = scratch.entry[scratch.special[n]]
-            mask = 0
-            if scratch.inside[scratch.special[n], SHELLS] >> own & 1:
-                mask = _mask_of_lanes(pairs, i, entry, scratch.bounds2[SHELLS - 1])
-            if mask != 0:
-                if filled_masked < len(masked):
-                    masked[filled_masked, 0] = entry
-                    masked[filled_masked, 1] = mask
-                filled_masked += 1
-        pairs.special[i, 1] = min(filled_masked, len(masked))
+        pairs.special[r, 0] = min(filled_masked, len(masked))
+        for n in range(specials):
+            special = scratch.special[n]
+            if scratch.inside[special, SHELLS] >> 2 * own & 1:
+                entry = scratch.entry[special]
+                first = _mask_of_lanes(pairs, 2 * r, entry, scratch.bounds2[SHELLS - 1])
+                second = _mask_of_lanes(pairs, 2 * r + 1, entry, scratch.bounds2[SHELLS - 1])
+                if first | second:
+                    if filled_masked < len(masked):
+                        masked[filled_masked, 0] = entry
+                        masked[filled_masked, 1] = first
+                        masked[filled_masked, 2] = second
+                    filled_masked += 1
+        pairs.special[r, 1] = min(filled_masked, len(masked))
     return filled, filled_masked, farthest
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _sort_into_shells(pairs, c, scratch, n):
-    """Which sites of a cluster have candidate n in which shell; whether some of them need a mask with it.
+    """Which rows of a cluster have candidate n in which shell; whether some of them need a mask with it.
 
     The sites are the lanes here, and the candidate's sites come one after the other: no sums across lanes, no guesses.
     """
@@ -354,23 +371,29 @@ def _sort_into_shells(pairs, c, scratch, n):
         dz = z - local[at + 2 * width]
         nearest2 = smaller(nearest2, dx * dx + dy * dy + dz * dz)
         mates = mates | (group == clusters.group[width * other + lane])
-    special = bits(mates)
-    if other == c or other == count - 1:
-        special = everyone
+    special = _rows_of(bits(mates))
+    if other == c or c == count - 1 or other == count - 1:
+        special = _rows_of(everyone)
     taken = special
-    if c == count - 1:
-        taken |= everyone ^ (everyone >> filler(pairs))
     for k in range(SHELLS):
-        inside = bits(nearest2 <= scratch.bounds2[k]) & ~taken
+        inside = _rows_of(bits(nearest2 <= scratch.bounds2[k])) & ~taken
         scratch.inside[n, k] = inside
         taken |= inside
     scratch.inside[n, SHELLS] = special
     return special != 0
 
 
+@kernel(inline=True)
+def _rows_of(sites):
+    """The rows with one or both of the sites that are given as bits, each as the bit of its first site."""
+    return (sites | sites >> 1) & 0x5555555555555555
+
+
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _mask_of_lanes(pairs, i, entry, radius2):
     """The sites of a cluster that site i may meet, as bits; 0 if none of them is inside the radius."""
+    if i >= len(pairs.group):
+        return 0
     clusters = pairs.clusters
     local = clusters.local
     width = width_of(local)

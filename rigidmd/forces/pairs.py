@@ -13,7 +13,6 @@ from rigidmd.forces import neighbors, terms
 from rigidmd.forces.lanes import (
     double,
     fill,
-    four,
     lane,
     load,
     load_beside,
@@ -198,36 +197,69 @@ def block_forces(law, pairs, own, others, tallies, block):
     masked = pairs.masked[block]
     zero = fill(0.0, clusters.local)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        for i in range(width * c, width * (c + 1)):
+        for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
-            here = load_four(clusters.origin, 4 * c) + four(
-                clusters.local[at], clusters.local[at + width], clusters.local[at + 2 * width]
+            here = (
+                (clusters.local[at], clusters.local[at + width], clusters.local[at + 2 * width]),
+                (clusters.local[at + 1], clusters.local[at + width + 1], clusters.local[at + 2 * width + 1]),
             )
-            sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
-            for n in range(pairs.special[i, 0], pairs.special[i, 1]):
-                sums = _meet(law, pairs, block, i, here, masked[n, 0], masked[n, 1], others, sums, tallies)
-            for n in range(pairs.row[i, 0], pairs.row[i, pairs.counters[2]]):
-                sums = _meet(law, pairs, block, i, here, entries[n], None, others, sums, tallies)
+            still = (zero, zero, zero)
+            sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
+            for n in range(pairs.special[i // 2, 0], pairs.special[i // 2, 1]):
+                masks = (masked[n, 1], masked[n, 2])
+                sums = _meet(law, pairs, block, c, i, here, masked[n, 0], masks, others, sums, tallies)
+            for n in range(pairs.row[i // 2, 0], pairs.row[i // 2, pairs.counters[2]]):
+                sums = _meet(law, pairs, block, c, i, here, entries[n], (None, None), others, sums, tallies)
+            first, second, totals = sums
             for k in range(3):
-                own[at + k * width] = total(sums[k])
+                own[at + k * width] = total(first[k])
+                own[at + k * width + 1] = total(second[k])
             if tallies is not None:
-                for k, of in enumerate((3, 4, 5, 6, 5, 7, 8, 6, 8, 9)):
-                    tallies[block, k] += total(sums[of])
+                for k, of in enumerate((0, 1, 2, 3, 2, 4, 5, 3, 5, 6)):
+                    tallies[block, k] += total(totals[of])
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
-    """Site i at `here` meets a cluster: forces into `others` and, with energy and virial, onto the vectors `sums`."""
+def _meet(law, pairs, block, c, i, here, entry, masks, others, sums, tallies):
+    """The sites in slots i, i + 1 of cluster c meet another: forces into `others` and, with energies, onto `sums`."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
-    c = entry >> 5
-    j = width * c
+    other = entry >> 5
+    j = width * other
     offset = narrowed(
-        here - load_four(pairs.shift, 4 * (entry & 31)) - load_four(clusters.origin, 4 * c), clusters.local
+        load_four(clusters.origin, 4 * c)
+        - load_four(pairs.shift, 4 * (entry & 31))
+        - load_four(clusters.origin, 4 * other),
+        clusters.local,
     )
-    dx = lane(offset, 0) - load(clusters.local, 3 * j)
-    dy = lane(offset, 1) - load(clusters.local, 3 * j + width)
-    dz = lane(offset, 2) - load(clusters.local, 3 * j + 2 * width)
+    there = (
+        load(clusters.local, 3 * j) - lane(offset, 0),
+        load(clusters.local, 3 * j + width) - lane(offset, 1),
+        load(clusters.local, 3 * j + 2 * width) - lane(offset, 2),
+    )
+    first, second, totals = sums
+    gx, gy, gz, totals = _act(law, i, j, here[0], there, masks[0], totals, tallies)
+    hx, hy, hz, totals = _act(law, i + 1, j, here[1], there, masks[1], totals, tallies)
+    ahead = other - clusters.bounds[block]
+    if ahead < 0:
+        ahead += len(clusters.origin) // 4
+    at = 3 * width * ahead
+    store(others, at, load(others, at) - (gx + hx))
+    store(others, at + width, load(others, at + width) - (gy + hy))
+    store(others, at + 2 * width, load(others, at + 2 * width) - (gz + hz))
+    return (
+        (first[0] + gx, first[1] + gy, first[2] + gz),
+        (second[0] + hx, second[1] + hy, second[2] + hz),
+        totals,
+    )
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _act(law, i, j, here, there, mask, totals, tallies):
+    """Force on a site from each of a vector of others; energy and virial, where wanted, onto the vectors `totals`."""
+    dx = here[0] - there[0]
+    dy = here[1] - there[1]
+    dz = here[2] - there[2]
     r2 = dx * dx + dy * dy + dz * dz
     counts = r2 < law.cutoff * law.cutoff
     if mask is not None:
@@ -237,14 +269,7 @@ def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
     gx = w * dx
     gy = w * dy
     gz = w * dz
-    ahead = c - clusters.bounds[block]
-    if ahead < 0:
-        ahead += len(clusters.origin) // 4
-    at = 3 * width * ahead
-    store(others, at, load(others, at) - gx)
-    store(others, at + width, load(others, at + width) - gy)
-    store(others, at + 2 * width, load(others, at + 2 * width) - gz)
-    fx, fy, fz, energy, xx, xy, xz, yy, yz, zz = sums
+    energy, xx, xy, xz, yy, yz, zz = totals
     if tallies is not None:
         energy = energy + select(counts, u, 0.0)
         xx = xx + gx * dx
@@ -253,7 +278,7 @@ def _meet(law, pairs, block, i, here, entry, mask, others, sums, tallies):
         yy = yy + gy * dy
         yz = yz + gy * dz
         zz = zz + gz * dz
-    return fx + gx, fy + gy, fz + gz, energy, xx, xy, xz, yy, yz, zz
+    return gx, gy, gz, (energy, xx, xy, xz, yy, yz, zz)
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)

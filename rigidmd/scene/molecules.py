@@ -132,7 +132,7 @@ class Forces(Section):
     """How charges act; none ignores them"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
-    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.0
+    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.3
     """Extra radius of the neighbour list; speed only, never the result"""
 
     @model_validator(mode="after")

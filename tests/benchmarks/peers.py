@@ -221,11 +221,11 @@ def take(work: Workload, folder: Path) -> None:
     write_start(folder, work, position, velocity, rotation, momentum_body)
 
 
-def write_start(folder: Path, work: Workload, position, velocity, rotation, momentum_body) -> None:
-    """A state as `[structure] file` reads it (output/state.py)."""
+def write_start(folder: Path, work: Workload, position, velocity, rotation, momentum_body, edge=None) -> None:
+    """A state as `[structure] file` reads it (output/state.py); the box is that of the workload unless given."""
     names = [work.molecules.get("model") or work.molecules["name"]]
     np.savez(folder / "start.npz", species_names=np.array(names), species=np.zeros(len(position), np.int64),
-             edges=np.full(3, work.edge), position=position, velocity=velocity, rotation=rotation,
+             edges=np.full(3, edge or work.edge), position=position, velocity=velocity, rotation=rotation,
              angular_momentum_body=momentum_body)  # fmt: skip
 
 

@@ -1,0 +1,123 @@
+"""What a step of liquid SPC/E costs from 512 to a million molecules, on one core and on several: time and memory.
+
+    python tests/benchmarks/scaling.py --copies 1,2,3,5,8,13 --cores 1,2 --precision mixed
+
+The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box of 512 waters that has
+come to rest is copied along each edge, so every size is the same liquid. Each size runs in a process of its own, so that
+its peak of memory is its own; lists are built before the clock starts, and rebuilt while it runs.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numba
+import numpy as np
+from peers import WORKLOADS, numbers, write_start
+
+from rigidmd import Scene, Simulation
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.thermostats import NoThermostat
+
+WORK = WORKLOADS["W1"]
+UNIT = 512  # molecules in the box that is copied
+EDGE = WORK.edge * (UNIT / WORK.count) ** (1 / 3)  # Å
+STEP = 2e-3  # ps
+FEWEST_STEPS = 20
+SECONDS = 3.0
+
+
+def scene(copies: int, precision: str, **changes) -> dict:
+    """The scene of so many copies along each edge."""
+    molecules = [{**WORK.molecules, "count": UNIT * copies**3}]
+    return WORK.scene(box={"lengths_A": EDGE * copies}, molecules=molecules, precision=precision, **changes)
+
+
+def relax(folder: Path) -> None:
+    """A box of liquid, folder/start.npz."""
+    stage = {"ensemble": "nvt", "temperature_K": WORK.temperature, "timestep_fs": 2.0, "duration_ps": 10.0,
+             "thermostat_time_ps": 0.1}  # fmt: skip
+    state = Simulation(Scene.from_dict(scene(1, "mixed", structure=None, stages=[stage]))).run().state
+    keep(folder, 1, state)
+
+
+def keep(folder: Path, copies: int, state) -> None:
+    """Copies of a state of one box as folder/start.npz."""
+    shifts = EDGE * np.array(list(np.ndindex((copies,) * 3)))
+    position = (shifts[:, None] + state.position).reshape(-1, 3)
+    rest = (state.velocity, state.rotation, state.angular_momentum_body)
+    rest = (np.tile(a, (len(shifts), *(1,) * (a.ndim - 1))) for a in rest)
+    write_start(folder, WORK, position, *rest, EDGE * copies)
+
+
+def measure(job: dict) -> dict:
+    """Seconds a step for each number of cores, and the peak of memory, of one size; in a process of its own."""
+    one = Simulation(Scene.from_dict(scene(1, job["precision"]), Path(job["folder"])))
+    with tempfile.TemporaryDirectory() as folder:
+        keep(Path(folder), job["copies"], one.state)
+        simulation = Simulation(Scene.from_dict(scene(job["copies"], job["precision"]), Path(folder)))
+    engine, state = simulation.engine, simulation.state
+    scheme, still = SCHEMES["velocity_verlet"], NoThermostat()
+    seconds = {}
+    for cores in job["cores"]:
+        numba.set_num_threads(cores)
+        engine.advance(state, scheme, STEP, 3, still)
+        steps, spent = 0, 0.0
+        while steps < FEWEST_STEPS or spent < SECONDS:
+            began = time.perf_counter()
+            engine.advance(state, scheme, STEP, FEWEST_STEPS, still)
+            spent += time.perf_counter() - began
+            steps += FEWEST_STEPS
+        seconds[cores] = spent / steps
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    arrays = sum(_bytes(part) for part in (simulation.system.state, engine.model, tuple(engine.terms.values())))
+    return {"molecules": UNIT * job["copies"] ** 3, "seconds": seconds, "peak": peak, "arrays": arrays}
+
+
+def _bytes(value) -> int:
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    return sum(_bytes(part) for part in value) if isinstance(value, tuple) else 0
+
+
+def main() -> None:
+    """Measure every size and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--copies", type=numbers(int), default=[1, 2, 3, 5, 8], help="along each edge; 1,2,3,5,8")
+    parser.add_argument("--cores", type=numbers(int), default=[1, 2], help="1,2")
+    parser.add_argument("--precision", choices=("double", "mixed"), default="mixed")
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.job:
+        print(json.dumps(measure(json.loads(asked.job))))
+        return
+    environment = os.environ | {"NUMBA_NUM_THREADS": str(max(asked.cores)), "OMP_WAIT_POLICY": "ACTIVE"}
+    with tempfile.TemporaryDirectory() as folder:
+        relax(Path(folder))
+        per_step = "".join(f" µs a molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores)
+        print(f"| molecules |{per_step} steps/s | arrays, kB a molecule | peak of the process, GB |")
+        print("|---" * (4 + len(asked.cores)) + "|", flush=True)
+        for copies in asked.copies:
+            job = {"copies": copies, "cores": asked.cores, "precision": asked.precision, "folder": folder}
+            command = [sys.executable, __file__, "--job", json.dumps(job)]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True)
+            if done.returncode:
+                sys.exit(done.stderr)
+            found = json.loads(done.stdout)
+            n = found["molecules"]
+            costs = "".join(f" {1e6 * found['seconds'][str(k)] / n:.3f} |" for k in asked.cores)
+            rate = 1 / found["seconds"][str(asked.cores[-1])]
+            print(
+                f"| {n:,} |{costs} {rate:.3g} | {found['arrays'] / n / 1e3:.2f} | {found['peak'] / 1e9:.2f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
