@@ -93,7 +93,7 @@ def _molecules(system: System) -> str:
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")
     lines += [f"  {k}: {_stage(stage)}" for k, stage in enumerate(scene.stages)]
-    lines.append(f"\nmemory: about {_size(system) / 1e6:.1f} MB for state, forces and neighbour lists")
+    lines.append(f"\nmemory: about {array_bytes(system) / 1e6:.1f} MB for state, forces and neighbour lists")
     return "\n".join(lines)
 
 
@@ -110,11 +110,11 @@ def _stage(stage: Stage) -> str:
     return text
 
 
-def _size(value) -> int:
+def array_bytes(value) -> int:
     """Bytes of all arrays in nested tuples."""
     if isinstance(value, System):
         # The state four times: the start, the one that moves, the last good one, forces and torques.
-        return 4 * _size(value.state) + _size(tuple(value.terms.values())) + _size(value.model)
+        return 4 * array_bytes(value.state) + array_bytes(tuple(value.terms.values())) + array_bytes(value.model)
     if isinstance(value, np.ndarray):
         return value.nbytes
-    return sum(_size(part) for part in value) if isinstance(value, tuple) else 0
+    return sum(array_bytes(part) for part in value) if isinstance(value, tuple) else 0

@@ -111,7 +111,7 @@ def settle_block(clusters, position, group, block):
     """Origins, anchors and places of newly sorted clusters; their origin is the middle of their box."""
     width = width_of(clusters.local)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        _bring_mates_together(clusters, width * c, min(width * (c + 1), len(clusters.wrapped)))
+        _pair_up(clusters, width * c, min(width * (c + 1), len(clusters.wrapped)))
         for k in range(3):
             low, high = inf, -inf
             for slot in range(width * c, width * (c + 1)):
@@ -130,7 +130,7 @@ def settle_block(clusters, position, group, block):
 
 
 @kernel(inline=True)
-def _bring_mates_together(clusters, first, end):
+def _pair_up(clusters, first, end):
     """Change the order of slots first ... end - 1 so that the two sites of each row are near one another."""
     order, wrapped = clusters.order, clusters.wrapped
     for a in range(first, end - 2, 2):

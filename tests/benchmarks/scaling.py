@@ -22,6 +22,7 @@ import numpy as np
 from peers import WORKLOADS, numbers, write_start
 
 from rigidmd import Scene, Simulation
+from rigidmd.build.describe import array_bytes
 from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat
 
@@ -76,14 +77,8 @@ def measure(job: dict) -> dict:
             steps += FEWEST_STEPS
         seconds[cores] = spent / steps
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    arrays = sum(_bytes(part) for part in (simulation.system.state, engine.model, tuple(engine.terms.values())))
+    arrays = array_bytes((simulation.system.state, engine.model, tuple(engine.terms.values())))
     return {"molecules": UNIT * job["copies"] ** 3, "seconds": seconds, "peak": peak, "arrays": arrays}
-
-
-def _bytes(value) -> int:
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    return sum(_bytes(part) for part in value) if isinstance(value, tuple) else 0
 
 
 def main() -> None:
