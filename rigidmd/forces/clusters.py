@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of
+from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of, zeros
 from rigidmd.jit import PAIR_FLAGS, kernel
 
 BLOCKS = 16  # enough for 16 threads
@@ -40,11 +40,11 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
     return Clusters(
         bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
         order=np.zeros(slots, np.int64),
-        group=np.zeros(slots, np.int32),
+        group=zeros(slots, np.int32),
         anchor=np.zeros((slots, 3)),
-        origin=np.zeros(4 * count),
-        local=np.zeros(3 * slots, dtype),
-        reference=np.zeros(3 * slots, dtype),
+        origin=zeros(4 * count, np.float64),
+        local=zeros(3 * slots, dtype),
+        reference=zeros(3 * slots, dtype),
         moved2=np.zeros(blocks),
         wrapped=np.zeros((sites, 3)),
     )
