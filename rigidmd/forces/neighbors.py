@@ -12,7 +12,7 @@ list is cut into blocks of rows, filled by whichever thread takes them, so the l
 the same bits for any number of threads.
 """
 
-from math import ceil, inf, nan, pi, sqrt
+from math import ceil, floor, inf, nan, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +20,12 @@ import numpy as np
 from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
 from rigidmd.forces.clusters import Clusters, clusters_of, follow_block, settle_block, sort_into_clusters
 from rigidmd.forces.lanes import bits, count_bits, fill, load, load_beside, lowest_bit, smaller, store, width_of, zeros
-from rigidmd.forces.space import Space
+from rigidmd.forces.space import Space, cell_of
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
 from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, work
 
+IMAGE_BITS = 6
+IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
 SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
@@ -42,7 +44,7 @@ class Parts(NamedTuple):
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one law.
 
-    An entry is 32 * cluster + image, the image one of 27 (-1, 0, 1 boxes along x, y, z).
+    An entry is IMAGES * cluster + image; `shift` says where the image is.
     """
 
     cutoff: float  # Å
@@ -50,17 +52,29 @@ class PairList(NamedTuple):
     reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
     group: np.ndarray  # (s,) pairs inside one group are left out
     position: np.ndarray  # (s, 3) where the sites are now, lab frame, Å
-    edges: np.ndarray  # (3,) of the box, Å
+    cell: np.ndarray  # (3, 3) of the box, rows a, b, c, Å
     clusters: Clusters
     tree: BoxTree
-    shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
+    shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     row: np.ndarray  # (rows, SHELLS + 1) shell k of slots 2 r, 2 r + 1: entries[b, row[r, k]:row[r, k + 1]]
     entries: np.ndarray  # (blocks, capacity) int32
     special: np.ndarray  # (rows, 2) entries with a mask: masked[b, special[r, 0]:special[r, 1]]
     masked: np.ndarray  # (blocks, capacity, 3) entry, and as bits the lanes that count for either site of the row
     needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
-    counters: np.ndarray  # (4,) usable (0 or 1); builds so far; shells that matter now; status of the preparation
+    counters: np.ndarray  # (5,) usable (0 or 1); builds; shells that matter now; status of the preparation; images
     parts: Parts
+
+
+@kernel(inline=True)
+def cluster_of(entry):
+    """The cluster that an entry names."""
+    return entry >> IMAGE_BITS
+
+
+@kernel(inline=True)
+def image_of(entry):
+    """The image of it."""
+    return entry & (IMAGES - 1)
 
 
 def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
@@ -78,19 +92,20 @@ def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, ski
     return PairList(
         cutoff=cutoff,
         reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
-        skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
+        # longer, second images could come near between builds, and IMAGES would be too few
+        skin=min(skin, 0.45 * min(space.edges)) if cutoff < inf else inf,
         group=group,
         position=np.zeros((len(group), 3)),
-        edges=np.array(space),
+        cell=cell_of(space),
         clusters=clusters,
         tree=box_tree(count),
-        shift=zeros(4 * 27, np.float64),
+        shift=zeros(4 * IMAGES, np.float64),
         row=np.zeros((rows, SHELLS + 1), np.int32),
         entries=np.empty((blocks, room), np.int32),
         special=np.zeros((rows, 2), np.int32),
         masked=np.empty((blocks, ceil(1.5 * rows / blocks), 3), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
         needed=needed,
-        counters=np.zeros(4, np.int64),
+        counters=np.zeros(5, np.int64),
         parts=Parts(),
     )
 
@@ -192,11 +207,47 @@ def _prepare(parcel, block):
         if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
             pairs.counters[3] = NOT_FINITE
             return
-    sort_into_clusters(pairs.clusters, pairs.edges, pairs.position)
-    for image in range(27):
-        for k in range(3):
-            boxes = image // 3 ** (2 - k) % 3 - 1
-            pairs.shift[4 * image + k] = boxes * pairs.edges[k] if boxes != 0 else 0.0
+    sort_into_clusters(pairs.clusters, pairs.cell, pairs.position)
+    pairs.counters[4] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+
+
+@kernel
+def _find_images(cell, radius, shift):
+    """Shifts of the images of the brick (see clusters) that are within a radius of it; how many. No shift comes first.
+
+    Bricks stand in layers along c, in rows along b; 27 in an upright box, up to 48 in a slanted one, the radius being
+    no longer than any edge.
+    """
+    found = 1
+    for n in range(3):
+        shift[n] = 0.0
+    for z in range(-1, 2):
+        if z != 0 and cell[2, 2] == inf:
+            continue
+        first, last = _images_along(cell, 1, z * cell[2, 1] if z != 0 else 0.0, radius)
+        for y in range(first, last + 1):
+            x0 = (z * cell[2, 0] if z != 0 else 0.0) + (y * cell[1, 0] if y != 0 else 0.0)
+            left, right = _images_along(cell, 0, x0, radius)
+            for x in range(left, right + 1):
+                if x == y == z == 0:
+                    continue
+                for k in range(3):
+                    total = 0.0
+                    for n, vector in ((x, 0), (y, 1), (z, 2)):
+                        if n != 0:
+                            total += n * cell[vector, k]
+                    shift[4 * found + k] = total
+                found += 1
+    return found
+
+
+@kernel
+def _images_along(cell, k, offset, radius):
+    """First and last multiple of edge k that brings a brick, now at an offset, within a radius of the one at 0."""
+    edge = cell[k, k]
+    if edge == inf:
+        return 0, 0
+    return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
 
 
 @work(counted=False)
@@ -281,14 +332,14 @@ def _find_candidates(pairs, c, scratch):
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
     entry = scratch.entry
     candidates = 0
-    for image in range(27):
+    for image in range(pairs.counters[4]):
         reaches = True
         for k in range(3):
             shift = pairs.shift[4 * image + k]
             scratch.low[k] = tree.low[k, c] - shift
             scratch.high[k] = tree.high[k, c] - shift
             if shift != 0.0:
-                reaches &= abs(shift) < inf and scratch.high[k] > -radius and scratch.low[k] < pairs.edges[k] + radius
+                reaches &= scratch.high[k] > -radius and scratch.low[k] < pairs.cell[k, k] + radius
         if not reaches:
             continue
         first = candidates
@@ -300,7 +351,7 @@ def _find_candidates(pairs, c, scratch):
             if ahead < 0:
                 ahead += count
             if 2 * ahead < count or (2 * ahead == count and c < entry[n]):
-                entry[candidates] = 32 * entry[n] + image
+                entry[candidates] = IMAGES * entry[n] + image
                 candidates += 1
     return candidates
 
@@ -320,7 +371,7 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
         scratch.specials[own] = 0
     for n in range(candidates):
         _measure(pairs, c, scratch, n)
-        ahead = (scratch.entry[n] >> 5) - c
+        ahead = cluster_of(scratch.entry[n]) - c
         farthest = max(farthest, ahead + count if ahead < 0 else ahead)
     for own in range(rows):
         near2 = scratch.near2[own]
@@ -373,7 +424,7 @@ def _measure(pairs, c, scratch, n):
     width = width_of(local)
     count = len(clusters.origin) // 4
     entry = scratch.entry[n]
-    other, image = entry >> 5, entry & 31
+    other, image = cluster_of(entry), image_of(entry)
     at = 3 * width * c
     x = load(local, at) + apart(pairs, c, other, image, 0)
     y = load(local, at + width) + apart(pairs, c, other, image, 1)
@@ -413,7 +464,7 @@ def _mask_of_lanes(pairs, i, entry, radius2):
     local = clusters.local
     width = width_of(local)
     everyone = (1 << width) - 1
-    c, other, image = i // width, entry >> 5, entry & 31
+    c, other, image = i // width, cluster_of(entry), image_of(entry)
     at = 2 * width * c + i
     start = 3 * width * other
     dx = local[at] + apart(pairs, c, other, image, 0) - load(local, start)

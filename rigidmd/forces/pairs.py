@@ -27,9 +27,9 @@ from rigidmd.forces.lanes import (
     width_of,
     zeros,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, empty_list, most_needed, update_list
+from rigidmd.forces.neighbors import PairList, cluster_of, empty_list, image_of, most_needed, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.space import Space
+from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
 from rigidmd.jit import PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
 
@@ -149,9 +149,7 @@ def _add_pair_forces(term, state, load, tally):
         sums = term.sums
         place_sites(term.sites, state, pairs.position)
         builds = pairs.counters[1]
-        pairs.edges[0] = term.space.x
-        pairs.edges[1] = term.space.y
-        pairs.edges[2] = term.space.z
+        fill_cell(term.space, pairs.cell)
         status = update_list(pairs)
         if status != OK:
             return status
@@ -248,11 +246,11 @@ def _displacements(pairs, c, here, entry):
     """From a vector of other sites, those of an entry, to each of two sites of cluster c."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
-    other = entry >> 5
+    other = cluster_of(entry)
     at = 3 * width * other
     offset = narrowed(
         load_four(clusters.origin, 4 * c)
-        - load_four(pairs.shift, 4 * (entry & 31))
+        - load_four(pairs.shift, 4 * image_of(entry))
         - load_four(clusters.origin, 4 * other),
         clusters.local,
     )
@@ -273,7 +271,7 @@ def _separation(here, x, y, z):
 def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
     """The sites in slots i, i + 1 meet those of an entry: forces into `others` and, with energies, onto `sums`."""
     width = width_of(pairs.clusters.local)
-    other = entry >> 5
+    other = cluster_of(entry)
     first, second, totals = sums
     gx, gy, gz, totals = _act(law, i, width * other, between[0], masks[0], totals, tallies)
     hx, hy, hz, totals = _act(law, i + 1, width * other, between[1], masks[1], totals, tallies)
