@@ -61,7 +61,15 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
         if by_residue:
             by_bonds.notes.append("its residues are no molecules of the scene; they were told by bonding distance")
         return by_bonds
-    return by_residue if by_residue and len(runs) > 1 else by_bonds
+    if by_residue and len(runs) > 1:
+        return by_residue
+    known = {"X"}.union(*map(_labels, species))
+    strange = sorted({name for name, kind in zip(atoms.names, kinds, strict=True) if kind not in known})
+    if strange:
+        called = ", ".join(name or "(no name)" for name in strange[:5]) + (", ..." if len(strange) > 5 else "")
+        wanted = ", ".join(f"{molecule.name} ({_composition(molecule)})" for molecule in species)
+        return [f"has atoms called {called}, which are in no molecule of the scene: {wanted}"]
+    return by_bonds
 
 
 def _labels(molecule: Molecule) -> list[str]:
@@ -70,9 +78,10 @@ def _labels(molecule: Molecule) -> list[str]:
 
 
 def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """The element of every atom (or what stands for it in the templates), X for massless ones, "" if it has none.
+    """The element of every atom (or what stands for it in the templates), X for massless ones; with "?" a mere guess.
 
-    An element that the file gives is believed. A name is that of a site, or begins with an element of the scene.
+    An element that the file gives is believed. A name is that of a site, or begins with an element of the scene, or
+    tells nothing that counts.
     """
     by_name, by_mass = {}, []
     for molecule in species:
@@ -95,7 +104,8 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
             return element
         if residue and residue[1] == name:  # an ion or a noble gas: NA, CL, AR
             name = name.capitalize()
-        return element_of(name, vocabulary)
+        guess = element_of(name, vocabulary)
+        return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
 
     found = []
     masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
@@ -172,10 +182,8 @@ def _attempt(
         eligible = called or list(range(len(species)))
         candidates = [c for k in eligible if (c := _candidate(names, run_kinds, species[k], k))]
         if not candidates:
-            has = _formula(kind or f"{name or 'a nameless atom'}?" for name, kind in zip(names, run_kinds, strict=True))
-            wanted = " or ".join(
-                f"{species[k].name} ({_formula(_labels(species[k])[i] for i in massive(species[k]))})" for k in eligible
-            )
+            has = _formula(kind.rstrip("?") for kind in run_kinds)
+            wanted = " or ".join(f"{species[k].name} ({_composition(species[k])})" for k in eligible)
             faults |= {m: f"has atoms {has}, expected {wanted}" for m in members}
             continue
         _place(atoms, kinds, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
@@ -197,6 +205,10 @@ def _formula(elements) -> str:
     return " ".join(f"{element}{count if count > 1 else ''}" for element, count in Counter(elements).items())
 
 
+def _composition(molecule: Molecule) -> str:
+    return _formula(_labels(molecule)[i] for i in massive(molecule))
+
+
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
     """A run as this species: sites by name if all names are its own, else by element; or None."""
     sites = massive(molecule)
@@ -204,7 +216,7 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     places = [i for i, kind in enumerate(kinds) if kind != "X"]
     if len(places) != len(sites):
         return None
-    if len(places) > 1 and not any(kinds[i] in labels for i in places) and all(not kinds[i] for i in places):
+    if len(places) > 1 and all(kinds[i].endswith("?") for i in places):
         return _Candidate(k, places, nameless=True)
     if Counter(kinds[i] for i in places) != Counter(labels):
         return None
