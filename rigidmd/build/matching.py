@@ -1,7 +1,7 @@
 """Which atoms are which molecule: by residues where a file has them, else by bonding distance; fitted by templates."""
 
 from collections import Counter
-from itertools import groupby
+from itertools import groupby, product
 from math import inf
 from typing import NamedTuple
 
@@ -122,32 +122,50 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
 
     Bonds of a template: the shortest set of distances that holds it together.
     """
-    from ase import Atoms as Plain
-    from ase.neighborlist import neighbor_list
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-    number = {kind: k + 1 for k, kind in enumerate(sorted({*kinds, *(x for m in species for x in _labels(m))}))}
-    reach = {}
+    numbers = {kind: k for k, kind in enumerate({*kinds}.union(*map(_labels, species)))}
+    reach = np.zeros((len(numbers), len(numbers)))
     for molecule in species:
         sites = massive(molecule)
         points = molecule.positions_body[sites]
+        number = [numbers[_labels(molecule)[s]] for s in sites]
         tree = minimum_spanning_tree(np.linalg.norm(points[:, None] - points, axis=2)).tocoo()
-        labels = [_labels(molecule)[s] for s in sites]
         for i, j, length in zip(tree.row, tree.col, tree.data, strict=True):
-            pair = tuple(sorted((number[labels[i]], number[labels[j]])))
-            reach[pair] = max(reach.get(pair, 0.0), BOND_REACH * length)
-    chosen = [i for i, kind in enumerate(kinds) if kind != "X"]
-    i = j = np.zeros(0, int)
-    if reach:
-        plain = Plain([number[kinds[k]] for k in chosen], atoms.position[chosen], cell=cell, pbc=cell is not None)
-        i, j = neighbor_list("ij", plain, reach)
+            one, other = number[i], number[j]
+            reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
+    chosen = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
+    number = np.array([numbers[kinds[i]] for i in chosen], int)
+    i, j, distance = _close_pairs(atoms.position[chosen], cell, reach.max())
+    i, j = np.array([i, j])[:, distance <= reach[number[i], number[j]]]
     shape = (len(chosen), len(chosen))
     count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
     runs = [[] for _ in range(count)]
     for atom, component in zip(chosen, label, strict=True):
         runs[component].append(atom)
     return sorted(runs)
+
+
+def _close_pairs(
+    position: np.ndarray, cell: np.ndarray | None, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs i, j of points (n, 3) within a radius, images in any cell (3, 3) included, and their distances."""
+    from scipy.spatial import cKDTree
+
+    points, owner = position, np.arange(len(position))
+    if cell is not None:
+        inverse = np.linalg.inv(cell)
+        inside = position @ inverse
+        inside -= np.floor(inside)
+        margin = radius * np.linalg.norm(inverse, axis=0)  # in fractions of the distances between opposite faces
+        shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
+        images = [inside + shift for shift in shifts]
+        near = [((image >= -margin) & (image <= 1 + margin)).all(axis=1) for image in images]
+        owner = np.concatenate([np.flatnonzero(chosen) for chosen in near])
+        points = np.concatenate([image[chosen] for image, chosen in zip(images, near, strict=True)]) @ cell
+    i, j = cKDTree(points).query_pairs(radius, output_type="ndarray").T
+    return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)
 
 
 class _Candidate(NamedTuple):

@@ -319,12 +319,16 @@ def _gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
             raise StructureError(
                 str(path), [f"line {first + 2} promises {promised} atoms and a box, {there} are there: truncated?"]
             )
-        frames.append(partial(_gro_frame, path, lines, first, box))
+        what = "the box, 3 or 9 numbers (is the number of atoms right?)"
+        edges = _numbers(path, box + 1, lines[box].split(), what)
+        if len(edges) not in (3, 9):
+            raise StructureError(str(path), [f"line {box + 1}: expected {what}, found {lines[box].strip()!r}"])
+        frames.append(partial(_gro_frame, path, lines, first, box, edges))
         first = box + 1
     return frames
 
 
-def _gro_frame(path: Path, lines: list[str], first: int, box: int) -> Atoms:
+def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[float]) -> Atoms:
     """Lines `first` to `box`. Columns are as wide as the decimal points of the first atom are apart, as in GROMACS."""
     names, residue = [], []
     position, velocity = np.zeros((box - first - 2, 3)), np.full((box - first - 2, 3), np.nan)
@@ -347,9 +351,6 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int) -> Atoms:
         names.append(line[10:15].strip())
         number = line[:5].strip()
         residue.append((int(number) if number.isdigit() else 0, line[5:10].strip()))
-    edges = _numbers(path, box + 1, lines[box].split(), "the box (3 or 9 numbers; is the number of atoms right?)")
-    if len(edges) not in (3, 9):
-        raise StructureError(str(path), [f"line {box + 1}: a box has 3 or 9 numbers, found {lines[box].strip()!r}"])
     xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
     cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     return Atoms(
