@@ -17,6 +17,8 @@ BOND_REACH = 1.25
 MOST_TRIES = 20_000
 #: Masses nearer than this fraction are one element.
 SAME_MASS = 0.01
+#: u; what engines that know no massless sites give them instead is less.
+NO_MASS = 0.1
 
 
 class Fit(NamedTuple):
@@ -93,18 +95,25 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     vocabulary = frozenset(label for _, label in by_mass)
     own_names = set(by_name) - vocabulary
     known = {}
+    hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
+
+    def isotope(element: str) -> str:
+        """Hydrogen that the scene does not tell from its own counts as its own: heavy water starts like light."""
+        return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
 
     def kind(name: str, element: str, mass: float, residue: tuple) -> str:
+        if 0 < mass < NO_MASS:
+            return "X"
         if mass > 0:
             nearest, label = min(by_mass, key=lambda entry: abs(entry[0] - mass))
-            return label if abs(nearest - mass) <= SAME_MASS * mass else element
+            return label if abs(nearest - mass) <= SAME_MASS * mass else isotope(element)
         if name in own_names and (not element or element == "X"):
             return by_name[name]
         if element:
-            return element
+            return isotope(element)
         if residue and residue[1] == name:  # an ion or a noble gas: NA, CL, AR
             name = name.capitalize()
-        guess = element_of(name, vocabulary)
+        guess = isotope(element_of(name, vocabulary))
         return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
 
     found = []

@@ -22,6 +22,8 @@ ASE_VELOCITY = 98.22694788464063
 NO_VOLUME = 1e-9  # of a cell against the cube of its longest edge
 #: A column of velocities in extended XYZ that ASE keeps as it stands: programs differ in its units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
+HEAVY_HYDROGEN = {"D": 2.014101777844, "T": 3.01604928132}  # u, AME2020; ASE has no symbols for them
+#: Names of sites without mass: M of four-site waters, L of five-site ones, and what programs call them.
 MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM|VS|XX?|Q)\d*", re.IGNORECASE)
 
 
@@ -29,7 +31,7 @@ class Atoms(NamedTuple):
     """What a file says of n atoms, in our units."""
 
     names: list[str]
-    elements: list[str]  # "" where the format has names only, X without mass
+    elements: list[str]  # "" where the format has names only; X without mass, D and T for heavy hydrogen
     residue: list[tuple]  # (number, name) or () where the format has none
     position: np.ndarray  # (n, 3) Å
     velocity: np.ndarray | None  # (n, 3) Å/ps; rows of NaN for atoms without one
@@ -80,9 +82,12 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
     """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file that holds one molecule."""
     from ase.data import atomic_masses, atomic_numbers
 
+    def mass(element: str) -> float:
+        return HEAVY_HYDROGEN[element] if element in HEAVY_HYDROGEN else float(atomic_masses[atomic_numbers[element]])
+
     atoms = read_atoms(path)
     elements = [e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)]
-    masses = np.array([atomic_masses[atomic_numbers[e]] if e != "X" else 0.0 for e in elements])
+    masses = np.array([mass(e) if e != "X" else 0.0 for e in elements])
     return atoms.names, elements, masses if atoms.masses is None else atoms.masses, atoms.position
 
 
@@ -118,7 +123,9 @@ def _choose(path: Path, frames: list, frame: int | None):
     if not frames:
         raise StructureError(str(path), ["holds no atoms"])
     if not 1 <= abs(frame) <= len(frames):
-        raise StructureError(str(path), [f"holds {len(frames)} structures; structure.frame is {frame}"])
+        raise StructureError(
+            str(path), [f"holds {len(frames)} structures, 1 is the first and -1 the last; structure.frame is {frame}"]
+        )
     return frames[frame - 1 if frame > 0 else frame]
 
 
@@ -208,20 +215,19 @@ def _pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 
 def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
-    """One model through ASE, its lines made what ASE expects: an element in each, residues counted."""
+    """One model through ASE, its lines made what ASE expects: some element in each, residues counted."""
     if len(places := {line[16:17] for line in body} - {"", " "}) > 1:
         raise StructureError(str(path), [f"has alternate locations {', '.join(sorted(places))}; keep one of them"])
     names, elements, residue, lines = [], [], [], []
     count, last = 0, None
     for line in body:
         symbol = line[76:78].strip().capitalize()
-        symbol = "H" if symbol in ("D", "T") else symbol
         names.append(line[12:16].strip())
-        elements.append(symbol if _is_element(symbol) else "")
+        elements.append(symbol if _is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
         if (here := line[17:27]) != last:  # name, chain, number and insertion code: numbers alone wrap or run out
             count, last = count + 1, here
         residue.append((count, line[17:21].strip()))
-        lines.append(f"{line[:22]:22}{count % 10000:4d}{line[26:76]:50}{elements[-1] or 'X':>2}")
+        lines.append(f"{line[:22]:22}{count % 10000:4d}{line[26:76]:50} X")
     found = _ase(path, io.StringIO("\n".join([*head, *lines]) + "\n"), format="proteindatabank")
     if len({number for number, _ in residue}) == 1 and not residue[0][1]:
         residue = [()] * len(names)
@@ -243,9 +249,9 @@ def _xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
                 labels.append(None)
                 continue
             name = words[column]
-            symbol = "H" if name in ("D", "T") else name.capitalize()
-            labels.append((name, symbol if _is_element(symbol) else ""))
-            words[column] = labels[-1][1] or "X"
+            symbol = name.capitalize()
+            labels.append((name, symbol if _is_element(symbol) or symbol in HEAVY_HYDROGEN else ""))
+            words[column] = symbol if _is_element(symbol) else "H" if symbol in HEAVY_HYDROGEN else "X"
             lines[k] = " ".join(words)
         at += 2 + int(count)
     frames, first = [], 0
