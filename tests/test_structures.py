@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rigidmd.build.cells import standard_rotation
+from rigidmd.build.matching import _close_pairs
 from rigidmd.build.structure import read_structure
 from rigidmd.build.structure_files import element_of, read_geometry
 from rigidmd.build.system import build
@@ -448,6 +449,32 @@ def test_a_mirror_image_is_another_molecule(tmp_path):
         read(tmp_path, xyz(mirrored, truth.cell), "a.xyz", ["chiral"])
 
 
+def test_hydrogen_bonds_are_none_of_the_bonds_of_larger_atoms(tmp_path):
+    """Waters 1.8 Å apart, in a scene that has bonds of 1.94 Å between other elements."""
+    rows = [("O", 0, 0, 0), ("H", 1, 0, 0), ("H", -1 / 3, 0.9428, 0)]
+    rows += [("O", 2.8, 0, 0), ("H", 3.3774, 0.8165, 0), ("H", 3.3774, -0.8165, 0)]
+    atoms = [("", e, 0, np.array([x, y, z]), None) for e, x, y, z in rows]
+    atoms += [(name, e, k, x + 8, v) for name, e, k, x, v in Truth(["chiral"]).atoms()]
+    found = read(tmp_path, xyz(atoms, np.diag([20.0] * 3)), "a.xyz", ["spce", "chiral"])
+    assert found.species.tolist() == [0, 0, 1]
+
+
+def test_close_pairs_in_any_cell():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        cell = np.tril(rng.uniform(-6, 6, (3, 3)), -1) + np.diag(rng.uniform(2, 6, 3))
+        points = (rng.random((12, 3)) + rng.integers(-1, 2, (12, 3))) @ cell
+        radius = rng.uniform(0.5, 3)
+        images = np.stack(np.meshgrid(*[np.arange(-14, 15)] * 3), -1).reshape(-1, 3) @ cell
+        step = points[:, None] - points
+        wanted = {
+            (i, j) for i in range(12) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
+        }
+        i, j, distance = _close_pairs(points, cell, radius)
+        assert {(max(a, b), min(a, b)) for a, b in zip(i, j, strict=True) if a != b} == wanted
+        assert distance.max(initial=0.0) <= radius
+
+
 # formats
 
 
@@ -602,6 +629,9 @@ def test_long_pdbs_whose_numbers_run_out(tmp_path):
     truth = Truth(["spce"] * 8, 13)
     text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"A{k:03d}")  # hybrid-36
     same_molecules(read(tmp_path, text, "a.pdb"), truth, [SPECIES["spce"]], 0.002)
+    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"   {k // 2}")  # two of each number, in two chains
+    lines = [line.replace(" A   ", " B   ") if (k - 1) % 6 < 3 else line for k, line in enumerate(text.splitlines())]
+    assert read(tmp_path, "\n".join(lines) + "\n", "c.pdb").notes == ()
     text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: "****")  # GROMACS and others beyond 9999
     same_molecules(read(tmp_path, text, "b.pdb"), truth, [SPECIES["spce"]], 0.002)
 

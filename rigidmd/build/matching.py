@@ -309,6 +309,7 @@ def _fit_in_any_order(
         for old, new in zip(fit, again, strict=True):
             old[bad[mended]] = new[mended]
         order[bad[mended]] = order[bad[mended]][:, better]
+        mended[0] = True  # or, by a rounding, as good as
         bad = bad[~mended]
     return fit
 
