@@ -38,6 +38,16 @@ def chiral() -> Molecule:
     return molecule("halothane", tuple(sites), residue_names=("HAL",))
 
 
+def tetrachloromethane() -> Molecule:
+    """Half of the orders of its chlorines have all distances right and are mirror images."""
+    corners = 1.766 / np.sqrt(3) * np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
+    sites = [
+        Site(name=f"CL{k}", element="Cl", mass_u=35.45, position_A=tuple(map(float, x))) for k, x in enumerate(corners)
+    ]
+    carbon = Site(name="C", element="C", mass_u=12.011, position_A=(0.0, 0.0, 0.0))
+    return molecule("tetrachloromethane", (carbon, *sites), residue_names=("CCL4",))
+
+
 def benzene() -> Molecule:
     """Twelve atoms of two kinds: 518,400 orders, 12 of which fit."""
     sites = []
@@ -61,6 +71,7 @@ SPECIES = {
     "argon": load_model("argon"),
     "chiral": chiral(),
     "benzene": benzene(),
+    "tetrachloromethane": tetrachloromethane(),
 }
 
 
@@ -375,7 +386,7 @@ def test_ions_among_waters(ending, tmp_path):
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    kinds=st.lists(st.sampled_from(["spce", "tip4p2005", "nitrogen", "argon", "chiral", "benzene"]), min_size=1, max_size=8),
+    kinds=st.lists(st.sampled_from(["spce", "tip4p2005", "nitrogen", "argon", "chiral", "benzene", "tetrachloromethane"]), min_size=1, max_size=8),
     seed=st.integers(0, 2**31),
     slant=st.booleans(),
     mirrored=st.booleans(),
@@ -442,10 +453,32 @@ def test_molecules_of_a_slanted_cell_are_made_whole_but_the_cell_is_refused(tmp_
         read(tmp_path, text, "a.xyz")
 
 
+def test_residuals_are_those_of_the_best_fit(tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    truth = Truth(["spce", "nitrogen", "argon", "benzene", "spce"], 21)
+    species = [SPECIES[name] for name in ("spce", "nitrogen", "argon", "benzene")]
+    rng = np.random.default_rng(1)
+    atoms = [(name, e, k, x + 0.02 * rng.standard_normal(3), v) for name, e, k, x, v in truth.atoms()]
+    found = read(tmp_path, xyz(wrapped(atoms, truth.cell), truth.cell), "a.xyz", species)
+    squares = []
+    for k, m in enumerate(truth.species):
+        points = np.array([x for _, _, owner, x, _ in atoms if owner == k])
+        points = points - m.masses @ points / m.mass
+        if len(points) > 2:
+            rotation, _ = Rotation.align_vectors(points, m.positions_body, weights=m.masses)
+            points = rotation.inv().apply(points)
+        else:  # along the axis, which SciPy finds not unique
+            points = m.positions_body * np.linalg.norm(points[0]) / max(m.radius, 1e-9)
+        squares += list(((points - m.positions_body) ** 2).sum(axis=1))
+    assert found.residual_rms == pytest.approx(np.sqrt(np.mean(squares)))
+    assert found.residual_max == pytest.approx(np.sqrt(np.max(squares)))
+
+
 def test_a_mirror_image_is_another_molecule(tmp_path):
     truth = Truth(["chiral"] * 4, 7)
     mirrored = [(name, e, k, x * [-1, 1, 1], v) for name, e, k, x, v in truth.atoms()]
-    with pytest.raises(StructureError, match=r"molecule 1 \(atoms 1 to 5\) is no halothane: an atom is"):
+    with pytest.raises(StructureError, match=r"molecule 1 \(atoms 1 to 5, by bonding distance\) is no halothane: an atom is"):
         read(tmp_path, xyz(mirrored, truth.cell), "a.xyz", ["chiral"])
 
 
@@ -462,15 +495,16 @@ def test_hydrogen_bonds_are_none_of_the_bonds_of_larger_atoms(tmp_path):
 def test_close_pairs_in_any_cell():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        cell = np.tril(rng.uniform(-6, 6, (3, 3)), -1) + np.diag(rng.uniform(2, 6, 3))
-        points = (rng.random((12, 3)) + rng.integers(-1, 2, (12, 3))) @ cell
-        radius = rng.uniform(0.5, 3)
-        images = np.stack(np.meshgrid(*[np.arange(-14, 15)] * 3), -1).reshape(-1, 3) @ cell
+        cell = np.tril(rng.uniform(-10, 10, (3, 3)), -1) + np.diag(rng.uniform(6, 12, 3))
+        points = rng.random((15, 3)) @ cell
+        radius = rng.uniform(2, 4)
+        images = np.stack(np.meshgrid(*[np.arange(-10, 11)] * 3), -1).reshape(-1, 3) @ cell
         step = points[:, None] - points
         wanted = {
-            (i, j) for i in range(12) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
+            (i, j) for i in range(15) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
         }
-        i, j, distance = _close_pairs(points, cell, radius)
+        assert 0 < len(wanted) < 105
+        i, j, distance = _close_pairs(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
         assert {(max(a, b), min(a, b)) for a, b in zip(i, j, strict=True) if a != b} == wanted
         assert distance.max(initial=0.0) <= radius
 
@@ -600,7 +634,7 @@ def lammps(truth, first_line, velocity_unit, molecule_ids=True) -> str:
     lines = [first_line, "", f"{len(atoms)} atoms", "3 atom types", ""]
     lines += [f"0 {x:.9f} {axis}lo {axis}hi" for x, axis in zip(edges, "xyz", strict=True)]
     lines += ["", "Masses", "", "1 15.9994", "2 1.008", "3 39.948", "", "Atoms # full", ""]
-    types = {"O": 1, "H": 2, "Ar": 3}
+    types = {"O": 1, "H": 2, "Ar": 3, "X": 3}
     lines += [
         f"{i} {k + 1 if molecule_ids else 0} {types[e]} 0.0 {x[0]:.10f} {x[1]:.10f} {x[2]:.10f}"
         for i, (_, e, k, x, _) in enumerate(atoms, 1)
@@ -623,6 +657,14 @@ def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
     else:
         assert found.velocity is None
         assert any("does not say its units" in note for note in found.notes)
+
+
+def test_lammps_sites_of_almost_no_mass(tmp_path):
+    truth = Truth(["tip4p2005"] * 3, 12)
+    text = lammps(truth, "x, units = real", 1.0).replace("3 39.948", "3 1e-10")
+    found = read(tmp_path, text, "a.data", ["tip4p2005"])
+    same_molecules(found, truth, [SPECIES["tip4p2005"]], 1e-6)
+    assert found.notes == ()
 
 
 def test_long_pdbs_whose_numbers_run_out(tmp_path):
@@ -852,7 +894,9 @@ def test_species_that_the_scene_lacks(tmp_path):
 
 def test_like_species_need_residue_names(tmp_path):
     truth = Truth(["spce"] * 3, 18)
-    with pytest.raises(StructureError, match=r"molecule 1 .* may be spce or tip4p2005: give them residue_names"):
+    with pytest.raises(
+        StructureError, match=r"molecule 1 .atoms 1 to 3, .* may be spce or tip4p2005: give them residue_names"
+    ):
         read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz", ["spce", "tip4p2005"])
 
 

@@ -19,6 +19,7 @@ MOST_TRIES = 20_000
 SAME_MASS = 0.01
 #: u; what engines that know no massless sites give them instead is less.
 NO_MASS = 0.1
+MOST_LISTED = 6  # atoms of a molecule that a message lists
 
 
 class Fit(NamedTuple):
@@ -55,10 +56,11 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
     """
     kinds = _kinds(atoms, species)
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
-    by_residue = _attempt(atoms, kinds, runs, species, cell, tolerance) if atoms.residue[0] else []
+    by_residue = _attempt(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
     if isinstance(by_residue, Matched):
         return by_residue
-    by_bonds = _attempt(atoms, kinds, _bonded(atoms, kinds, species, cell), species, cell, tolerance)
+    runs_by_bonds = _bonded(atoms, kinds, species, cell)
+    by_bonds = _attempt(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
     if isinstance(by_bonds, Matched):
         if by_residue:
             by_bonds.notes.append("its residues are no molecules of the scene; they were told by bonding distance")
@@ -184,9 +186,9 @@ class _Candidate(NamedTuple):
 
 
 def _attempt(
-    atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float
+    atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
 ) -> Matched | list[str]:
-    """Each run of atoms as one molecule. Runs that look alike are dealt with together."""
+    """Each run of atoms as one molecule. Runs that look alike are dealt with together. how: told of runs at fault."""
     alike = {}
     for number, run in enumerate(runs):
         residue = atoms.residue[run[0]]
@@ -219,13 +221,16 @@ def _attempt(
             note = f"atoms called {', '.join(name or 'nothing' for name in names)} tell no element: {called} by shape"
             found.notes.append(note)
     if faults:
-        return [f"{_address(atoms, runs[m], m)} {fault}" for m, fault in sorted(faults.items())]
+        return [f"{_address(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
     return found
 
 
-def _address(atoms: Atoms, run: list[int], number: int) -> str:
+def _address(atoms: Atoms, run: list[int], number: int, how: str) -> str:
+    listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
+    if run == list(range(run[0], run[-1] + 1)):
+        listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
     residue = f", residue {atoms.residue[run[0]][1]!r}" if atoms.residue[run[0]] else ""
-    return f"molecule {number + 1} (atoms {min(run) + 1} to {max(run) + 1}{residue})"
+    return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
 
 
 def _formula(elements) -> str:
