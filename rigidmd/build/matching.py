@@ -11,7 +11,8 @@ from rigidmd.build.structure_files import Atoms, element_of
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
 
-#: Atoms of a molecule are bonded up to this multiple of the template's longest bond between two like them.
+#: Atoms of a molecule are bonded up to this multiple of the template's longest bond between two like them; hydrogen
+#: bonds of water are 1.6 times its bonds or longer.
 BOND_REACH = 1.25
 #: Partial assignments tried before a molecule's atoms count as fitting in no order.
 MOST_TRIES = 20_000
@@ -217,9 +218,9 @@ def _attempt(
             continue
         _place(atoms, kinds, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
         if any(c.nameless for c in candidates) and not faults:
-            called = species[found.species[members[0]]].name
-            note = f"atoms called {', '.join(name or 'nothing' for name in names)} tell no element: {called} by shape"
-            found.notes.append(note)
+            listed = ", ".join(name or "(no name)" for name in names)
+            by_shape = species[found.species[members[0]]].name
+            found.notes.append(f"atoms called {listed} tell no element: {by_shape} by shape")
     if faults:
         return [f"{_address(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
     return found
@@ -340,7 +341,7 @@ def _fit(points: np.ndarray, molecule: Molecule) -> Fit:
     return Fit(centre, rotation, off.max(axis=1), (off**2).mean(axis=1))
 
 
-def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray | None:
+def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> list[int] | None:
     """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
 
     Sites are given atoms one by one, such that all distances between them agree: first closely, then up to twice the
@@ -349,29 +350,28 @@ def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: 
     template = molecule.positions_body[massive(molecule)]
     wanted = np.linalg.norm(template[:, None] - template, axis=2)
     there = np.linalg.norm(points[:, None] - points, axis=2)
+    tries = 0
+
+    def extended(order: list[int], closeness: float) -> list[int] | None:
+        nonlocal tries
+        site = len(order)
+        if site == len(points):
+            return order if _fit(points[None, order], molecule).deviation[0] <= limit else None
+        tries += 1
+        if tries > MOST_TRIES:
+            return None
+        off = np.abs(there[:, order] - wanted[site, :site]).max(axis=1, initial=0.0)
+        off[order] = inf
+        off[~allowed[site]] = inf
+        for atom in np.argsort(off):
+            if off[atom] > closeness:
+                return None
+            if found := extended([*order, int(atom)], closeness):
+                return found
+        return None
+
     for closeness in (0.1, 0.5, 2.0):
-        tries = [0]
-        order: list[int] = []
-
-        def extend(closeness=closeness, tries=tries, order=order) -> bool:
-            site = len(order)
-            if site == len(points):
-                return bool(_fit(points[None, order], molecule).deviation[0] <= limit)
-            tries[0] += 1
-            if tries[0] > MOST_TRIES:
-                return False
-            off = np.abs(there[:, order] - wanted[site, :site]).max(axis=1, initial=0.0)
-            off[order] = inf
-            off[~allowed[site]] = inf
-            for atom in np.argsort(off):
-                if off[atom] > closeness * limit:
-                    break
-                order.append(int(atom))
-                if extend():
-                    return True
-                order.pop()
-            return False
-
-        if extend():
-            return np.array(order)
+        tries = 0
+        if found := extended([], closeness * limit):
+            return found
     return None

@@ -17,8 +17,6 @@ MOST_NAMED = 5  # how many molecules a message names before it only counts
 SAME_BOX = 1e-4  # boxes of file and scene that differ by less, relatively, are the same as printed
 #: Units in which files are given by mistake, in Å.
 OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
-
-
 CLOSE = 1.2  # how well distances between atoms agree with bonds of the templates, as a factor
 
 
@@ -73,10 +71,9 @@ def read_structure(
 def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
     """The cell and its molecules beside one another, `repeat` times along each edge."""
     shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ found.cell
-    times = len(shifts)
 
     def tiled(values):
-        return None if values is None else np.tile(values, (times, *[1] * (values.ndim - 1)))
+        return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))
 
     return found._replace(
         species=tiled(found.species),
@@ -85,6 +82,7 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
         velocity=tiled(found.velocity),
         angular_momentum_body=tiled(found.angular_momentum_body),
         cell=found.cell * np.array(repeat)[:, None],
+        notes=(*found.notes, f"its {len(found.species)} molecules stand {' x '.join(map(str, repeat))} times"),
     )
 
 

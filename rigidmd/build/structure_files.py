@@ -47,13 +47,7 @@ def read_atoms(path: Path, frame: int | None = None) -> Atoms:
     """
     if not path.is_file():
         raise StructureError(str(path), ["there is no such file"])
-    try:
-        frames = _frames(path)
-    except StructureError:
-        raise
-    except UnicodeDecodeError:
-        raise StructureError(str(path), ["is not text, as its ending says it should be"]) from None
-    atoms = _choose(path, frames, frame)()
+    atoms = _choose(path, _frames(path), frame)()
     if len(atoms.position) == 0:
         raise StructureError(str(path), ["holds no atoms"])
     for what, values in (("position", atoms.position), ("cell", atoms.cell)):
@@ -115,8 +109,8 @@ def _choose(path: Path, frames: list, frame: int | None):
             raise StructureError(
                 str(path),
                 [
-                    f"holds {len(frames)} structures one after another; structure.frame says which to start from "
-                    f"(1 to {len(frames)}, -1 for the last)"
+                    f"holds {len(frames)} structures one after another: keep one, or of a start say which by "
+                    f"structure.frame (1 to {len(frames)}, -1 for the last)"
                 ],
             )
         frame = 1
@@ -124,7 +118,7 @@ def _choose(path: Path, frames: list, frame: int | None):
         raise StructureError(str(path), ["holds no atoms"])
     if not 1 <= abs(frame) <= len(frames):
         raise StructureError(
-            str(path), [f"holds {len(frames)} structures, 1 is the first and -1 the last; structure.frame is {frame}"]
+            str(path), [f"structure.frame is {frame}: it holds {len(frames)}, 1 is the first and -1 the last"]
         )
     return frames[frame - 1 if frame > 0 else frame]
 
@@ -132,7 +126,8 @@ def _choose(path: Path, frames: list, frame: int | None):
 def _frames(path: Path) -> list[Callable[[], Atoms]]:
     """The structures of a file, each ready to be read."""
     if reader := READERS.get(path.suffix.lower()):
-        return reader(path, path.read_text().splitlines())
+        # Titles are in any encoding; what matters is ASCII.
+        return reader(path, path.read_text(encoding="utf-8", errors="replace").splitlines())
     return [partial(_from_ase, path, atoms) for atoms in _ase(path, path)]
 
 
@@ -207,7 +202,7 @@ def _pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         elif line.startswith(("ATOM", "HETATM")):
             body.append(line)
         elif line.startswith("ORIGX"):
-            cryst.append(line)
+            cryst = [*cryst, line]
         elif line.startswith("END") and body:
             models.append(partial(_pdb_model, path, cryst, body))
             body = []
@@ -279,7 +274,7 @@ def _lammps(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     text = "\n".join(lines) + "\n"
     if not re.search(r"^\s*Masses\b", text, re.MULTILINE) and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
         raise StructureError(str(path), ["has no section Masses, from which its atom types could be told"])
-    units = re.search(r"units = (\w+)", text.split("\n", 1)[0])
+    units = re.search(r"\bunits\s*=?\s*(real|metal|si|cgs|electron)\b", text.split("\n", 1)[0])
     try:
         found = _ase(path, io.StringIO(text), format="lammps-data", units=units.group(1) if units else "metal")
     except StructureError:
@@ -307,7 +302,7 @@ def _numbers(path: Path, number: int, words: list[str], what: str) -> list[float
     try:
         return [float(word) for word in words]
     except ValueError:
-        raise StructureError(str(path), [f"line {number}: expected {what}, found {' '.join(words)!r}"]) from None
+        raise StructureError(str(path), [f"line {number}: expected {what}, found {' '.join(words)[:60]!r}"]) from None
 
 
 def _gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
@@ -318,7 +313,9 @@ def _gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     while first < len(lines):
         promised = lines[first + 1].strip() if first + 1 < len(lines) else ""
         if not promised.isdigit():
-            raise StructureError(str(path), [f"line {first + 2}: expected the number of atoms, found {promised!r}"])
+            raise StructureError(
+                str(path), [f"line {first + 2}: expected the number of atoms, found {promised[:60]!r}"]
+            )
         box = first + 2 + int(promised)
         if box >= len(lines):
             there = max(0, len(lines) - first - 3)
@@ -386,18 +383,23 @@ def _arc(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
             raise StructureError(
                 str(path), [f"promises {count} atoms, {max(0, len(lines) - start)} are there: truncated?"]
             )
-        frames.append(partial(_arc_frame, path, lines[first + 1] if periodic else "", lines[start:end]))
+        frames.append(partial(_arc_frame, path, lines[first + 1] if periodic else "", lines[start:end], start + 1))
         first = end
     return frames
 
 
-def _arc_frame(path: Path, box: str, lines: list[str]) -> Atoms:
+def _arc_frame(path: Path, box: str, lines: list[str], first: int) -> Atoms:
+    """The atoms from line `first` on."""
+    cell = _cell(_numbers(path, first - 1, box.split(), "three edges and three angles")) if box else None
+    names, position = _columns(path, lines, first, "an atom of Tinker's format: number, name, x, y, z, type, bonds")
+    return Atoms(names, [""] * len(names), [()] * len(names), position, None, cell, None, [])
+
+
+def _columns(path: Path, lines: list[str], first: int, what: str) -> tuple[list[str], np.ndarray]:
+    """Names and positions (n, 3) in the columns after the first of lines from number `first` on."""
     rows = [line.split() for line in lines]
-    what = "an atom of Tinker's format: number, name, x, y, z, type, bonds"
-    position = np.array([_numbers(path, k, [*row[2:5], *[""] * (5 - len(row))], what) for k, row in enumerate(rows, 1)])
-    cell = _cell(_numbers(path, 2, box.split(), "three edges and three angles")) if box else None
-    names = [row[1] for row in rows]
-    return Atoms(names, [""] * len(rows), [()] * len(rows), position, None, cell, None, [])
+    position = [_numbers(path, first + k, [*row[2:5], *[""] * (5 - len(row))], what) for k, row in enumerate(rows)]
+    return [row[1] for row in rows], np.reshape(position, (-1, 3))
 
 
 def _cssr(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
@@ -420,13 +422,10 @@ def _cssr_atoms(path: Path, lines: list[str]) -> Atoms:
         raise StructureError(
             str(path), [f"line 3 promises {head[0] if head else 'no'} atoms, {len(lines) - 4} are there: truncated?"]
         )
-    rows = [line.split() for line in lines[4 : 4 + int(head[0])]]
-    what = "an atom of a .cssr: number, name, x, y, z"
-    position = np.array([_numbers(path, k, [*row[2:5], *[""] * (5 - len(row))], what) for k, row in enumerate(rows, 5)])
+    names, position = _columns(path, lines[4 : 4 + int(head[0])], 5, "an atom of a .cssr: number, name, x, y, z")
     if head[1:2] != ["1"]:
         position = position @ cell
-    names = [row[1] for row in rows]
-    return Atoms(names, [""] * len(rows), [()] * len(rows), position.reshape(-1, 3), None, cell, None, [])
+    return Atoms(names, [""] * len(names), [()] * len(names), position, None, cell, None, [])
 
 
 def _cell(edges_and_angles: list[float]) -> np.ndarray:
