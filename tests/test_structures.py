@@ -449,6 +449,13 @@ def test_molecules_of_a_slanted_cell_are_made_whole_but_the_cell_is_refused(tmp_
     truth = Truth(["spce"] * 8, 6, cell=cell)
     text = xyz(wrapped(truth.atoms(), truth.cell), truth.cell)
     same_molecules(read(tmp_path, text, "a.xyz", periodic=False), truth, [SPECIES["spce"]], 1e-6)
+    atoms = wrapped(truth.atoms(), truth.cell)
+    plain = ase.Atoms([a[1] for a in atoms], [a[3] for a in atoms], cell=truth.cell, pbc=True)
+    for name in ("b.gro", "b.cif", "b.lmp"):
+        ase.io.write(tmp_path / name, plain, **({"format": "lammps-data", "masses": True} if name == "b.lmp" else {}))
+        found = read(tmp_path, (tmp_path / name).read_text(), name, periodic=False)
+        assert found.residual_max < 0.02
+        same_molecules(found, truth, [SPECIES["spce"]], 0.02)
     with pytest.raises(StructureError, match=r"angles .*°; only boxes with right angles are handled"):
         read(tmp_path, text, "a.xyz")
 
@@ -838,6 +845,7 @@ DAMAGED = {
     "no_box.gro": (cut(GRO, 14), r"promises 12 atoms and a box, 11 are there"),
     "box.gro": (cut(GRO, 14) + "1.4 1.5\n", r"line 15: expected the box, 3 or 9 numbers .*found '1.4 1.5'"),
     "nan.gro": (GRO.replace(GRO.splitlines()[4][20:28], "     nan"), r"atom 3 has a position that is not a finite"),
+    "nan_box.gro": (cut(GRO, 14) + "1.4 nan 1.4\n", r"its box has an edge that is not a finite number"),
     "empty.gro": ("", "holds no atoms"),
     "cut.pdb": (cryst1(WATERS.cell) + "\nATOM      1  O   HOH A   1       1.000   2.0\n", "ASE cannot read it"),
     "edges_only.pdb": ("CRYST1   14.000   15.000   16.000\n" + pdb(WATERS.atoms(), ""), "line 1: CRYST1 needs three"),

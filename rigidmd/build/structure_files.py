@@ -53,8 +53,8 @@ def read_atoms(path: Path, frame: int | None = None) -> Atoms:
     for what, values in (("position", atoms.position), ("cell", atoms.cell)):
         if values is not None and not np.isfinite(values).all():
             bad = int(np.argmin(np.isfinite(values).all(axis=1)))
-            owner = "its cell" if what == "cell" else f"atom {bad + 1}"
-            raise StructureError(str(path), [f"{owner} has a {what} that is not a finite number"])
+            owner = "its box has an edge" if what == "cell" else f"atom {bad + 1} has a position"
+            raise StructureError(str(path), [f"{owner} that is not a finite number"])
     return _without_placeholder(atoms)
 
 
