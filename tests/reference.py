@@ -8,8 +8,7 @@ import numpy as np
 KE = 138935.457644  # u Å³/ps² per e², CODATA 2018
 
 
-def nearest(d, edges):
-    return d if edges is None else d - edges * np.round(d / edges)
+AROUND = np.array(list(np.ndindex(5, 5, 5))) - 2
 
 
 def quintic(r, start, cutoff):
@@ -81,7 +80,13 @@ class Oracle:
     def __init__(self, system):
         scene = system.scene
         self.system = system
-        self.edges = np.array(system.space) if np.isfinite(system.space.volume) else None
+        self.edges = None
+        if np.isfinite(system.space.volume):
+            edges = np.zeros((3, 3))
+            edges[0, 0], edges[1, 1], edges[2, 2] = system.space[:3]
+            if len(system.space) > 3:
+                edges[1, 0], edges[2, 0], edges[2, 1] = system.space[3:]
+            self.edges = edges
         self.cutoff = system.cutoff
         usual = (
             0.6 * self.cutoff if scene.forces.truncation == "smooth_switch" else max(0.9 * self.cutoff, self.cutoff - 1)
@@ -99,6 +104,13 @@ class Oracle:
         arms = np.einsum("sij,sj->si", rotation[self.owner], self.offset) if len(rotation) else 0.0
         return position[self.owner] + arms
 
+    def distance(self, d):
+        """Shortest length of a displacement and its images: those of sites brought near one another, two boxes around."""
+        if self.edges is None:
+            return np.linalg.norm(d)
+        near = d - np.round(d @ np.linalg.inv(self.edges)) @ self.edges
+        return np.linalg.norm(near + AROUND @ self.edges, axis=1).min()
+
     def energy(self, position, rotation):
         """(lennard_jones, coulomb) in u Å²/ps²."""
         x = self.sites(position, rotation)
@@ -108,7 +120,7 @@ class Oracle:
             for j in range(i):
                 if self.owner[i] == self.owner[j]:
                     continue
-                r = np.linalg.norm(nearest(x[i] - x[j], self.edges))
+                r = self.distance(x[i] - x[j])
                 if r >= self.cutoff:
                     continue
                 if self.epsilon[i] > 0 and self.epsilon[j] > 0:

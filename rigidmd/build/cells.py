@@ -22,6 +22,28 @@ def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.tril(cell @ q), q.T
 
 
+def reduced(cell: np.ndarray) -> np.ndarray:
+    """The same lattice by a cell (3, 3) in standard orientation that leans by no more than half an edge."""
+    cell = cell.copy()
+    cell[2] -= np.rint(cell[2, 1] / cell[1, 1]) * cell[1]
+    cell[2] -= np.rint(cell[2, 0] / cell[0, 0]) * cell[0]
+    cell[1] -= np.rint(cell[1, 0] / cell[0, 0]) * cell[0]
+    return cell
+
+
+def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the cells (3, 3) of a lattice one with room for a long cut-off, and the rotation (3, 3) that it needs.
+
+    The cell as it is but for lean, if no edge of the upright brick gets longer by another choice of edges.
+    """
+    from ase.geometry import minkowski_reduce
+
+    own = reduced(cell)
+    other, turn = standard_rotation(minkowski_reduce(cell)[0])
+    other = reduced(other)
+    return (other, turn) if np.diag(other).min() > (1 + ORIENTED) * np.diag(own).min() else (own, np.eye(3))
+
+
 def right_angled(cell: np.ndarray) -> bool:
     """Whether the edges of a cell (3, 3) are at right angles to one another, as far as files tell."""
     unit = cell / np.linalg.norm(cell, axis=1)[:, None]

@@ -5,9 +5,11 @@ from math import inf
 import numpy as np
 
 from rigidmd.build.body import BodySystem, build_body
+from rigidmd.build.cells import angles_deg, right_angled
 from rigidmd.build.system import System, build
 from rigidmd.dynamics.odes import Solver
 from rigidmd.dynamics.schemes import Scheme
+from rigidmd.forces.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, Scene
@@ -75,8 +77,10 @@ def _molecules(system: System) -> str:
         f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
     )
     if system.space.volume < inf:
-        edges = " x ".join(f"{edge:.4f}" for edge in system.space)
-        lines.append(f"  box: {edges} Å, {system.density:.4f} g/cm³")
+        cell = cell_of(system.space)
+        edges = " x ".join(f"{edge:.4f}" for edge in np.linalg.norm(cell, axis=1))
+        angles = "" if right_angled(cell) else f", angles {', '.join(f'{x:.4g}' for x in angles_deg(cell))}°"
+        lines.append(f"  box: {edges} Å{angles}, {system.density:.4f} g/cm³")
     else:
         lines.append("  no box")
     lines += [f"  {note}" for note in system.notes]

@@ -3,9 +3,8 @@
 import numpy as np
 
 
-def lattice(n: int, edges: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
-    """n points (n, 3) in a box with these edges, on a nearly cubic lattice; which of its places is drawn at random."""
-    edges = np.asarray(edges)
+def lattice(n: int, edges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """n points (n, 3) in an upright box with edges (3,), on a nearly cubic lattice; its places are drawn at random."""
     shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
     while shape.prod() < n:
         shape[np.argmax(edges / shape)] += 1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.cells import angles_deg, right_angled, standard_rotation
+from rigidmd.build.cells import angles_deg, reduced, right_angled, roomiest, standard_rotation
 from rigidmd.build.matching import Matched, massive, match
 from rigidmd.build.structure_files import Atoms, read_atoms
 from rigidmd.errors import StructureError
@@ -37,7 +37,7 @@ class Arrangement(NamedTuple):
 def read_structure(
     path: Path,
     species: list[Molecule],
-    edges: tuple[float, float, float] | None,
+    wanted: np.ndarray | None,
     periodic: bool,
     tolerance: float,
     frame: int | None = None,
@@ -45,27 +45,48 @@ def read_structure(
 ) -> Arrangement:
     """The molecules of a structure file. Raises StructureError.
 
-    edges: those the scene asks for, or None to take the file's. tolerance, frame, repeat: see Scene.structure.
+    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat: see
+    Scene.structure.
     """
     if path.suffix == ".npz":
         if frame is not None:
             raise StructureError(str(path), ["holds one state: leave out structure.frame"])
         found = _read_state(path, species)
-        if periodic and edges is None:
+        if periodic and wanted is None:
             _check_box(path, found.cell, [])
     else:
-        found = _read_molecules(path, species, edges, periodic, tolerance, frame)
+        found = _read_molecules(path, species, wanted, periodic, tolerance, frame)
     notes = list(found.notes)
     if not periodic:
         cell = None
-    elif edges is not None:
-        cell = np.diag(edges).astype(float)
+    elif wanted is not None:
+        cell = wanted
         if found.cell is not None and np.abs(found.cell - cell).max() > SAME_BOX * cell.max():
             notes.append("the scene's box counts, not that of the file")
     else:
         cell = found.cell
     found = found._replace(cell=cell, notes=tuple(notes))
-    return found if repeat == (1, 1, 1) else _repeated(found, repeat)
+    if repeat != (1, 1, 1):
+        found = _repeated(found, repeat)
+    return found if found.cell is None else _reduced(found, wanted is None)
+
+
+def _reduced(found: Arrangement, may_turn: bool) -> Arrangement:
+    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off."""
+    cell, turn = roomiest(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
+    if np.array_equal(cell, found.cell):
+        return found
+    lengths, angles = (np.linalg.norm(cell, axis=1), angles_deg(cell))
+    told = f"edges {', '.join(f'{x:.4f}' for x in lengths)} Å, angles {', '.join(f'{x:.4g}' for x in angles)}°"
+    if np.array_equal(turn, np.eye(3)):
+        return found._replace(cell=cell, notes=(*found.notes, f"its lattice is described by the cell with {told}"))
+    return found._replace(
+        cell=cell,
+        position=found.position @ turn.T,
+        rotation=turn @ found.rotation,
+        velocity=None if found.velocity is None else found.velocity @ turn.T,
+        notes=(*found.notes, f"its lattice is described by the cell with {told}, turned, contents included"),
+    )
 
 
 def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
@@ -86,7 +107,7 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
     )
 
 
-def _read_molecules(path: Path, species, edges, periodic: bool, tolerance: float, frame) -> Arrangement:
+def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: float, frame) -> Arrangement:
     atoms = read_atoms(path, frame)
     notes = list(atoms.notes)
     if atoms.cell is not None:
@@ -96,9 +117,9 @@ def _read_molecules(path: Path, species, edges, periodic: bool, tolerance: float
             atoms = atoms._replace(position=atoms.position @ turn.T, velocity=velocity)
             notes.append("its cell was turned, contents included, so that a is along x and b in the xy plane")
         atoms = atoms._replace(cell=np.diag(np.linalg.norm(cell, axis=1)) if right_angled(cell) else cell)
-    if periodic and edges is None:
+    if periodic and wanted is None:
         _check_box(path, atoms.cell, notes)
-    across = atoms.cell if atoms.cell is not None or edges is None or not periodic else np.diag(edges)
+    across = atoms.cell if atoms.cell is not None or not periodic else wanted
     matched = match(atoms, species, across, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
@@ -120,19 +141,10 @@ def _read_molecules(path: Path, species, edges, periodic: bool, tolerance: float
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
-    """Refuse a start without a box, or in one that the forces cannot be computed in."""
+    """Refuse a start without a box."""
     if cell is None:
         told = f" ({'; '.join(notes)})" if notes else ""
         raise StructureError(str(path), [f"has no box{told}: give [box] lengths_A, or periodic = false"])
-    if not right_angled(cell):
-        angles = ", ".join(f"{angle:.4g}" for angle in angles_deg(cell))
-        raise StructureError(
-            str(path),
-            [
-                f"its cell has angles {angles}°; only boxes with right angles are handled: give [box] lengths_A for "
-                "another box, or periodic = false"
-            ],
-        )
 
 
 def _massless(matched: Matched, species: list[Molecule]) -> list[str]:
@@ -200,7 +212,7 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
             names = [str(name) for name in data["species_names"]]
             arrays = {
                 key: data[key]
-                for key in ("species", "position", "velocity", "rotation", "angular_momentum_body", "edges")
+                for key in ("species", "position", "velocity", "rotation", "angular_momentum_body", "cell")
             }
     except FileNotFoundError:
         raise StructureError(str(path), ["there is no such file"]) from None
@@ -211,10 +223,10 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
         raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
     n = len(arrays["species"])
     turning = len(arrays["rotation"]) > 0
-    shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "edges": (3,)}
+    shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3)}
     shapes |= {"rotation": (n, 3, 3), "angular_momentum_body": (n, 3)} if turning else {}
     bad = [k for k, shape in shapes.items() if arrays[k].shape != shape or arrays[k].dtype.kind not in "fi"]
-    bad += [k for k, a in arrays.items() if k not in (*bad, "edges") and not np.isfinite(a).all()]
+    bad += [k for k, a in arrays.items() if k not in (*bad, "cell") and not np.isfinite(a).all()]
     if not bad and (arrays["species"].dtype.kind != "i" or not np.isin(arrays["species"], np.arange(len(names))).all()):
         bad.append("species")
     if not bad and orthogonality_error(arrays["rotation"]) > NOT_A_ROTATION:
@@ -227,7 +239,7 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
         rotation=arrays["rotation"] if turning else np.tile(np.eye(3), (n, 1, 1)),
         velocity=arrays["velocity"],
         angular_momentum_body=arrays["angular_momentum_body"] if turning else np.zeros((n, 3)),
-        cell=None if np.isinf(arrays["edges"]).all() else np.diag(arrays["edges"]).astype(float),
+        cell=arrays["cell"] if np.isfinite(arrays["cell"]).all() else None,
         residual_rms=0.0,
         residual_max=0.0,
     )

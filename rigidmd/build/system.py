@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.build.cells import reduced
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
 from rigidmd.build.structure import Arrangement, read_structure
@@ -17,7 +18,7 @@ from rigidmd.forces.coulomb import reaction_field, self_energy
 from rigidmd.forces.lennard_jones import lennard_jones, tail
 from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.sites import BodySites, CentralSites
-from rigidmd.forces.space import Orthorhombic, Space, Unbounded
+from rigidmd.forces.space import Space, cell_of, fractions, heights, space_of, wrap
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
@@ -89,10 +90,7 @@ class System:
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
-        centre = state.position
-        if wrapped and self.space.volume < inf:
-            edges = np.array(self.space)
-            centre = centre - edges * np.floor(centre / edges)
+        centre = wrap(self.space, state.position) if wrapped else state.position
         return centre[self.sites.molecule] + self._arms(state)
 
     def site_velocities(self, state: State) -> np.ndarray:
@@ -114,7 +112,7 @@ def build(scene: MolecularScene) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
     species = _species(scene)
     arrangement = _arrange(scene, species)
-    space = Unbounded() if arrangement.cell is None else Orthorhombic(*map(float, np.diag(arrangement.cell)))
+    space = space_of(arrangement.cell)
     cutoff = _cutoff(scene, space, species)
     frozen = np.array([entry.frozen for entry in scene.molecules])
     if frozen[arrangement.species].all():
@@ -222,7 +220,7 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         path = scene.path(scene.structure.file)
         start = scene.structure
         found = read_structure(
-            path, species, scene.box.edges, scene.box.periodic, start.tolerance, start.frame, start.repeat
+            path, species, scene.box.cell, scene.box.periodic, start.tolerance, start.frame, start.repeat
         )
         faults = []
         for k, entry in enumerate(scene.molecules):
@@ -237,16 +235,18 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         return found
     counts = [entry.count for entry in scene.molecules]
     mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
-    edges = scene.box.edges or (float(np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))),) * 3
+    cell = scene.box.cell
+    if cell is None:
+        cell = np.eye(3) * np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))
     rng = np.random.default_rng([scene.seed, STREAM_LATTICE])
     n = sum(counts)
     return Arrangement(
         species=np.repeat(np.arange(len(species)), counts),
-        position=lattice(n, edges, rng),
+        position=lattice(n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
         velocity=None,
         angular_momentum_body=None,
-        cell=np.diag(edges).astype(float) if scene.box.periodic else None,
+        cell=reduced(cell) if scene.box.periodic else None,
         residual_rms=0.0,
         residual_max=0.0,
     )
@@ -256,7 +256,7 @@ def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> flo
     forces = scene.forces
     cutoff = forces.cutoff_A or (DEFAULT_CUTOFF if space.volume < inf else inf)
     faults = []
-    half = min(space) / 2
+    half = min(space.edges) / 2
     if cutoff > half:
         given = "" if forces.cutoff_A else " (the default)"
         faults.append(
@@ -454,16 +454,26 @@ def close_pairs(system: System, state: State, radius: float) -> list[tuple[int, 
     """Sites (i, j) of different molecules, not both frozen, no further apart than `radius`; their distances, Å."""
     from scipy.spatial import cKDTree
 
-    positions, edges = system.site_positions(state), None
+    positions = system.site_positions(state)
+    images, source = positions, np.arange(len(positions))
     if system.space.volume < inf:
-        edges = np.array(system.space)
-        positions = np.mod(positions, edges)
-        positions[positions >= edges] = 0.0
-    found = cKDTree(positions, boxsize=edges).query_pairs(radius, output_type="ndarray")
-    a, b = system.sites.molecule[found].T
-    free = mobile(system.model)
-    found = found[(a != b) & (free[a] | free[b])]
-    step = positions[found[:, 0]] - positions[found[:, 1]]
-    if edges is not None:
-        step -= edges * np.round(step / edges)
-    return sorted((int(i), int(j), float(d)) for (i, j), d in zip(found, np.linalg.norm(step, axis=1), strict=True))
+        positions = wrap(system.space, positions)
+        images, source = _images(system.space, positions, radius)
+    found = cKDTree(positions).sparse_distance_matrix(cKDTree(images), radius, output_type="ndarray")
+    i, j = found["i"], source[found["j"]]
+    a, b, free = system.sites.molecule[i], system.sites.molecule[j], mobile(system.model)
+    kept = (i < j) & (a != b) & (free[a] | free[b])
+    return sorted(zip(i[kept].tolist(), j[kept].tolist(), found["v"][kept].tolist(), strict=True))
+
+
+def _images(space: Space, positions: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Images (m, 3) of positions (s, 3) in the cell within a radius of it, and which position (m,) each is of."""
+    margin = radius / heights(space)
+    part = fractions(space, positions)
+    found, source = [], []
+    for image in np.ndindex(3, 3, 3):
+        there = part + np.array(image) - 1
+        near = np.flatnonzero(((there > -margin) & (there < 1 + margin)).all(axis=1))
+        found.append(positions[near] + (np.array(image) - 1) @ cell_of(space))
+        source.append(near)
+    return np.concatenate(found), np.concatenate(source)

@@ -74,6 +74,28 @@ def cell_of(space: Space) -> np.ndarray:
     return cell
 
 
+def wrap(space: Space, position: np.ndarray) -> np.ndarray:
+    """Positions (n, 3) moved by whole edges into the cell; as they are where there is none."""
+    if isinstance(space, Unbounded):
+        return position
+    return position - np.floor(fractions(space, position)) @ cell_of(space)
+
+
+def fractions(space: Space, position: np.ndarray) -> np.ndarray:
+    """Positions (n, 3) of a periodic box as fractions (n, 3) of its edges a, b, c."""
+    cell = cell_of(space)
+    x, y, z = position.T
+    c = z / cell[2, 2]
+    b = (y - c * cell[2, 1]) / cell[1, 1]
+    a = (x - b * cell[1, 0] - c * cell[2, 0]) / cell[0, 0]
+    return np.stack([a, b, c], axis=1)
+
+
+def heights(space: Space) -> np.ndarray:
+    """Distances (3,) between opposite faces of the cell, Å."""
+    return 1 / np.linalg.norm(np.linalg.inv(cell_of(space)), axis=0)
+
+
 def fill_cell(space, cell):
     """Write the cell matrix (3, 3), rows the edges a, b, c, into an array; whether it has changed."""
     raise TypeError("compiled code only")

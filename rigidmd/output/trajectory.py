@@ -11,8 +11,10 @@ import numpy as np
 from MDAnalysis.coordinates.memory import MemoryReader
 
 from rigidmd.build.body import BodySystem
+from rigidmd.build.cells import angles_deg
 from rigidmd.build.system import System
 from rigidmd.errors import SimulationError
+from rigidmd.forces.space import cell_of
 from rigidmd.forces.terms import State
 from rigidmd.output.folder import whole_file
 
@@ -54,7 +56,10 @@ def set_frame(
 
 def dimensions(system: System | BodySystem) -> list[float] | None:
     """Box as MDAnalysis wants it; None without one."""
-    return [*system.space, 90.0, 90.0, 90.0] if system.space.volume < inf else None
+    if system.space.volume == inf:
+        return None
+    cell = cell_of(system.space)
+    return [*np.linalg.norm(cell, axis=1), *angles_deg(cell)]
 
 
 def in_memory(system: System | BodySystem, times: list[float], positions: list[np.ndarray]) -> mda.Universe:
@@ -138,9 +143,11 @@ class TrajectoryFile:
 
     def _extended_xyz(self, time: float) -> str:
         """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
-        box = dimensions(self._system)
-        cell = f'Lattice="{box[0]:.9g} 0 0 0 {box[1]:.9g} 0 0 0 {box[2]:.9g}" pbc="T T T" ' if box else 'pbc="F F F" '
-        return f"{cell}Properties=species:S:1:pos:R:3 Time={time:.9g}"
+        box = 'pbc="F F F"'
+        if self._system.space.volume < inf:
+            edges = " ".join(f"{x:.9g}" for x in cell_of(self._system.space).flat)
+            box = f'Lattice="{edges}" pbc="T T T"'
+        return f"{box} Properties=species:S:1:pos:R:3 Time={time:.9g}"
 
     def close(self) -> None:
         """Finish the file."""

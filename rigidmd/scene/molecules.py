@@ -1,9 +1,10 @@
 """The scene of molecules: species, box, forces, stages."""
 
-from math import inf
+from math import cos, inf, pi, radians, sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.dynamics.schemes import AUTO, SCHEMES, Rotor, Scheme, auto_faults, rotor_fault
@@ -19,6 +20,7 @@ TOPOLOGY_FORMATS = (".gro", ".pdb")
 MOST_STEPS = 1e12
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
+Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 
 
@@ -43,6 +45,8 @@ class Box(Section):
 
     lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
     """Edges; one number for a cube"""
+    angles_deg: tuple[Angle, Angle, Angle] | None = None
+    """Angles between b and c, c and a, a and b; right angles when not given"""
     density_g_cm3: Positive | None = None
     """Mass density, from which the edge of a cube follows"""
     periodic: Flag = True
@@ -52,14 +56,27 @@ class Box(Section):
     def _one_size(self):
         if self.lengths_A is not None and self.density_g_cm3 is not None:
             raise ValueError("give lengths_A or density_g_cm3, not both")
+        if self.angles_deg is not None and self.lengths_A is None:
+            raise ValueError("angles_deg needs lengths_A")
+        if self.angles_deg is not None and not _span_a_volume(*map(radians, self.angles_deg)):
+            raise ValueError("angles_deg: three edges cannot stand at these angles")
         return self
 
     @property
-    def edges(self) -> tuple[float, float, float] | None:
-        """Edges in Å, or None where the scene does not say."""
-        if self.lengths_A is None or isinstance(self.lengths_A, tuple):
-            return self.lengths_A
-        return (self.lengths_A,) * 3
+    def cell(self) -> np.ndarray | None:
+        """Rows (3, 3) a along x, b in the xy plane and c, Å; None where the scene does not say."""
+        if self.lengths_A is None:
+            return None
+        a, b, c = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
+        alpha, beta, gamma = (0.0 if angle == 90 else cos(radians(angle)) for angle in self.angles_deg or (90,) * 3)
+        across = sqrt(1 - gamma**2)
+        y = (alpha - beta * gamma) / across
+        return np.array([[a, 0, 0], [b * gamma, b * across, 0], [c * beta, c * y, c * sqrt(1 - beta**2 - y**2)]])
+
+
+def _span_a_volume(alpha: float, beta: float, gamma: float) -> bool:
+    """Whether edges at these angles to one another (radians) can stand, and not in one plane."""
+    return 2 * max(alpha, beta, gamma) < alpha + beta + gamma < 2 * pi
 
 
 class Molecules(Section):

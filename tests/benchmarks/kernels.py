@@ -3,8 +3,8 @@
     python tests/benchmarks/kernels.py --workloads W1,W3 --bits 512,256,128
 
 The liquids are W1 and W3 of peers.py. A lane is one site of a vector that meets another site; it is useful if the two
-are inside the cut-off and act on one another. Times are the fastest of many calls, since other programs can only add to them; each width runs in a process of its own, since it is
-chosen when the package is imported.
+are inside the cut-off and act on one another. Times are the shortest of many calls, since other programs can only add
+to them; each width runs in a process of its own, since it is chosen when the package is imported.
 """
 
 import argparse

@@ -225,14 +225,14 @@ def write_start(folder: Path, work: Workload, position, velocity, rotation, mome
     """A state as `[structure] file` reads it (output/state.py); the box is that of the workload unless given."""
     names = [work.molecules.get("model") or work.molecules["name"]]
     np.savez(folder / "start.npz", species_names=np.array(names), species=np.zeros(len(position), np.int64),
-             edges=np.full(3, edge or work.edge), position=position, velocity=velocity, rotation=rotation,
+             cell=np.eye(3) * (edge or work.edge), position=position, velocity=velocity, rotation=rotation,
              angular_momentum_body=momentum_body)  # fmt: skip
 
 
 def start_of(name: str, source: str) -> Start:
     """The start of a workload, made or taken once and then kept in the cache folder."""
     work = WORKLOADS[name]
-    digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES}".encode()).hexdigest()[:8]
+    digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES} cell".encode()).hexdigest()[:8]
     folder = Path(CACHE_FOLDER).parent / "peers" / f"{name}-{source}-{digest}"
     if not (folder / "start.npz").is_file():
         print(f"{name}: making the start, kept in {folder}", flush=True)
