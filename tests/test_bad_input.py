@@ -11,7 +11,7 @@ from conftest import ROOT, small_scene
 from rigidmd.build.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError, SimulationError, StructureError
-from rigidmd.molecules import Site, available_models, load_model, molecule
+from rigidmd.molecules import Site, load_model, molecule
 from rigidmd.scene import Scene, parse_override
 from rigidmd.simulation import Simulation
 
@@ -240,27 +240,6 @@ def test_sites_that_make_no_body(sites, expected):
         molecule(
             "x", tuple(Site(name=f"A{k}", mass_u=m, position_A=tuple(map(float, x))) for k, (m, x) in enumerate(sites))
         )
-
-
-def test_every_model_is_what_it_says():
-    assert available_models() == ["argon", "nitrogen", "spce", "tip3p", "tip4p2005"]
-    kinds = {name: load_model(name).kind for name in available_models()}
-    assert kinds == {
-        "argon": "point",
-        "nitrogen": "linear",
-        "spce": "asymmetric",
-        "tip3p": "asymmetric",
-        "tip4p2005": "asymmetric",
-    }
-    dipoles = {"spce": 2.351, "tip3p": 2.347, "tip4p2005": 2.305}  # debye, as published
-    for name, dipole in dipoles.items():
-        found = load_model(name)
-        assert found.dipole_debye == pytest.approx(dipole, abs=2e-3)
-        assert found.charge == 0
-        assert found.mass == pytest.approx(18.0154)
-        o, h1, h2 = found.positions_body[:3]
-        angle = np.degrees(np.arccos((h1 - o) @ (h2 - o) / np.linalg.norm(h1 - o) / np.linalg.norm(h2 - o)))
-        assert angle == pytest.approx(109.47 if name == "spce" else 104.52)
 
 
 # structure files
