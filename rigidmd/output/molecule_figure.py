@@ -77,10 +77,13 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
         weight="bold",
         va="top",
     )
-    moments = f"; moments {' '.join(f'{x:.4g}' for x in m.inertia)} u Å²" if m.radius > 0 else ""
-    figure.text(0.03, 0.94, f"{m.name}: {m.words}{moments}", color=INK, fontsize=FONT, va="top")
-    told = "; discs: Lennard-Jones diameters" + ("; diamonds: massless sites" if (m.masses == 0).any() else "")
-    figure.text(0.03, 0.917, short_source(m) + told, color=FAINT, fontsize=FONT, va="top")
+    told = [f"{m.name}: {m.words}"]
+    if m.radius > 0:
+        told.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
+    told.append(short_source(m))
+    told[-1] += "; discs: Lennard-Jones diameters" if (m.epsilon > 0).any() else ""
+    told[-1] += "; diamonds: massless sites" if (m.masses == 0).any() else ""
+    figure.text(0.03, 0.942, "\n".join(told), color=INK, fontsize=FONT, va="top", linespacing=1.35)
     with rc_context({"svg.hashsalt": m.name}), whole_file(path) as temporary:
         figure.savefig(temporary, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
 
@@ -160,7 +163,7 @@ def _sphere(axes, m: Molecule, i: int, sphere: _Sphere) -> None:
 
 
 def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tuple]:
-    """Arrows along the axes, a ring for one that points at the viewer; the boxes of their labels."""
+    """Arrows along the axes, a ring for one that points at the viewer; the boxes that no label shall cover."""
     if m.radius == 0:
         return []
     taken = []
@@ -177,6 +180,7 @@ def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tu
         at = tip[:2] + 0.04 * half * tip[:2] / np.linalg.norm(tip[:2])
         axes.text(*at, str(k + 1), color=INK, fontsize=FONT, ha="center", va="center", style="italic", zorder=8)
         taken.append((*(at - 0.03 * half), *(at + 0.03 * half)))
+        taken += [(*x, *x) for x in np.linspace(0, 1, 30)[:, None] * tip[:2]]
     return taken
 
 
