@@ -59,11 +59,11 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half))
     axes.set_axis_off()
     _diameters(axes, m, spheres)
-    _links(axes, m, seen, spheres)
+    bonded = _links(axes, m, seen, spheres)
     for i in np.argsort(seen[:, 2], kind="stable"):
         _sphere(axes, m, i, spheres[i])
     taken = _principal_axes(axes, m, view, half)
-    _labels(axes, m, spheres, half, taken)
+    _labels(axes, m, spheres, half, taken + bonded)
     length = 1.0 if half > 1.6 else 0.5
     corner = np.array([-0.96, -0.95]) * half
     axes.plot(corner[0] + np.array([0, length]), [corner[1]] * 2, color=INK, lw=2, solid_capstyle="butt")
@@ -81,6 +81,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     if m.radius > 0:
         told.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
     told.append(short_source(m))
+    told[-1] += "; charges in e" if m.charges.any() else ""
     told[-1] += "; discs: Lennard-Jones diameters" if (m.epsilon > 0).any() else ""
     told[-1] += "; diamonds: massless sites" if (m.masses == 0).any() else ""
     figure.text(0.03, 0.942, "\n".join(told), color=INK, fontsize=FONT, va="top", linespacing=1.35)
@@ -124,8 +125,9 @@ def _diameters(axes, m: Molecule, spheres: list[_Sphere]) -> None:
         )
 
 
-def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> None:
-    """Bonds from surface to surface."""
+def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[tuple]:
+    """Bonds from surface to surface; points of them that no label shall cover."""
+    taken = []
     for i, j in bonds(m):
         if m.masses[j] == 0:
             axes.plot(*seen[[i, j], :2].T, color=FAINT, lw=1.0, zorder=_order(seen[j, 2]) - 0.01)
@@ -134,6 +136,8 @@ def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> None:
         ends = np.array([seen[i] + 0.9 * spheres[i].radius * along, seen[j] - 0.9 * spheres[j].radius * along])
         for colour, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
             axes.plot(*ends[:, :2].T, color=colour, lw=width, solid_capstyle="butt", zorder=_order(ends[:, 2].mean()))
+        taken += [(*x, *x) for x in np.linspace(*ends[:, :2], 12)]
+    return taken
 
 
 def _order(depth: float) -> float:
