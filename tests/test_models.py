@@ -138,6 +138,7 @@ def test_geometry_mass_and_dipole_are_the_published_ones(name):
     kind, freedom, mass, (dipole, within), lengths, angles = MODEL_TABLE[name]
     m = load_model(name)
     assert (m.kind, m.degrees_of_freedom) == (kind, freedom)
+    assert m.planar == (name == "benzene_opls" or (kind == "asymmetric" and name != "tip5p"))
     assert m.mass == pytest.approx(mass, abs=2e-4)
     assert m.dipole_debye == pytest.approx(dipole, abs=within)
     for (a, b), length in lengths.items():
