@@ -538,6 +538,19 @@ def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
     assert (tmp_path / "again.svg").read_text() == text
 
 
+def test_a_molecule_of_ones_own_is_shown_and_drawn(tmp_path, capsys):
+    """Whatever its sites are called: names are no formulas."""
+    sites = "".join(
+        f'[[sites]]\nname = "{name}"\nmass_u = 3.0\nposition_A = [0, 0, {12.0 * k}]\n'
+        for k, name in enumerate(("A$b$", "B_{"))
+    )
+    (tmp_path / "odd.toml").write_text(f'name = "odd"\ntitle = "$x"\n{sites}charge_e = 1.5\n')
+    assert main(["models", str(tmp_path / "odd.toml")]) == 0
+    assert "net charge +1.5 e, dipole 43.229 D" in capsys.readouterr().out
+    assert main(["models", str(tmp_path / "odd.toml"), "-o", str(tmp_path / "odd.svg")]) == 0
+    assert "<!-- A$b$ -->" in (tmp_path / "odd.svg").read_text()
+
+
 def test_bonds_are_those_of_chemistry_and_join_everything():
     def named(name):
         m = load_model(name)

@@ -68,23 +68,19 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     corner = np.array([-0.96, -0.95]) * half
     axes.plot(corner[0] + np.array([0, length]), [corner[1]] * 2, color=INK, lw=2, solid_capstyle="butt")
     axes.text(corner[0], corner[1] + 0.03 * half, f"{length:g} Å", color=INK, fontsize=FONT, ha="left", va="bottom")
-    figure.text(
-        0.03,
-        0.975,
-        m.title or m.name,
-        color=INK,
-        fontsize=min(13, 780 / len(m.title or m.name)),
-        weight="bold",
-        va="top",
-    )
+    title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
+    figure.text(0.03, 0.975, title, fontsize=min(13.0, 780 / len(title)), weight="bold", **plain)
     told = [f"{m.name}: {m.words}"]
     if m.radius > 0:
         told.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
-    told.append(short_source(m))
-    told[-1] += "; charges in e" if m.charges.any() else ""
-    told[-1] += "; discs: Lennard-Jones diameters" if (m.epsilon > 0).any() else ""
-    told[-1] += "; diamonds: massless sites" if (m.masses == 0).any() else ""
-    figure.text(0.03, 0.942, "\n".join(told), color=INK, fontsize=FONT, va="top", linespacing=1.35)
+    legend = [
+        (short_source(m), bool(m.source)),
+        ("charges in e", m.charges.any()),
+        ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()),
+        ("diamonds: massless sites", (m.masses == 0).any()),
+    ]
+    told.append("; ".join(text for text, there in legend if there))
+    figure.text(0.03, 0.942, "\n".join(told), fontsize=FONT, linespacing=1.35, **plain)
     with rc_context({"svg.hashsalt": m.name}), whole_file(path) as temporary:
         figure.savefig(temporary, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
 
@@ -194,7 +190,8 @@ def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[
     for i in sorted(range(len(spheres)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(spheres[i].centre))):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]
         size = np.array([0.56 * height * len(text), height])
-        outward = np.arctan2(*spheres[i].centre[::-1]) if np.linalg.norm(spheres[i].centre) > 1e-6 else -np.pi / 2
+        x, y = spheres[i].centre
+        outward = np.arctan2(y, x) if np.hypot(x, y) > 1e-6 * half else -np.pi / 2
         best = None
         for gap in (0.02, 0.08, 0.16, 0.26, 0.38, 0.52):
             for turn in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6, 7, -7, 8):
@@ -213,7 +210,8 @@ def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[
         if gap > 0.02:
             near = np.clip(spheres[i].centre, box[:2], box[2:])
             axes.plot(*np.array([spheres[i].centre, near]).T, color=FAINT, lw=0.7, zorder=6.4)
-        axes.text(*centre, text, color=INK, fontsize=FONT, ha="center", va="center", zorder=9)
+        style = {"color": INK, "fontsize": FONT, "ha": "center", "va": "center", "parse_math": False}
+        axes.text(*centre, text, zorder=9, **style)
 
 
 def _overlap(one: tuple, other: tuple) -> bool:
