@@ -308,7 +308,7 @@ def model_fault(name: str) -> str:
     known = available_models()
     if name in known:
         return ""
-    near = [model for model in known if model.startswith(name)] or difflib.get_close_matches(name, known, 3, 0.4)
+    near = [model for model in known if model.startswith(name)] or difflib.get_close_matches(name, known, 1, 0.4)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return f"there is no model {name!r}; {hint}`rigidmd models` lists all {len(known)}"
 
