@@ -109,7 +109,17 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--force", action="store_true", help="replace earlier results in that folder")
     stability.set_defaults(scene="stability")
 
-    _command(commands, "models", _models, "list the molecules that come with rigidmd", "rigidmd models")
+    models = _command(
+        commands,
+        "models",
+        _models,
+        "list the molecules that come with rigidmd, or show or draw one",
+        "rigidmd models tip4p2005 --draw -o water.svg",
+    )
+    models.add_argument("model", nargs="?", metavar="NAME", help="show this one; or a .toml file with one of your own")
+    models.add_argument("--draw", action="store_true", help="draw it, into NAME.png")
+    models.add_argument("-o", "--output", metavar="FILE", help="the picture: .png, .svg or .pdf")
+    models.add_argument("--force", action="store_true", help="replace that file")
     _command(
         commands,
         "schema",
@@ -307,18 +317,27 @@ def _stability(options: argparse.Namespace) -> int:
 
 
 def _models(options: argparse.Namespace) -> int:
-    from rigidmd.molecules import available_models, load_model
+    from rigidmd.errors import MoleculeError
+    from rigidmd.molecules import available_models, load_model, read_molecule
+    from rigidmd.output.molecule_report import models_table, molecule_text
 
-    for name in available_models():
-        m = load_model(name)
-        moments = " ".join(f"{x:.4f}" for x in m.inertia)
-        print(f"{name:<12}{m.title}")
-        sites = f"{len(m.masses)} sites ({' '.join(m.site_names)})"
-        print(f"{'':<12}{sites}, {m.kind}, {m.mass:.4f} u, inertia {moments} u Å²")
-        if m.charges.any():
-            charges = " ".join(f"{q:+.4f}" for q in m.charges)
-            print(f"{'':<12}charges {charges} e, dipole {m.dipole_debye:.3f} D")
-        print(f"{'':<12}{m.source}")
+    draws = options.draw or options.output is not None
+    if options.model is None:
+        if draws:
+            raise MoleculeError("models", ["--draw and -o need the NAME of a model"])
+        print(models_table([load_model(name) for name in available_models()]))
+        print("\n`rigidmd models NAME` shows one in full, with --draw in a picture")
+        return 0
+    own = options.model.endswith(".toml")
+    found = read_molecule(Path(options.model)) if own else load_model(options.model)
+    if not draws:
+        print(molecule_text(found))
+        return 0
+    from rigidmd.output.molecule_figure import draw_molecule
+
+    path = Path(options.output or f"{Path(options.model).stem}.png")
+    draw_molecule(path, found, options.force)
+    print(f"{found.name} is drawn in {path}")
     return 0
 
 

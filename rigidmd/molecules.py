@@ -1,16 +1,17 @@
 """Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds the published ones."""
 
+import difflib
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import Kind, principal_frame, rotational_freedom
-from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 from rigidmd.validation import NonNegative, Number, Positive, Section, Vector, faults_of
 
 MODELS = Path(__file__).parent / "models"
@@ -20,6 +21,10 @@ SAME_PLACE = 1e-6
 #: A site further than this fraction of the size from a linear body's axis would turn it about an axis without inertia.
 OFF_AXIS = 1e-4
 
+
+#: Keys of a site that come together.
+DEPTHS = ("epsilon_kJ_mol", "epsilon_kcal_mol", "epsilon_K")
+LENNARD_JONES = ("sigma_A", *DEPTHS)
 
 #: Names of sites and residues as every structure format can hold them: one to five visible ASCII characters.
 SiteName = Annotated[str, Field(pattern=r"^[!-~]{1,5}$")]
@@ -36,28 +41,37 @@ class Site(Section):
     """Mass; 0 for a massless site. With `file`, taken from the element when not given"""
     position_A: Vector | None = None
     """Position in any frame fixed in the molecule; taken from `file` where there is one"""
-    charge_e: Number = 0.0
-    """Charge in elementary charges"""
+    charge_e: Number | None = None
+    """Charge in elementary charges; none when not given"""
     sigma_A: Positive | None = None
     """Lennard-Jones diameter"""
     epsilon_kJ_mol: NonNegative | None = None
     """Lennard-Jones well depth"""
+    epsilon_kcal_mol: NonNegative | None = None
+    """Lennard-Jones well depth in the other unit of the field; 1 kcal is 4.184 kJ"""
     epsilon_K: NonNegative | None = None
     """Lennard-Jones well depth over Boltzmann's constant"""
 
     @model_validator(mode="after")
     def _lennard_jones_is_whole(self):
-        given = [self.epsilon_kJ_mol is not None, self.epsilon_K is not None]
-        if sum(given) > 1:
-            raise ValueError("give epsilon_kJ_mol or epsilon_K, not both")
-        if any(given) != (self.sigma_A is not None):
-            raise ValueError("a Lennard-Jones site needs both sigma_A and one of epsilon_kJ_mol, epsilon_K")
+        given = [key for key in DEPTHS if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give one of {', '.join(given)}, not {'both' if len(given) == 2 else 'all'}")
+        if bool(given) != (self.sigma_A is not None):
+            raise ValueError(f"a Lennard-Jones site needs both sigma_A and one of {', '.join(DEPTHS)}")
         return self
 
     @property
     def epsilon(self) -> float:
         """Well depth in u Å²/ps²; 0 without one."""
-        return (self.epsilon_kJ_mol or 0.0) * KJ_PER_MOL + (self.epsilon_K or 0.0) * BOLTZMANN
+        kilojoules, kilocalories = (self.epsilon_kJ_mol or 0.0), (self.epsilon_kcal_mol or 0.0)
+        return kilojoules * KJ_PER_MOL + kilocalories * ENERGY_UNITS["kcal/mol"] + (self.epsilon_K or 0.0) * BOLTZMANN
+
+
+Mixing = Literal["lorentz-berthelot", "geometric"]
+
+#: In this order `rigidmd models` lists them.
+GROUPS = ("water", "ion", "noble gas", "gas", "organic", "other")
 
 
 class MoleculeFile(Section):
@@ -65,9 +79,25 @@ class MoleculeFile(Section):
 
     name: str = Field(min_length=1)
     title: str = ""
+    group: Literal[GROUPS] = "other"  # type: ignore[valid-type]
+    """Among which `rigidmd models` lists it"""
     source: str = ""
+    """Where the numbers come from"""
+    note: str = ""
+    """What else its user has to know"""
+    mixing: Mixing | None = None
+    """The mixing rule it was made with, where its sites have parameters of several kinds"""
     residue_names: tuple[SiteName, ...] = ()
     sites: tuple[Site, ...] = Field(min_length=1)
+
+
+class ParameterFile(Section):
+    """A table of parameters that several molecules may share: what a scene's `parameters` names."""
+
+    title: str = ""
+    source: str = ""
+    sites: tuple[Site, ...] = Field(min_length=1)
+    """By a site's name, or else its element"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +122,9 @@ class Molecule:
     mass: float
     inertia: np.ndarray
     kind: Kind
+    group: str = "other"
+    note: str = ""
+    mixing: Mixing | None = None
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -107,7 +140,35 @@ class Molecule:
     @property
     def dipole_debye(self) -> float:
         """Dipole moment about the centre of mass in debye (1 e Å = 4.80320471 D)."""
-        return float(np.linalg.norm(self.charges @ self.positions_body)) * 4.80320471
+        return float(np.linalg.norm(self.charges @ self.positions_body)) / DEBYE
+
+    @property
+    def quadrupole_debye_A(self) -> np.ndarray:
+        """Traceless quadrupole moment (3, 3) about the centre of mass, body frame, D Å: sum of q (3 x x - r²) / 2."""
+        x, q = self.positions_body, self.charges
+        return (1.5 * np.einsum("s,si,sj->ij", q, x, x) - 0.5 * np.sum(q * np.sum(x**2, axis=1)) * np.eye(3)) / DEBYE
+
+    @property
+    def planar(self) -> bool:
+        """Whether all sites, massless ones too, lie in one plane and not in one line."""
+        return bool(self._extents[2] <= OFF_AXIS * self.radius < self._extents[1])
+
+    @property
+    def _extents(self) -> np.ndarray:
+        """How far (3,) the sites reach along the axes of their own shape, Å, descending."""
+        return np.append(np.linalg.svd(self.positions_body, compute_uv=False), [0.0, 0.0])[:3]
+
+    @property
+    def words(self) -> str:
+        """What kind of body it is and what it weighs and carries, in words."""
+        shape = f"{self.kind}, planar" if self.planar else self.kind
+        charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
+        dipole = ""
+        if self.charges.any() and self.radius > 0:
+            size = self.dipole_debye * DEBYE
+            gone = size <= SAME_PLACE * self.radius * np.abs(self.charges).sum()
+            dipole = ", no dipole" if gone else f", dipole {self.dipole_debye:.3f} D"
+        return f"{shape}, {_counted(len(self.masses), 'site')}, {self.mass:.4f} u, {charge}{dipole}"
 
     @property
     def radius(self) -> float:
@@ -129,6 +190,10 @@ class Molecule:
                 entry |= {"sigma_A": float(self.sigma[i]), "epsilon_kJ_mol": float(self.epsilon[i] / KJ_PER_MOL)}
             entries.append(entry)
         return entries
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def molecule(
@@ -181,7 +246,7 @@ def molecule(
         elements=tuple(s.element for s in sites),
         masses=masses,
         positions_body=body,
-        charges=np.array([s.charge_e for s in sites]),
+        charges=np.array([s.charge_e or 0.0 for s in sites]),
         sigma=np.array([s.sigma_A or 0.0 for s in sites]),
         epsilon=np.array([s.epsilon for s in sites]),
         mass=float(frame.mass),
@@ -190,25 +255,97 @@ def molecule(
     )
 
 
+def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
+    """The same molecule with other masses (u) of sites, by their names or else their elements: other isotopes.
+
+    Raises MoleculeError.
+    """
+    faults, changed = [], {}
+    for key, mass in masses.items():
+        places = [i for i, name in enumerate(found.site_names) if name == key] or [
+            i for i, element in enumerate(found.elements) if element == key
+        ]
+        heavy = [i for i in places if found.masses[i] > 0]
+        if not heavy:
+            known = dict.fromkeys([*found.elements, *found.site_names])
+            why = (
+                "is massless, and stays so" if places else f"is no site or element of it; there are {', '.join(known)}"
+            )
+            faults.append(f"masses_u.{key} {why}")
+        changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
+    if faults:
+        raise MoleculeError(f"molecule {found.name}", faults)
+    sites = [Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])}) for i, entry in enumerate(found.sites())]
+    again = molecule(found.name, tuple(sites), found.title, found.source, found.residue_names)
+    return replace(again, group=found.group, note=found.note, mixing=found.mixing)
+
+
+def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:
+    """Sites with what they do not say themselves from a table, by their name or else their element."""
+    filled = []
+    for site in sites:
+        if (entry := find_site(table, site.name, site.element)) is not None:
+            keys = [key for key in ("mass_u", "charge_e") if getattr(site, key) is None]
+            keys += ["element"] if site.element == "X" else []
+            keys += LENNARD_JONES if site.sigma_A is None else []
+            site = site.model_copy(update={key: getattr(entry, key) for key in keys})
+        filled.append(site)
+    return tuple(filled)
+
+
+def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
+    """The entry that has this name, or else is called like the element."""
+    return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)
+
+
 def available_models() -> list[str]:
     """Names of the models that come with the package."""
     return sorted(path.stem for path in MODELS.glob("*.toml"))
 
 
+def model_fault(name: str) -> str:
+    """Why there is no model of this name; empty if there is one."""
+    known = available_models()
+    if name in known:
+        return ""
+    near = [model for model in known if model.startswith(name)] or difflib.get_close_matches(name, known, 1, 0.4)
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    return f"there is no model {name!r}; {hint}`rigidmd models` lists all {len(known)}"
+
+
 def load_model(name: str) -> Molecule:
-    """A model that comes with the package, by name."""
+    """A model that comes with the package, by name. Raises MoleculeError."""
+    if fault := model_fault(name):
+        raise MoleculeError("models", [fault])
     return read_molecule(MODELS / f"{name}.toml")
 
 
 def read_molecule(path: Path) -> Molecule:
     """A molecule from a TOML file as those in `models/`. Raises MoleculeError."""
+    data = _read(path, MoleculeFile)
+    found = molecule(data.name, data.sites, data.title, data.source, data.residue_names)
+    return replace(found, group=data.group, note=data.note, mixing=data.mixing)
+
+
+def read_parameters(path: Path) -> tuple[Site, ...]:
+    """The entries of a table of parameters. Raises MoleculeError."""
+    entries = _read(path, ParameterFile).sites
+    names = [s.name for s in entries]
+    faults = [f"sites: {name} stands there twice" for name in sorted(set(names)) if names.count(name) > 1]
+    faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in entries if s.position_A is not None]
+    if faults:
+        raise MoleculeError(str(path), faults)
+    return entries
+
+
+def _read(path: Path, kind: type[Section]) -> Section:
+    """A file as this kind of table. Raises MoleculeError."""
     try:
         text = path.read_text(encoding="utf-8")
-        data = MoleculeFile.model_validate(tomllib.loads(text))
+        return kind.model_validate(tomllib.loads(text))
     except OSError as error:
         raise MoleculeError(str(path), [f"cannot be read: {error.strerror}"]) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise MoleculeError(str(path), [f"is not TOML: {error}"]) from None
     except ValidationError as error:
-        raise MoleculeError(str(path), faults_of(error, MoleculeFile, text)) from None
-    return molecule(data.name, data.sites, data.title, data.source, data.residue_names)
+        raise MoleculeError(str(path), faults_of(error, kind, text)) from None

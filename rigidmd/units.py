@@ -15,6 +15,9 @@ KJ_PER_MOL = 100.0  # u Å²/ps²
 BOLTZMANN = BOLTZMANN_SI * AVOGADRO * 1e-3 * KJ_PER_MOL  # u Å²/ps² per K
 COULOMB = ELEMENTARY_CHARGE**2 * AVOGADRO / (4 * pi * VACUUM_PERMITTIVITY) * 1e10 * 1e-3 * KJ_PER_MOL  # u Å³/ps² per e²
 
+#: One debye in e Å: 1e-21 C m²/s over the speed of light and e (1 e Å = 4.80320471 D).
+DEBYE = 1e-21 / 299792458 / ELEMENTARY_CHARGE * 1e10  # e Å
+
 FEMTOSECOND = 1e-3  # ps
 BAR = 1e5 * AVOGADRO * 1e-30 * 1e-3 * KJ_PER_MOL  # u/(Å ps²)
 GRAM_PER_CM3 = AVOGADRO * 1e-24  # u/Å³

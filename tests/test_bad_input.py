@@ -11,7 +11,7 @@ from conftest import ROOT, small_scene
 from rigidmd.build.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError, SimulationError, StructureError
-from rigidmd.molecules import Site, available_models, load_model, molecule
+from rigidmd.molecules import Site, load_model, molecule
 from rigidmd.scene import Scene, parse_override
 from rigidmd.simulation import Simulation
 
@@ -242,27 +242,6 @@ def test_sites_that_make_no_body(sites, expected):
         )
 
 
-def test_every_model_is_what_it_says():
-    assert available_models() == ["argon", "nitrogen", "spce", "tip3p", "tip4p2005"]
-    kinds = {name: load_model(name).kind for name in available_models()}
-    assert kinds == {
-        "argon": "point",
-        "nitrogen": "linear",
-        "spce": "asymmetric",
-        "tip3p": "asymmetric",
-        "tip4p2005": "asymmetric",
-    }
-    dipoles = {"spce": 2.351, "tip3p": 2.347, "tip4p2005": 2.305}  # debye, as published
-    for name, dipole in dipoles.items():
-        found = load_model(name)
-        assert found.dipole_debye == pytest.approx(dipole, abs=2e-3)
-        assert found.charge == 0
-        assert found.mass == pytest.approx(18.0154)
-        o, h1, h2 = found.positions_body[:3]
-        angle = np.degrees(np.arccos((h1 - o) @ (h2 - o) / np.linalg.norm(h1 - o) / np.linalg.norm(h2 - o)))
-        assert angle == pytest.approx(109.47 if name == "spce" else 104.52)
-
-
 # structure files
 
 
@@ -376,8 +355,7 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
     assert "holds no velocities" in refused(capsys, tmp_path, text)
     (tmp_path / "c.npz").write_bytes(b"not a zip file")
     assert "not a state that rigidmd wrote" in refused(capsys, tmp_path, text.replace("b.xyz", "c.npz"))
-    pdb = "CRYST1   20.000   20.000   20.000  90.00  80.00  90.00 P 1           1\nATOM      1  O   HOH A   1       0.000   0.000   0.000  1.00  0.00           O\n"
-    assert "only boxes with right angles" in refused(capsys, tmp_path, structure_scene(tmp_path, pdb, "d.pdb"))
+
 
 
 def test_molecules_by_order_and_by_geometry(tmp_path):

@@ -194,10 +194,10 @@ def wrapped(atoms, cell):
     return [(name, e, k, wrap(x), v) for name, e, k, x, v in atoms]
 
 
-def read(tmp_path: Path, text: str, name: str, species=("spce",), edges=None, periodic=True, **options):
+def read(tmp_path: Path, text: str, name: str, species=("spce",), cell=None, periodic=True, **options):
     (tmp_path / name).write_text(text)
     models = [SPECIES[s] if isinstance(s, str) else s for s in species]
-    return read_structure(tmp_path / name, models, edges, periodic, TOLERANCE, **options)
+    return read_structure(tmp_path / name, models, cell, periodic, TOLERANCE, **options)
 
 
 # outside data
@@ -230,7 +230,7 @@ REFERENCE = [
         "structures/ice_XI_like_8water_P1.cif", "spce", None,
         8, density(8, WATER, 4.452382 * 7.70757 * 7.278858), 0.0244, 0.0332, "",
     ),
-    ("structures/H2O_ice_Ih.cif", "tip4p2005", None, "angles 90, 90, 120°; only boxes with right angles"),
+    ("structures/H2O_ice_Ih.cif", "tip4p2005", None, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
     # All its hydrogens are there (an ordered model of 1933), 0.82 Å from their oxygens.
     ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
     ("structures/H2O_ice_Ih.cif", "spce", inf, "is no spce: an atom is 0.173 Å from the rigid template"),
@@ -254,11 +254,11 @@ REFERENCE = [
 @pytest.mark.parametrize("case", REFERENCE, ids=lambda case: f"{Path(case[0]).name}-{case[1]}-{case[2]}")
 def test_reference_files(reference, case):
     file, model, edge, *expected = case
-    edges = None if edge in (None, inf) else (edge,) * 3
+    cell = None if edge in (None, inf) else edge * np.eye(3)
     model = load_model(model)
 
     def found():
-        return read_structure(reference / file, [model], edges, edge != inf, TOLERANCE)
+        return read_structure(reference / file, [model], cell, edge != inf, TOLERANCE)
 
     if isinstance(expected[0], str):
         with pytest.raises(StructureError) as refusal:
@@ -630,7 +630,7 @@ def test_cssr(fractional, tmp_path):
 def test_arc(tmp_path):
     truth = Truth(["spce"] * 4, 11)
     same_molecules(read(tmp_path, arc(truth.atoms(), truth.cell), "a.arc"), truth, [SPECIES["spce"]], 1e-7)
-    found = read(tmp_path, arc(truth.atoms(), None), "b.txyz", edges=tuple(np.diag(truth.cell)))
+    found = read(tmp_path, arc(truth.atoms(), None), "b.txyz", cell=truth.cell)
     same_molecules(found, truth, [SPECIES["spce"]], 1e-7)
 
 
@@ -795,7 +795,7 @@ def test_no_box(box, note, tmp_path):
     text = gro(truth.atoms(), box)
     with pytest.raises(StructureError, match=r"has no box.*give \[box\] lengths_A, or periodic = false"):
         read(tmp_path, text, "a.gro")
-    found = read(tmp_path, text, "a.gro", edges=(14.0, 15.0, 16.0))
+    found = read(tmp_path, text, "a.gro", cell=np.diag([14.0, 15.0, 16.0]))
     same_molecules(found, truth, [SPECIES["spce"]], 0.02)
     assert found.notes == ((note,) if note else ())
     assert read(tmp_path, text, "a.gro", periodic=False).cell is None
@@ -806,13 +806,13 @@ def test_placeholder_boxes(tmp_path):
     text = pdb(truth.atoms(), cryst1(np.eye(3)))
     with pytest.raises(StructureError, match=r"has no box .its cell, a cube of 1 Å, stands for none"):
         read(tmp_path, text, "a.pdb")
-    same_molecules(read(tmp_path, text, "a.pdb", edges=(14.0, 15.0, 16.0)), truth, [SPECIES["spce"]], 0.002)
+    same_molecules(read(tmp_path, text, "a.pdb", cell=np.diag([14.0, 15.0, 16.0])), truth, [SPECIES["spce"]], 0.002)
 
 
 def test_the_scene_may_want_another_box_than_the_file(tmp_path):
     truth = Truth(["spce"] * 8, 15)
     text = gro(wrapped(truth.atoms(), truth.cell), box_of(truth.cell), 9)
-    found = read(tmp_path, text, "a.gro", edges=(30.0, 30.0, 30.0))
+    found = read(tmp_path, text, "a.gro", cell=30 * np.eye(3))
     assert found.residual_max < 1e-6  # whole by the file's box, not the scene's
     assert found.notes == ("the scene's box counts, not that of the file",)
     assert np.diag(found.cell) == pytest.approx(30)

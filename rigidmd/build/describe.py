@@ -70,9 +70,11 @@ def _molecules(system: System) -> str:
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites"]
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
-        charge = f", net charge {m.charge:+g} e" if m.charge else ""
         freely = "frozen" if system.model.inverse_mass[k] == 0 else f"{m.degrees_of_freedom} degrees of freedom each"
-        lines.append(f"  {count} {m.name}: {m.kind}, {len(m.masses)} sites, {m.mass:.4f} u, {freely}{charge}")
+        lines.append(f"  {count} {m.name}: {m.words}, {freely}")
+    charges = np.array([m.charge for m in system.species])[system.model.species]
+    if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
+        lines.append(f"  net charge of all of them: {charges.sum():+.6g} e")
     lines.append(
         f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
     )

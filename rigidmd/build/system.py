@@ -22,7 +22,17 @@ from rigidmd.forces.space import Space, cell_of, fractions, heights, space_of, w
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
-from rigidmd.molecules import Molecule, Site, load_model, molecule, read_molecule
+from rigidmd.molecules import (
+    Molecule,
+    Site,
+    find_site,
+    load_model,
+    molecule,
+    read_molecule,
+    read_parameters,
+    with_masses,
+    with_parameters,
+)
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import Molecules
 from rigidmd.units import COULOMB, GRAM_PER_CM3, KJ_PER_MOL
@@ -145,6 +155,11 @@ def build(scene: MolecularScene) -> System:
         left_out=_left_out(scene, terms, model, space),
     )
     _set_momenta(system, arrangement)
+    system.notes += [
+        f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
+        for m in species
+        if m.mixing not in (None, scene.forces.mixing)
+    ]
     if scene.structure is not None:
         system.notes.append(
             f"{n} molecules read from {scene.structure.file}; atoms against rigid templates: "
@@ -178,38 +193,33 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     elif entry.file is not None and entry.file.endswith(".toml"):
         found = read_molecule(scene.path(entry.file))
     else:
-        sites = entry.sites if entry.file is None else _sites_from_file(scene, entry)
-        found = molecule(entry.name or scene.path(entry.file).stem, sites)
+        table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters))
+        sites = entry.sites if entry.file is None else _sites_from_file(scene, entry, table)
+        found = molecule(entry.name or scene.path(entry.file).stem, with_parameters(sites, table))
+    if entry.masses_u is not None:
+        found = with_masses(found, entry.masses_u)
     changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
     return Molecule(**{**vars(found), **changed})
 
 
-def _sites_from_file(scene: MolecularScene, entry: Molecules) -> tuple[Site, ...]:
-    """Geometry from the file, everything else from the scene's sites, found by atom name or else by element."""
+def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
+    """Geometry from the file, everything else from the scene's sites and the table, by atom name or else by element."""
     path = scene.path(entry.file)
+    own = entry.sites or ()
     faults = []
     sites = []
     used = set()
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
-        match = next((s for s in entry.sites if s.name == name), None) or next(
-            (s for s in entry.sites if s.name == element), None
-        )
-        if match is None:
-            faults.append(f"atom {name}: no entry of sites has this name or is called {element}")
+        match, shared = find_site(own, name, element), find_site(table, name, element)
+        if match is None and shared is None:
+            where = " or of parameters" if entry.parameters is not None else ""
+            faults.append(f"atom {name}: no entry of sites{where} has this name or is called {element}")
             continue
-        used.add(match.name)
-        given = match.mass_u if match.mass_u is not None else float(mass)
-        sites.append(
-            match.model_copy(
-                update={
-                    "name": name[:5],
-                    "element": element,
-                    "mass_u": given,
-                    "position_A": tuple(map(float, position)),
-                }
-            )
-        )
-    faults += [f"sites: {s.name} is no atom of it" for s in entry.sites if s.name not in used]
+        used.add(match.name if match else "")
+        given = next((s.mass_u for s in (match, shared) if s is not None and s.mass_u is not None), float(mass))
+        known = {"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
+        sites.append(match.model_copy(update=known) if match else Site(**known))
+    faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]
     if faults:
         raise StructureError(str(path), faults)
     return tuple(sites)

@@ -27,8 +27,9 @@ def write_scene(folder: Path, scene: MolecularScene, system: System) -> None:
     for key, copied in input_names(scene).items():
         with whole_file(folder / copied) as temporary:
             shutil.copyfile(scene.inputs[key], temporary)
-        section = data["structure"] if key == "structure.file" else data["molecules"][int(key.split(".")[1])]
-        section["file"] = copied
+        *table, last = key.split(".")
+        section = data["structure"] if table == ["structure"] else data["molecules"][int(table[1])]
+        section[last] = copied
     _write(folder, data)
 
 

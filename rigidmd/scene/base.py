@@ -121,7 +121,7 @@ def _kind(data: dict, body: type[Scene], molecules: type[Scene]) -> type[Scene] 
 
 def _override(data: dict, key: str, value: Any) -> list[str]:
     """Set one dotted key in nested tables and lists, in place; a list of faults."""
-    if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.file", key):
+    if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".")
     target: Any = data

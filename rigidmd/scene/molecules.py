@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.dynamics.schemes import AUTO, SCHEMES, Rotor, Scheme, auto_faults, rotor_fault
-from rigidmd.molecules import Site, SiteName, available_models
+from rigidmd.molecules import Mixing, Site, SiteName, model_fault
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.watch import Watch
 from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
@@ -18,6 +18,9 @@ WITH_VELOCITIES = (".trr", ".nc")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 MOST_STEPS = 1e12
+
+#: Keys of [[molecules]] that name a file.
+SPECIES_FILES = ("file", "parameters")
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
@@ -90,6 +93,11 @@ class Molecules(Section):
     """What to call the species; the model's or file's name when not given"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
     """The sites of a molecule of one's own; with a geometry `file`, their parameters by atom name or element"""
+    parameters: str | None = None
+    """A .toml file with entries like those of `sites`, which several molecules may share: what they do not say
+    themselves, by atom name or element"""
+    masses_u: dict[str, Positive] | None = Field(default=None, min_length=1)
+    """Other masses of sites, by name or element: other isotopes, { H = 2.014 } for heavy water"""
     residue_names: tuple[SiteName, ...] | None = None
     """Residue names by which structure files may call this species"""
     count: Count | None = None
@@ -100,24 +108,25 @@ class Molecules(Section):
     @field_validator("model")
     @classmethod
     def _is_known(cls, model: str | None):
-        import difflib
-
-        if model is not None and model not in available_models():
-            near = difflib.get_close_matches(model, available_models(), 1, 0.4)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            raise ValueError(f"there is no model {model!r}{hint} (known: {', '.join(available_models())})")
+        if model is not None and (fault := model_fault(model)):
+            raise ValueError(fault)
         return model
 
     @model_validator(mode="after")
     def _one_source(self):
         if self.model is not None and (self.file is not None or self.sites is not None):
             raise ValueError("give a model, or a file and sites of your own, not both")
+        whole = self.model is not None or (self.file is not None and self.file.endswith(".toml"))
+        if self.parameters is not None and whole:
+            raise ValueError("parameters would do nothing: a model or a .toml file has its own")
+        if self.parameters is not None and not self.parameters.endswith(".toml"):
+            raise ValueError(f"parameters = {self.parameters!r} must be a .toml file with [[sites]]")
         if self.model is None and self.file is None and self.sites is None:
             raise ValueError("needs one of model, file, sites")
         if self.file is not None and self.file.endswith(".toml") and self.sites is not None:
             raise ValueError("a .toml file has its own sites: leave out one of them")
-        if self.file is not None and not self.file.endswith(".toml") and self.sites is None:
-            raise ValueError("a geometry file needs sites with the parameters of its atoms")
+        if self.file is not None and not whole and self.sites is None and self.parameters is None:
+            raise ValueError("a geometry file needs sites, or a file of parameters, for its atoms")
         if self.sites is not None and self.file is None and self.name is None:
             raise ValueError("a molecule of one's own needs a name")
         return self
@@ -144,7 +153,7 @@ class Forces(Section):
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
     and smooth_switch, at 0.6 of the cut-off"""
-    mixing: Literal["lorentz-berthelot", "geometric"] = "lorentz-berthelot"
+    mixing: Mixing = "lorentz-berthelot"
     """Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = ()
     """Parameters of particular pairs, in place of the mixing rule"""
@@ -311,8 +320,9 @@ class MolecularScene(Scene):
         """Every file it reads besides itself: dotted key -> path."""
         found = {} if self.structure is None else {"structure.file": self.path(self.structure.file)}
         for k, species in enumerate(self.molecules):
-            if species.file is not None:
-                found[f"molecules.{k}.file"] = self.path(species.file)
+            for key in SPECIES_FILES:
+                if (name := getattr(species, key)) is not None:
+                    found[f"molecules.{k}.{key}"] = self.path(name)
         return found
 
     @model_validator(mode="after")
@@ -375,7 +385,10 @@ class MolecularScene(Scene):
             named.append(("structure.file", structure.get("file")))
         if isinstance(species := data.get("molecules"), list):
             named += [
-                (f"molecules.{k}.file", entry.get("file")) for k, entry in enumerate(species) if isinstance(entry, dict)
+                (f"molecules.{k}.{key}", entry.get(key))
+                for k, entry in enumerate(species)
+                if isinstance(entry, dict)
+                for key in SPECIES_FILES
             ]
         return [
             f"{key}: {file!r} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"

@@ -1,0 +1,131 @@
+"""Models in words: the list of all of them, and one with its geometry, its parameters and where they come from."""
+
+import re
+import textwrap
+from collections import Counter
+from itertools import combinations
+
+import numpy as np
+
+from rigidmd.molecules import GROUPS, Molecule
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+WIDTH = 100
+#: Covalent radii, Å (Cordero et al. 2008, Dalton Trans. 2832), of the elements that rigid models have.
+COVALENT = {"H": 0.31, "C": 0.76, "N": 0.71, "O": 0.66, "F": 0.57, "S": 1.05, "Cl": 1.02}
+#: Two atoms this much further apart than their covalent radii are bonded still.
+SLACK = 1.25
+
+
+def models_table(molecules: list[Molecule]) -> str:
+    """A line for each model, by groups, at most WIDTH columns wide."""
+    lines = []
+    for group in GROUPS:
+        members = [m for m in molecules if m.group == group]
+        if members:
+            lines += ["" if lines else None, f"{group:<20}sites   mass u dipole D  {'charges e':<22}source"]
+        lines += [_row(m) for m in members]
+    return "\n".join(line for line in lines if line is not None)
+
+
+def _row(m: Molecule) -> str:
+    dipole = f"{m.dipole_debye:.3f}" if m.charges.any() and m.radius > 0 else ""
+    charges = textwrap.shorten(" ".join(dict.fromkeys(f"{q:+.4g}" for q in m.charges if q)), 21, placeholder=" ...")
+    return f"  {m.name:<19}{len(m.masses):>4}{m.mass:>9.4g}{dipole:>9}  {charges:<22}{short_source(m)}".rstrip()
+
+
+def short_source(m: Molecule) -> str:
+    """Who published it and when."""
+    found = re.match(r".*?\b(?:19|20)\d\d\b", m.source)
+    authors, year = (found[0][:-4].strip(), found[0][-4:]) if found else (m.source, "")
+    names = re.split(r", | & ", authors)
+    return f"{names[0]} et al. {year}" if len(names) > 2 else f"{authors} {year}"
+
+
+def molecule_text(m: Molecule) -> str:
+    """One model in full: what it is, its sites in the principal frame, its geometry, its source."""
+    moments = " ".join(f"{x:.5g}" for x in m.inertia)
+    lines = [
+        f"{m.name}: {m.title}" if m.title else m.name,
+        f"  {m.words}",
+        f"  {m.degrees_of_freedom} degrees of freedom",
+    ]
+    lines.append(f"  principal moments {moments} u Å²")
+    if m.kind == "linear" and m.charges.any() and not m.charge:
+        lines.append(f"  quadrupole along the axis {m.quadrupole_debye_A[0, 0]:+.4f} D Å")
+    lines += ["", *_sites(m), "", *_geometry(m)]
+    said = [("mixing", m.mixing), ("note", m.note), ("source", m.source)]
+    for name, text in said:
+        if text:
+            lines += textwrap.wrap(text, WIDTH, initial_indent=f"  {name:<8}", subsequent_indent=" " * 10)
+    if m.residue_names:
+        lines.append(f"  {'called':<8}{' '.join(m.residue_names)} in structure files")
+    return "\n".join(lines)
+
+
+def _sites(m: Molecule) -> list[str]:
+    """A table of the sites, principal axes."""
+    lines = ["  site   element    mass u       x Å       y Å       z Å   charge e   sigma Å  epsilon kJ/mol        K"]
+    for i, name in enumerate(m.site_names):
+        x, y, z = np.round(m.positions_body[i], 5) + 0.0
+        charge = f"{m.charges[i]:+.6g}" if m.charges[i] else ""
+        element = m.elements[i] if m.elements[i] != "X" else ""
+        well = ""
+        if m.epsilon[i] > 0:
+            well = f"{m.sigma[i]:>10.6g}{m.epsilon[i] / KJ_PER_MOL:>16.6g}{m.epsilon[i] / BOLTZMANN:>9.5g}"
+        line = f"  {name:<7}{element:<7}{m.masses[i]:>10.4f}{x:>10.5f}{y:>10.5f}{z:>10.5f}{charge:>11}{well}"
+        lines.append(line.rstrip())
+    return lines
+
+
+def _geometry(m: Molecule) -> list[str]:
+    """Lengths and angles of the links, like ones once."""
+    stems = [re.sub(r"(?<=\D)\d+$", "", name) for name in m.site_names]
+    kind = [stem if stems.count(stem) > 1 else name for stem, name in zip(stems, m.site_names, strict=True)]
+    # charges in the place of a multipole are no geometry: the table of sites says where they are
+    few = (m.masses == 0).sum() <= 2
+    links = [(i, j) for i, j in bonds(m) if m.masses[j] > 0 or few]
+    lengths = Counter(f"{kind[i]}-{kind[j]} {_distance(m, i, j):.4f} Å" for i, j in links)
+    angles = Counter()
+    for one, other in combinations(links, 2):
+        if len(ends := {*one} ^ {*other}) == 2:
+            (corner,) = {*one} & {*other}
+            a, b = sorted(ends, key=lambda s: kind[s])
+            # two massless sites stand on an atom like ears; where one is on a bisector, its length says it all
+            ears = kind[a] == kind[b] and abs(_distance(m, a, corner) / _distance(m, b, corner) - 1) < 1e-6
+            if ears or m.masses[a] > 0 < m.masses[b]:
+                angles[f"{kind[a]}-{kind[corner]}-{kind[b]} {_angle(m, a, corner, b):.2f}°"] += 1
+    lines = []
+    for name, found in (("lengths", lengths), ("angles", angles)):
+        if found:
+            text = ", ".join(what if count == 1 else f"{what} ({count})" for what, count in found.items())
+            lines += textwrap.wrap(text, WIDTH, initial_indent=f"  {name:<8}", subsequent_indent=" " * 10)
+    return lines
+
+
+def bonds(m: Molecule) -> list[tuple[int, int]]:
+    """Links between sites, heavier first: atoms within bonding distance, all parts of a molecule by the shortest links
+    between atoms, and each massless site to its nearest atom."""
+    atoms = np.flatnonzero(m.masses > 0)
+    part = {i: i for i in atoms}
+    found = []
+    for i, j in sorted(combinations(atoms, 2), key=lambda pair: round(_distance(m, *pair), 9)):
+        reach = SLACK * sum(COVALENT.get(m.elements[s], 0.0) for s in (i, j))
+        if _distance(m, i, j) <= reach or part[i] != part[j]:
+            found.append((i, j) if m.masses[i] >= m.masses[j] else (j, i))
+            part = {s: part[i] if p == part[j] else p for s, p in part.items()}
+    massless = np.flatnonzero(m.masses == 0)
+    return sorted(found) + [(min(atoms, key=lambda i, s=s: round(_distance(m, i, s), 9)), s) for s in massless]
+
+
+def _distance(m: Molecule, i: int, j: int) -> float:
+    return float(np.linalg.norm(m.positions_body[i] - m.positions_body[j]))
+
+
+def _angle(m: Molecule, i: int, corner: int, j: int) -> float:
+    """Degrees."""
+    a, b = (m.positions_body[[i, j]] - m.positions_body[corner]) / [
+        [_distance(m, i, corner)],
+        [_distance(m, j, corner)],
+    ]
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
