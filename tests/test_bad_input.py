@@ -90,6 +90,10 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", '[structure]\nfile = "../../etc/passwd"\n[start]', ["outside the scene's folder", "--set"]),
         ("[start]", '[structure]\nfile = "/etc/passwd"\n[start]', ["outside the scene's folder"]),
         ("[start]", '[structure]\nfile = "none.gro"\n[start]', ["none.gro", "no such file"]),
+        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [30.0, 30.0, 90.0]", ["cannot stand at these angles"]),
+        ("lengths_A = 20.0", "density_g_cm3 = 1.0\nangles_deg = [80.0, 80.0, 90.0]", ["angles_deg needs lengths_A"]),
+        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 180.0]", ["angles_deg.2", "less than 180"]),
+        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 50.0]", ["smallest of a_x, b_y, c_z"]),
         ("lengths_A = 20.0", "density_g_cm3 = 3000", ["half the shortest edge"]),
         ("[[stages]]", '[[molecules]]\nname = "x"\nsites = []\n[[stages]]', ["molecules.1.sites", "needs at least 1"]),
         ("[[stages]]", '[[molecules]]\nname = "x"\ncount = 1\nsites = [{name = "A", mass_u = -1.0, position_A = [0,0,0]}]\n[[stages]]',
@@ -355,7 +359,6 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
     assert "holds no velocities" in refused(capsys, tmp_path, text)
     (tmp_path / "c.npz").write_bytes(b"not a zip file")
     assert "not a state that rigidmd wrote" in refused(capsys, tmp_path, text.replace("b.xyz", "c.npz"))
-
 
 
 def test_molecules_by_order_and_by_geometry(tmp_path):

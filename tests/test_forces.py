@@ -8,6 +8,7 @@ from reference import Oracle
 from rigidmd.build.system import build
 from rigidmd.dynamics.engine import Engine
 from rigidmd.forces.pairs import PairForces
+from rigidmd.forces.space import cell_of
 from rigidmd.mechanics.rotation import from_vector
 
 ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
@@ -63,6 +64,42 @@ def test_a_box_with_unequal_edges_and_many_cells():
     assert energies(engine, state)["lennard_jones"] == pytest.approx(expected, rel=1e-9)
 
 
+SLANTED = [[60.0, 60.0, 60.0], [70.0, 100.0, 50.0], [120.0, 110.0, 95.0], [35.0, 60.0, 80.0]]
+
+
+@pytest.mark.parametrize("skin", [0.3, 3.0])
+@pytest.mark.parametrize("angles", SLANTED)
+def test_slanted_boxes(angles, skin):
+    """Energies are the oracle's, forces the slope of its energy, whole cells of any kind away; c leans by boxes."""
+    box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
+    forces = ended("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
+    system = build(small_scene({"spce": 20, "nitrogen": 15}, None, box=box, forces=forces))
+    engine, state, oracle = Engine(system.model, system.terms), system.state.copy(), Oracle(system)
+    rng = np.random.default_rng(3)
+    state.position[:] += rng.normal(size=state.position.shape)
+    state.position[:] += rng.integers(-3, 4, state.position.shape) @ cell_of(system.space)
+    lj, coulomb = oracle.energy(state.position, state.rotation)
+    assert energies(engine, state) == pytest.approx({"lennard_jones": lj, "coulomb": coulomb}, rel=1e-10)
+    load, h = engine.evaluate(state)[0], 1e-4
+    for m, k in ((0, 0), (7, 1), (30, 2)):
+        up, down = state.position.copy(), state.position.copy()
+        up[m, k] += h
+        down[m, k] -= h
+        slope = (sum(oracle.energy(up, state.rotation)) - sum(oracle.energy(down, state.rotation))) / (2 * h)
+        assert load.force[m, k] == pytest.approx(-slope, rel=1e-5, abs=1e-7 * np.abs(load.force).max())
+
+
+def test_a_cell_and_the_same_lattice_by_another_have_the_same_energy():
+    """A cell that leans by more than half an edge is reduced."""
+    counts, forces = {"spce": 20}, {"cutoff_A": 6.0, "truncation": "shift"}
+    leaning = {"lengths_A": [13.0, (13.0**2 + 13.0**2) ** 0.5, 13.0], "angles_deg": [90.0, 90.0, 45.0]}
+    cube = build(small_scene(counts, 13.0, forces=forces))
+    other = build(small_scene(counts, None, box=leaning, forces=forces))
+    assert cell_of(other.space) == pytest.approx(13.0 * np.eye(3))
+    found = [energies(Engine(s.model, s.terms), cube.state) for s in (cube, other)]
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+
+
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_forces_and_torques_are_the_slope_of_the_energy(ending):
     forces = ended(ending)
@@ -96,9 +133,12 @@ def test_forces_and_torques_are_the_slope_of_the_energy(ending):
             assert load.torque_body[m, k] == pytest.approx(extrapolated(turn), abs=1e-6 * scale)
 
 
-def test_virial_is_the_slope_of_the_energy_with_the_box():
+@pytest.mark.parametrize("angles", [None, [70.0, 100.0, 80.0]])
+def test_virial_is_the_slope_of_the_energy_with_the_box(angles):
     forces = {"cutoff_A": 6.0, "truncation": "force_switch", "switch_start_A": 4.0}
-    system, engine, state = built({"spce": 14}, 13.0, 2, forces=forces)
+    box = {"lengths_A": 14.0, "angles_deg": angles} if angles else {"lengths_A": 13.0}
+    system = build(small_scene({"spce": 14}, None, box=box, forces=forces))
+    engine, state = Engine(system.model, system.terms), system.state
     virial = sum(tally.virial for tally in engine.evaluate(state)[1].values())
 
     def energy(stretch):

@@ -81,8 +81,10 @@ def test_the_final_state_starts_another_run(tmp_path):
 @pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
 @pytest.mark.parametrize("topology", ["topology.gro", "topology.pdb"])
 def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp_path):
+    lengths, angles = [20.0, 21.0, 22.0], [80.0, 100.0, 75.0]
     scene = small_scene(
-        {"tip4p2005": 6, "nitrogen": 4}, 18.5, stages=[{"duration_ps": 0.04}],
+        {"tip4p2005": 6, "nitrogen": 4}, None, stages=[{"duration_ps": 0.04}],
+        box={"lengths_A": lengths, "angles_deg": angles},
         output={"trajectory": name, "trajectory_interval_ps": 0.01, "topology": topology, "positions": "unwrapped"},
     )  # fmt: skip
     seen = []
@@ -100,7 +102,7 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
         if name[1:] not in (".xyz", ".pdb"):  # those say the time in their own words, tested below
             assert frame.time == pytest.approx(moment, abs=1e-5)
         if name != "t.xyz":
-            assert frame.dimensions == pytest.approx([18.5, 18.5, 18.5, 90, 90, 90], abs=1e-3)
+            assert frame.dimensions == pytest.approx([*lengths, *angles], abs=2e-3)
         assert frame.has_velocities == (name in ("t.trr", "t.nc"))
         if frame.has_velocities:
             assert frame.velocities == pytest.approx(velocities, abs=1e-3)
@@ -109,7 +111,7 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
         import ase.io
 
         frames = ase.io.read(tmp_path / "out" / name, index=":", format="extxyz")
-        assert frames[2].cell.lengths() == pytest.approx([18.5] * 3)
+        assert frames[2].cell.cellpar() == pytest.approx([*lengths, *angles])
         assert frames[2].info["Time"] == pytest.approx(0.02)
     if name == "t.pdb":
         assert b"TIME 0.020000 PS" in text
@@ -117,15 +119,19 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
     assert universe.residues.n_residues == 10
 
 
-def test_wrapped_molecules_are_whole_and_inside(tmp_path):
-    scene = small_scene({"spce": 30}, 18.5, output={"trajectory": "t.trr"})
-    simulation = Simulation(scene)
+@pytest.mark.parametrize("angles", [[90.0, 90.0, 90.0], [80.0, 75.0, 100.0]])
+def test_wrapped_molecules_are_whole_and_inside(angles, tmp_path):
+    box = {"lengths_A": 20.0, "angles_deg": angles}
+    simulation = Simulation(small_scene({"spce": 30}, None, box=box, output={"trajectory": "t.trr"}))
     simulation.state.position[:] += 300.0
     system = simulation.system
     x = system.site_positions(simulation.state, wrapped=True).reshape(30, 3, 3)
     centre = np.einsum("s,nsk->nk", system.species[0].masses, x) / system.species[0].mass
-    assert (centre >= -1e-9).all()
-    assert (centre < 18.5 + 1e-9).all()
+    part = centre @ np.linalg.inv(simulation.scene.box.cell)
+    assert (part >= -1e-9).all()
+    assert (part < 1 + 1e-9).all()
+    moved = (centre - simulation.state.position) @ np.linalg.inv(simulation.scene.box.cell)
+    assert moved == pytest.approx(np.rint(moved), abs=1e-9)
     assert np.linalg.norm(x[:, 1] - x[:, 0], axis=1) == pytest.approx(np.ones(30))
 
 

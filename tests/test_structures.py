@@ -444,7 +444,7 @@ def test_the_standard_orientation_keeps_the_lattice():
     assert np.array_equal(rotation, np.eye(3))
 
 
-def test_molecules_of_a_slanted_cell_are_made_whole_but_the_cell_is_refused(tmp_path):
+def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
     cell = [[12.0, 0, 0], [9.0, 11.0, 0], [-8.0, 7.0, 12.0]]
     truth = Truth(["spce"] * 8, 6, cell=cell)
     text = xyz(wrapped(truth.atoms(), truth.cell), truth.cell)
@@ -456,8 +456,34 @@ def test_molecules_of_a_slanted_cell_are_made_whole_but_the_cell_is_refused(tmp_
         found = read(tmp_path, (tmp_path / name).read_text(), name, periodic=False)
         assert found.residual_max < 0.02
         same_molecules(found, truth, [SPECIES["spce"]], 0.02)
-    with pytest.raises(StructureError, match=r"angles .*°; only boxes with right angles are handled"):
-        read(tmp_path, text, "a.xyz")
+    leaning = read(tmp_path, text, "a.xyz")  # c lies on top of b: the same lattice by a cell that leans less
+    assert leaning.cell == pytest.approx(np.array([[12.0, 0, 0], [-3.0, 11.0, 0], [-5.0, -4.0, 12.0]]))
+    assert any("its lattice is described by the cell with edges 12.0000, 11.4018, 13.6015" in n for n in leaning.notes)
+    same_molecules(leaning, truth, [SPECIES["spce"]], 1e-6)
+
+
+def test_a_cell_with_room_for_a_cut_off_is_found(tmp_path):
+    """c of this cell stands 2 Å high, yet the lattice is that of a cube: turned, the box is upright and has room."""
+    cell = 14.0 * np.array([[1.0, 0, 0], [2.0, 1.0, 0], [7.0, 6.0, 1.0]]) @ standard_turn(3).T
+    truth = Truth(["spce"] * 8, 6, edges=(14.0, 14.0, 14.0))
+    turned = [(n, e, k, x @ standard_turn(3).T, v) for n, e, k, x, v in truth.atoms()]
+    found = read(tmp_path, xyz(wrapped(turned, cell), cell), "a.xyz")
+    assert found.cell == pytest.approx(14.0 * np.eye(3), abs=1e-6)
+    assert pair_distances(found.position, found.cell) == pytest.approx(
+        pair_distances(truth.centre, truth.cell), abs=1e-6
+    )
+
+
+def standard_turn(seed):
+    """A rotation drawn at random."""
+    return random_rotations(np.random.default_rng(seed), 1)[0]
+
+
+def pair_distances(position, cell):
+    """Sorted distances of nearest images in a cell that leans little."""
+    i, j = np.triu_indices(len(position), 1)
+    d = (position[i] - position[j]) @ np.linalg.inv(cell)
+    return np.sort(np.linalg.norm((d - np.rint(d)) @ cell, axis=1))
 
 
 def test_residuals_are_those_of_the_best_fit(tmp_path):

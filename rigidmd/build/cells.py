@@ -7,6 +7,9 @@ RIGHT = np.radians(1e-3)
 #: A cell whose vectors lie closer to the standard orientation than this fraction of its longest edge is left as it is.
 ORIENTED = 1e-6
 
+#: How much longer a cut-off another choice of edges must allow before a cell is turned for it.
+ROOMIER = 1.1
+
 
 def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) that turns it so.
@@ -34,14 +37,14 @@ def reduced(cell: np.ndarray) -> np.ndarray:
 def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the cells (3, 3) of a lattice one with room for a long cut-off, and the rotation (3, 3) that it needs.
 
-    The cell as it is but for lean, if no edge of the upright brick gets longer by another choice of edges.
+    The cell as it is but for lean, unless the shortest edge of the upright brick gets much longer by another choice.
     """
     from ase.geometry import minkowski_reduce
 
     own = reduced(cell)
     other, turn = standard_rotation(minkowski_reduce(cell)[0])
     other = reduced(other)
-    return (other, turn) if np.diag(other).min() > (1 + ORIENTED) * np.diag(own).min() else (own, np.eye(3))
+    return (other, turn) if np.diag(other).min() > ROOMIER * np.diag(own).min() else (own, np.eye(3))
 
 
 def right_angled(cell: np.ndarray) -> bool:

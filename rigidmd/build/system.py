@@ -18,7 +18,7 @@ from rigidmd.forces.coulomb import reaction_field, self_energy
 from rigidmd.forces.lennard_jones import lennard_jones, tail
 from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.sites import BodySites, CentralSites
-from rigidmd.forces.space import Space, cell_of, fractions, heights, space_of, wrap
+from rigidmd.forces.space import Space, Triclinic, cell_of, fractions, heights, space_of, wrap
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
@@ -267,17 +267,18 @@ def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> flo
     cutoff = forces.cutoff_A or (DEFAULT_CUTOFF if space.volume < inf else inf)
     faults = []
     half = min(space.edges) / 2
+    least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
     if cutoff > half:
         given = "" if forces.cutoff_A else " (the default)"
         faults.append(
-            f"forces.cutoff_A = {cutoff:g}{given} is longer than half the shortest edge of the box, {half:.3f} Å: "
+            f"forces.cutoff_A = {cutoff:g}{given} is longer than half {least} of the box, {half:.3f} Å: "
             "a site would meet two images of another. Take a larger box or a shorter cut-off"
         )
     for m in species:
         extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
         if extent > half:
             faults.append(
-                f"a molecule of {m.name} is {extent:.2f} Å long, more than half the shortest edge, {half:.3f} Å"
+                f"a molecule of {m.name} is {extent:.2f} Å long, more than half {least} of the box, {half:.3f} Å"
             )
     start = forces.switch_start_A
     if start is not None and start >= cutoff:
