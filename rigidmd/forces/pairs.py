@@ -61,6 +61,23 @@ class PairForces(NamedTuple):
     sums: Sums
     parts: Parts
 
+    def with_room(self) -> "PairForces":
+        """The term with its machine code and as much room as its last list asked for."""
+        term = self._replace(pairs=neighbors.with_room(self.pairs))
+        if (room := _room(term.pairs)) > term.sums.others.shape[1]:
+            others = np.zeros((len(term.sums.others), int(1.1 * room)), term.sums.others.dtype)
+            term = term._replace(sums=term.sums._replace(others=others))
+        if term.parts.forces == 0:
+            content = (term.arranged, term.pairs, term.sums)
+            parts = (part.address(content) for part in (_forces, _forces_and_energies, _gather))
+            term = term._replace(parts=Parts(*parts))
+        return term
+
+    def with_own_work(self) -> "PairForces":
+        """The term with a list and work arrays that it shares with no other."""
+        precision = next(name for name, dtype in PRECISIONS.items() if dtype == self.sums.others.dtype)
+        return pair_forces(self.law, self.space, self.sites, self.pairs.skin, precision, self.pairs.group)
+
 
 def pair_forces(
     law: NamedTuple,
@@ -86,32 +103,10 @@ def pair_forces(
     return PairForces(law, law.room(slots, dtype), space, sites, pairs, sums, Parts())
 
 
-def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with its machine code and as much room as its last list asked for; other terms as they are."""
-    if not isinstance(term, PairForces):
-        return term
-    term = term._replace(pairs=neighbors.with_room(term.pairs))
-    if (room := _room(term.pairs)) > term.sums.others.shape[1]:
-        others = np.zeros((len(term.sums.others), int(1.1 * room)), term.sums.others.dtype)
-        term = term._replace(sums=term.sums._replace(others=others))
-    if term.parts.forces == 0:
-        content = (term.arranged, term.pairs, term.sums)
-        term = term._replace(parts=Parts(*(part.address(content) for part in (_forces, _forces_and_energies, _gather))))
-    return term
-
-
 @kernel
 def _room(pairs):
     """Room that a block needs for forces on the sites of others."""
     return 3 * width_of(pairs.clusters.local) * most_needed(pairs, 2)
-
-
-def with_own_list(term: NamedTuple) -> NamedTuple:
-    """The term with work arrays that it shares with no other; other terms as they are."""
-    if not isinstance(term, PairForces):
-        return term
-    precision = next(name for name, dtype in PRECISIONS.items() if dtype == term.sums.others.dtype)
-    return pair_forces(term.law, term.space, term.sites, term.pairs.skin, precision, term.pairs.group)
 
 
 def pair(law, i, j, r2):

@@ -68,3 +68,29 @@ def _wrap_index(space, index, count):
     if is_a(space, Unbounded):
         return lambda space, index, count: index if 0 <= index < count else -1
     return lambda space, index, count: index % count
+
+
+def cell_of(space: Space) -> np.ndarray:
+    """Cell matrix (3, 3), rows the edges a, b, c, Å."""
+    return np.diag(np.array(space))
+
+
+def fill_cell(space, cell):
+    """Write the cell matrix (3, 3), rows the edges a, b, c, into an array; whether it has changed."""
+    raise TypeError("compiled code only")
+
+
+@implements(fill_cell)
+def _fill_cell(space, cell):
+    if not is_a(space, Orthorhombic):
+        return None
+
+    def fill(space, cell):
+        changed = cell[0, 0] != space.x or cell[1, 1] != space.y or cell[2, 2] != space.z
+        cell[:] = 0.0
+        cell[0, 0] = space.x
+        cell[1, 1] = space.y
+        cell[2, 2] = space.z
+        return changed
+
+    return fill
