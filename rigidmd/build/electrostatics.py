@@ -1,6 +1,7 @@
-"""Charges of a scene become terms: the law between pairs, what periodic images add, and constants of rigid molecules."""
+"""Charges of a scene become terms: the law between pairs, what images add, constants of rigid molecules."""
 
-from math import inf, pi
+from collections.abc import Callable
+from math import inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ from rigidmd.forces import ewald
 from rigidmd.forces.coulomb import reaction_field, self_energy
 from rigidmd.forces.ewald_errors import (
     FAREST,
-    Charges,
     alpha_for,
     charges_of,
     mesh_error,
@@ -24,6 +24,7 @@ from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.screened import damped_self_energy, damped_shifted_force, screened_coulomb
 from rigidmd.forces.sites import BodySites, CentralSites
 from rigidmd.forces.space import Space, cell_of
+from rigidmd.forces.terms import State
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import COULOMB, KJ_PER_MOL
@@ -61,29 +62,30 @@ class Electrostatics(NamedTuple):
 
     terms: dict[str, NamedTuple]
     constants: dict[str, float]  # u Å²/ps²
-    notes: list[str]
+    pressure: float = 0.0  # u/(Å ps²), that no motion changes
+    force_error: float | None = None  # estimated rms error of the force on a site, u Å/ps²; with Ewald sums
+    notes: tuple[str, ...] = ()
 
 
-def electrostatics(scene: MolecularScene, charged: Charged, space: Space, cutoff: float, start: float):
-    """Terms, constants and notes for charges; start : where a switch of the reaction field begins, Å."""
+def electrostatics(
+    scene: MolecularScene, charged: Charged, space: Space, cutoff: float, start: float, state: State
+) -> Electrostatics:
+    """What the charges of a scene add. start : where a switch of the reaction field begins, Å. Raises SceneError."""
     forces = scene.forces
 
-    def between_pairs(law):
+    def between_pairs(law: NamedTuple) -> NamedTuple:
         return pair_forces(law, space, charged.sites, forces.skin_A, scene.precision, charged.group)
 
     charge = charged.charge_e
     if forces.electrostatics == "reaction_field":
         law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
-        constants = {}
-        if cutoff < inf:
-            own = charged.each(lambda q, x: self_energy(law._replace(charge=q), x))
-            constants["reaction_field_self"] = own
-        return Electrostatics({"coulomb": between_pairs(law)}, constants, [])
+        own = charged.each(lambda q, x: self_energy(law._replace(charge=q), x)) if cutoff < inf else None
+        return Electrostatics({"coulomb": between_pairs(law)}, {} if own is None else {"reaction_field_self": own})
     if forces.electrostatics == "damped_shifted_force":
         law = damped_shifted_force(charge, cutoff, forces.damping_per_A)
         own = charged.each(lambda q, x: damped_self_energy(law._replace(charge=q), x))
-        return Electrostatics({"coulomb": between_pairs(law)}, {"damped_self": own}, [])
-    return _ewald(scene, charged, space, cutoff, between_pairs)
+        return Electrostatics({"coulomb": between_pairs(law)}, {"damped_self": own})
+    return _ewald(scene, charged, space, cutoff, between_pairs, state)
 
 
 def electrostatic_faults(scene: MolecularScene, space: Space, cutoff: float) -> list[str]:
@@ -101,108 +103,134 @@ def electrostatic_faults(scene: MolecularScene, space: Space, cutoff: float) -> 
     given = {"damped_shifted_force": "damping_per_A", "ewald": "ewald_alpha_per_A", "pme": "ewald_alpha_per_A"}
     if not faults and (key := given.get(method)) and (getattr(forces, key) or 0.0) * cutoff > FAREST:
         faults.append(
-            f"forces.{key} = {getattr(forces, key):g} with a cut-off of {cutoff:g} Å screens charges by "
-            f"erfc({getattr(forces, key) * cutoff:.3g}) there, far below rounding; at most {FAREST / cutoff:.3g} is of use"
+            f"forces.{key} = {getattr(forces, key):g} with a cut-off of {cutoff:g} Å screens charges there by "
+            f"erfc({getattr(forces, key) * cutoff:.3g}), far below rounding; at most {FAREST / cutoff:.3g} is of use"
         )
     return faults
 
 
-def _ewald(scene: MolecularScene, charged: Charged, space: Space, cutoff: float, between_pairs) -> Electrostatics:
-    forces, volume = scene.forces, space.volume
-    charge = ewald.in_energy_units(charged.charge_e)
-    net = charged.charge_e.sum()
+class Settings(NamedTuple):
+    """Of an Ewald sum, and what it leaves out."""
+
+    alpha: float  # 1/Å
+    waves: ewald.Waves
+    grid: tuple[int, int, int] | None  # of PME
+    order: int | None
+    real_error: float  # e²/Å², see ewald_errors
+    wave_error: float
+
+
+def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: float) -> Settings:
+    """What the scene gives, and what follows from the accuracy it asks for."""
+    forces, volume, cell = scene.forces, space.volume, cell_of(space)
     charges = charges_of(
         [
             (int((charged.index == k).sum()), m.charges[c], m.positions_body[c])
             for k, (m, c) in enumerate(zip(charged.species, charged.chosen, strict=True))
         ]
     )
-    share = forces.ewald_accuracy / np.sqrt(2)
+    share = forces.ewald_accuracy / sqrt(2)  # for either part
+    asked = f"forces.ewald_accuracy = {forces.ewald_accuracy:g} cannot be had"
     alpha = forces.ewald_alpha_per_A or alpha_for(charges, cutoff, volume, share)
     if alpha * cutoff > FAREST:
-        raise SceneError(
-            scene.source,
-            [f"forces.ewald_accuracy = {forces.ewald_accuracy:g} cannot be had with a cut-off of {cutoff:g} Å"],
-        )
+        raise SceneError(scene.source, [f"{asked} with a cut-off of {cutoff:g} Å; take a longer one"])
+    beyond = real_error(charges, alpha, cutoff, volume)
+    reciprocal = 2 * pi * np.linalg.inv(cell).T
+    grid, order = forces.pme_grid, forces.pme_order
+    if forces.electrostatics == "pme":
+        if grid is None or order is None:
+            found = mesh_for(charges, alpha, cell, share, order, grid)
+            if found is None:
+                given = " with the forces.pme_order or pme_grid that is given" if order or grid else ""
+                raise SceneError(
+                    scene.source,
+                    [f"{asked}{given} at alpha = {alpha:.3g} 1/Å; ask for less, or take a longer cut-off"],
+                )
+            grid, order = found
+        over = waves_for(charges, alpha, reciprocal, share)
+        return Settings(alpha, over, grid, order, beyond, mesh_error(charges, alpha, cell, grid, order))
+    if forces.ewald_k_max is not None:
+        most = forces.ewald_k_max if isinstance(forces.ewald_k_max, tuple) else (forces.ewald_k_max,) * 3
+        over = ewald.waves(most, forces.ewald_k2_max)
+        if over.total == 0:
+            raise SceneError(scene.source, ["forces.ewald_k_max leaves no wave at all"])
+    else:
+        over = waves_for(charges, alpha, reciprocal, share)
+    return Settings(alpha, over, None, None, beyond, wave_error(charges, alpha, radius_of(over.total, volume), volume))
+
+
+def _ewald(
+    scene: MolecularScene,
+    charged: Charged,
+    space: Space,
+    cutoff: float,
+    between_pairs: Callable[[NamedTuple], NamedTuple],
+    state: State,
+) -> Electrostatics:
+    settings = _settings(scene, charged, space, cutoff)
+    forces, alpha = scene.forces, settings.alpha
+    charge = ewald.in_energy_units(charged.charge_e)
     law = screened_coulomb(charged.charge_e, cutoff, alpha)
-    over, settings, waves_left = _reciprocal(scene, charged, charges, space, alpha, share, charge)
+    if settings.grid is None:
+        over = ewald.ewald_sum(charge, alpha, space, charged.sites, settings.waves)
+        most = " ".join(map(str, settings.waves.most))
+        how = f"{settings.waves.total} waves, |n| up to {most}"
+    else:
+        from rigidmd.forces.pme import pme  # rocket-fft is for scenes with PME only
+
+        dtype = np.float64 if scene.precision == "double" else np.float32
+        over = pme(charge, alpha, space, charged.sites, settings.grid, settings.order, dtype)
+        how = f"grid {' x '.join(map(str, settings.grid))}, splines of order {settings.order}"
     terms = {"coulomb_real": between_pairs(law), "coulomb_reciprocal": over}
     constants = {
         "coulomb_self": charged.each(lambda q, x: ewald.self_energy(q, alpha)),
         "coulomb_intramolecular": charged.each(lambda q, x: ewald.intramolecular_energy(q, x, alpha)),
     }
-    real_left = real_error(charges, alpha, cutoff, volume)
-    estimate = float(np.hypot(real_left, waves_left))
-    unit = COULOMB / KJ_PER_MOL
+    error = float(np.hypot(settings.real_error, settings.wave_error))
     notes = [
-        f"{scene.forces.electrostatics}: alpha {alpha:.6g} 1/Å, cut-off {cutoff:g} Å, {settings}",
-        f"estimated rms error of the force on a site {estimate:.2g} e²/Å² = {estimate * unit:.2g} kJ/(mol Å): "
-        f"{real_left:.2g} from pairs beyond the cut-off, {waves_left:.2g} from the reciprocal part",
+        f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cut-off {cutoff:g} Å, {how}",
+        f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
+        f"kJ/(mol Å); {settings.real_error:.2g} beyond the cut-off, {settings.wave_error:.2g} in the reciprocal part",
     ]
-    if abs(net) > NEUTRAL * np.abs(charged.charge_e).sum():
-        terms["coulomb_background"] = ewald.background(charge, alpha, space)
+    still = charged.frozen[charged.sites.molecule]
+    net, net_still = charge.sum(), charge[still].sum()
+    neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
+    if not neutral:
+        terms["coulomb_background"] = ewald.background(net**2 - net_still**2, alpha, space)
         notes.append(
-            f"the box has a net charge of {net:+g} e, which an even background of the opposite charge makes neutral; "
-            "energies and pressure then depend on the size of the box"
+            f"the box has a net charge of {charged.charge_e.sum():+.6g} e; an even background of the opposite charge "
+            "makes it neutral, and energies and pressure depend on the size of the box"
         )
-        if forces.ewald_surface_permittivity < inf:
-            raise SceneError(
-                scene.source,
-                [
-                    f"forces.ewald_surface_permittivity: a box with a net charge, {net:+g} e, has no dipole of its own; "
-                    "leave it out"
-                ],
-            )
-    if forces.ewald_surface_permittivity < inf:
-        terms["coulomb_surface"] = ewald.surface_dipole(charge, forces.ewald_surface_permittivity, space, charged.sites)
-    return Electrostatics(terms, constants, notes)
+    if (permittivity := forces.ewald_surface_permittivity) < inf:
+        if not neutral:
+            fault = "forces.ewald_surface_permittivity: a box with a net charge has no dipole of its own; leave it out"
+            raise SceneError(scene.source, [fault])
+        terms["coulomb_surface"] = ewald.surface_dipole(charge, permittivity, space, charged.sites)
+    pressure = 0.0
+    if still.any():
+        constants["coulomb_frozen"], pressure = _of_frozen(
+            charged, charge * still, space, settings, permittivity, state
+        )
+    return Electrostatics(terms, constants, pressure, error * COULOMB, tuple(notes))
 
 
-def _reciprocal(
-    scene: MolecularScene,
-    charged: Charged,
-    charges: Charges,
-    space: Space,
-    alpha: float,
-    error: float,
-    charge: np.ndarray,
-):
-    """The reciprocal term, its settings in words, and the error it leaves."""
-    forces = scene.forces
-    if forces.electrostatics == "pme":
-        return _mesh(scene, charged, charges, space, alpha, error, charge)
-    reciprocal = 2 * pi * np.linalg.inv(cell_of(space)).T
-    if forces.ewald_k_max is not None:
-        most = forces.ewald_k_max if isinstance(forces.ewald_k_max, tuple) else (forces.ewald_k_max,) * 3
-        over = ewald.waves(most, forces.ewald_k2_max)
-        if over.total == 0:
-            raise SceneError(scene.source, ["forces.ewald_k_max and ewald_k2_max leave no wave at all"])
-    else:
-        over = waves_for(charges, alpha, reciprocal, error)
-    left = wave_error(charges, alpha, radius_of(over.total, space.volume), space.volume)
-    settings = f"{over.total} waves, |n| up to {' '.join(map(str, over.most))}"
-    return ewald.ewald_sum(charge, alpha, space, charged.sites, over), settings, left
+def _of_frozen(
+    charged: Charged, charge: np.ndarray, space: Space, settings: Settings, permittivity: float, state: State
+) -> tuple[float, float]:
+    """Energy and pressure that take out what frozen molecules do to one another in sums over images: constants.
 
-
-def _mesh(scene: MolecularScene, charged: Charged, charges: Charges, space: Space, alpha: float, error: float, charge):
-    """The same on a grid."""
-    from rigidmd.forces.pme import pme  # rocket-fft is for scenes with PME only
-
-    forces, cell = scene.forces, cell_of(space)
-    grid, order = forces.pme_grid, forces.pme_order
-    if grid is None or order is None:
-        found = mesh_for(charges, alpha, cell, error, order, grid)
-        if found is None:
-            given = " with this forces.pme_order or pme_grid" if order or grid else ""
-            raise SceneError(
-                scene.source,
-                [
-                    f"forces.ewald_accuracy = {forces.ewald_accuracy:g} cannot be had{given} at alpha = {alpha:.3g} 1/Å; "
-                    "take a larger ewald_accuracy, a longer cutoff_A or a finer grid"
-                ],
-            )
-        grid, order = found
-    left = mesh_error(charges, alpha, cell, grid, order)
-    dtype = np.float64 if scene.precision == "double" else np.float32
-    settings = f"grid {' x '.join(map(str, grid))}, splines of order {order}"
-    return pme(charge, alpha, space, charged.sites, grid, order, dtype), settings, left
+    charge (s,) : 0 for sites that move
+    """
+    sites, volume = charged.sites, space.volume
+    arms = np.zeros((len(charge), 3))
+    if isinstance(sites, BodySites):
+        arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offset_body)
+    position = state.position[sites.molecule] + arms
+    energy, force, virial = ewald.sum_of(charge, position, cell_of(space), settings.alpha, settings.waves)
+    dipole = charge @ position
+    surface = 2 * pi / ((2 * permittivity + 1) * volume)
+    force -= 2 * surface * charge[:, None] * dipole
+    energy += surface * float(dipole @ dipole)
+    trace = float(virial.trace()) + 3 * surface * float(dipole @ dipole)
+    trace -= 2 * surface * float(dipole @ dipole) + float((force * arms).sum())
+    return -energy, -trace / (3 * volume)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.electrostatics import Charged, electrostatic_faults, electrostatics
+from rigidmd.build.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
 from rigidmd.build.structure import Arrangement, read_geometry, read_structure
@@ -58,11 +58,12 @@ class System:
     terms: dict[str, NamedTuple]
     freedom: Freedom
     constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
-    tail_pressure: float  # u/(Å ps²)
+    tail_pressure: float  # u/(Å ps²), all that no motion changes
     sites: Sites
     from_lattice: bool
     cutoff: float  # Å
     left_out: list[str]
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -129,7 +130,7 @@ def build(scene: MolecularScene) -> System:
         np.zeros(1),
         np.zeros(1),
     )
-    terms, constants, tail_pressure, notes = _terms(scene, species, model, space, cutoff)
+    terms, constants, tail_pressure, charges = _terms(scene, species, model, space, cutoff, state)
     system = System(
         scene=scene,
         species=species,
@@ -144,7 +145,8 @@ def build(scene: MolecularScene) -> System:
         from_lattice=scene.structure is None,
         cutoff=cutoff,
         left_out=_left_out(scene, terms, model, space),
-        notes=notes,
+        force_error=charges.force_error if charges else None,
+        notes=list(charges.notes) if charges else [],
     )
     _set_momenta(system, arrangement)
     if scene.structure is not None:
@@ -344,8 +346,10 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
     return found
 
 
-def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float):
-    """Terms by name, constant energies by name, tail pressure, notes."""
+def _terms(
+    scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float, state: State
+) -> tuple[dict[str, NamedTuple], dict[str, float], float, Electrostatics | None]:
+    """Terms by name, constant energies by name, tail pressure, what charges are."""
     forces = scene.forces
     index = model.species
     usual = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
@@ -378,16 +382,16 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
         )
         if forces.tail_correction:
             constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
-    notes = []
+    found = None
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if forces.electrostatics != "none" and any(len(c) for c in chosen):
         sites = _taking_part(species, index, chosen)
         charged = Charged(species, index, frozen[index], chosen, sites, _groups(sites, frozen[index]))
-        found = electrostatics(scene, charged, space, cutoff, start)
+        found = electrostatics(scene, charged, space, cutoff, start, state)
         terms |= found.terms
         constants |= found.constants
-        notes = found.notes
-    return terms, constants, tail_pressure, notes
+        tail_pressure += found.pressure
+    return terms, constants, tail_pressure, found
 
 
 def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
@@ -399,6 +403,10 @@ def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) ->
         out.append(
             "charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one")
         )
+    elif "coulomb_reciprocal" not in terms:
+        out.append(f"sums over periodic images, Fourier transforms: electrostatics is {scene.forces.electrostatics}")
+    elif scene.forces.electrostatics == "ewald":
+        out.append("Fourier transforms: electrostatics is ewald, wave by wave")
     if isinstance(model.rotor, NoRotor):
         out.append("rotation and torques: every molecule is a point")
     if space.volume == inf:

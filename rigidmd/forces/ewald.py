@@ -34,7 +34,7 @@ WIDTH = lane_count(np.float64)
 
 
 class Waves(NamedTuple):
-    """Half of the vectors n = (n_x, n_y, n_z) of a sum; the others are their opposites. They stand in columns of n_z."""
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns of n_z; the others are their opposites."""
 
     column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, where in the sum that one stands
     count: np.ndarray  # (columns,) how many n_z there are
@@ -53,7 +53,10 @@ def waves(most: tuple[int, int, int], largest_square: int | None = None) -> Wave
 
 
 def waves_within(reciprocal: np.ndarray, radius: float) -> Waves:
-    """All n != 0 whose k is no longer than `radius` (1/Å); reciprocal (3, 3) has 2 pi times the reciprocal edges in rows."""
+    """All n != 0 whose k is no longer than `radius` (1/Å).
+
+    reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
+    """
     cell = 2 * pi * np.linalg.inv(reciprocal).T
     most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
     return _waves(tuple(most), lambda n: ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2)
@@ -116,6 +119,11 @@ class EwaldSum(NamedTuple):
     waves: Waves
     work: Work
     parts: Parts
+
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.work.force
 
     def with_room(self) -> "EwaldSum":
         """The term with its machine code."""
@@ -213,7 +221,7 @@ def _set_strengths(over, own, alpha, volume):
 @work(counted=False)
 def _turn(parcel, block):
     """Cosines and sines of a share of the sites, by the angle sum: each power costs one complex product."""
-    alpha, over, own = opened(parcel)
+    _alpha, over, own = opened(parcel)
     blocks, s = len(own.tallies), len(own.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
         for d in range(3):
@@ -302,7 +310,7 @@ def add_wave_virial(tally, energy, k, slope):
 @work(fastmath=PAIR_FLAGS, counted=False)
 def _push(parcel, block):
     """Forces on a share of the sites."""
-    alpha, over, own = opened(parcel)
+    _alpha, over, own = opened(parcel)
     width = width_of(own.charge)
     blocks, vectors = len(own.tallies), len(own.charge) // width
     for at in range(width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width):
@@ -330,6 +338,27 @@ def _push(parcel, block):
                 own.force[i, k] = own.push[k, i]
 
 
+def sum_of(
+    charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, over: Waves
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3); for once, nothing compiled."""
+    reciprocal = 2 * pi * np.linalg.inv(cell).T
+    turns = position @ reciprocal.T
+    energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))
+    for (x, y, z, _), count in zip(over.column, over.count, strict=True):
+        n = np.stack([np.full(count, x), np.full(count, y), z + np.arange(count)], axis=1)
+        k = n @ reciprocal
+        k2 = (k**2).sum(axis=1)
+        strength = 4 * pi / abs(np.linalg.det(cell)) * np.exp(-k2 / (4 * alpha**2)) / k2
+        phase = charge[:, None] * np.exp(1j * (turns @ n.T))
+        total = phase.sum(axis=0)
+        of = strength * np.abs(total) ** 2
+        energy += of.sum()
+        force += (2 * strength * (np.conj(total) * phase).imag) @ k
+        virial += of.sum() * np.eye(3) - np.einsum("k,ki,kj->ij", of * (2 / k2 + 1 / (2 * alpha**2)), k, k)
+    return float(energy), force, virial
+
+
 class Background(NamedTuple):
     """The charge, spread evenly, that makes a charged box neutral."""
 
@@ -339,9 +368,9 @@ class Background(NamedTuple):
     reciprocal: np.ndarray  # (3, 3) room for the volume
 
 
-def background(charge: np.ndarray, alpha: float, space: Space) -> Background:
-    """The term for charges (s,), in units where q²/r is an energy in u Å²/ps²."""
-    return Background(-pi / (2 * alpha**2) * float(charge.sum()) ** 2, space, np.zeros((3, 3)), np.zeros((3, 3)))
+def background(square: float, alpha: float, space: Space) -> Background:
+    """The term for a net charge whose square is given, in units where q²/r is an energy in u Å²/ps²."""
+    return Background(-pi / (2 * alpha**2) * square, space, np.zeros((3, 3)), np.zeros((3, 3)))
 
 
 @implements(terms.add_forces)
@@ -371,6 +400,11 @@ class SurfaceDipole(NamedTuple):
     force: np.ndarray  # (s, 3)
     cell: np.ndarray  # (3, 3) and
     reciprocal: np.ndarray  # (3, 3) room for the volume
+
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.force
 
     def with_own_work(self) -> "SurfaceDipole":
         """The term with work arrays that it shares with no other."""

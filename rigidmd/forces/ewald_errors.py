@@ -1,8 +1,8 @@
 """What Ewald sums leave out, estimated before anything is computed, and settings that keep it to what is asked for.
 
 An error here is the root mean square over sites of the vector by which the force on a site is wrong, for charges whose
-molecules stand and turn at random. It is given in units of COULOMB: of the force between two charges e, 1 Å apart. (That
-is the accuracy of LAMMPS' kspace_style.)
+molecules stand and turn at random. It is given in units of COULOMB: of the force between two charges e, 1 Å apart, as
+the accuracy of LAMMPS' kspace_style is.
 """
 
 from math import exp, pi, sqrt
@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
-
 
 from rigidmd.forces.ewald import Waves, waves_within
 from rigidmd.forces.splines import aliases

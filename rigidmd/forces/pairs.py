@@ -61,6 +61,11 @@ class PairForces(NamedTuple):
     sums: Sums
     parts: Parts
 
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.sums.force
+
     def with_room(self) -> "PairForces":
         """The term with its machine code and as much room as its last list asked for."""
         term = self._replace(pairs=neighbors.with_room(self.pairs))

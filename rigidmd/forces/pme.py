@@ -24,7 +24,7 @@ from rocket_fft import c2c, c2r, r2c
 
 from rigidmd.forces import terms
 from rigidmd.forces.ewald import add_wave_virial, invert_cell
-from rigidmd.forces.lanes import lane, load_eight, load_four, store, total
+from rigidmd.forces.lanes import load_eight, load_four, store, total
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.splines import aliases, weights
@@ -71,6 +71,7 @@ class Mesh(NamedTuple):
     axes: np.ndarray  # (3, 1) names of the axes
     tallies: np.ndarray  # (blocks, 10)
     lost: np.ndarray  # (blocks,) whether a position is no number
+    weight: np.ndarray  # (blocks, 64) the weights of one site, to be taken one by one
 
 
 class Parts(NamedTuple):
@@ -96,6 +97,11 @@ class Pme(NamedTuple):
     spline: UpToFour | UpToEight
     mesh: Mesh
     parts: Parts
+
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.mesh.force
 
     def with_room(self) -> "Pme":
         """The term with its machine code."""
@@ -151,6 +157,7 @@ def pme(
         axes=np.arange(3)[:, None],
         tallies=np.zeros((blocks, TALLY_SIZE)),
         lost=np.zeros(blocks, np.bool_),
+        weight=np.zeros((blocks, 64), kind),
     )
     return Pme(alpha, charge, space, sites, spline, mesh, Parts())
 
@@ -314,25 +321,24 @@ def _spread(parcel, block):
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
-    grid = mesh.grid
+    grid, weight = mesh.grid, mesh.weight[block]
     grid[low:high] = 0
     for before in range(min(high - low + order - 1, na)):
         corner = low - order + 1 + before
         corner += na if corner < 0 else 0
         for n in range(mesh.first[corner], mesh.first[corner + 1]):
             i = mesh.order[n]
-            x = weights_at(spline, mesh.part[i, 0])
-            y = weights_at(spline, mesh.part[i, 1])
+            store(weight, 0, weights_at(spline, mesh.part[i, 0]))
+            store(weight, 8, weights_at(spline, mesh.part[i, 1]))
             z = weights_at(spline, mesh.part[i, 2]) * mesh.part[i, 3]
             b, c = mesh.corner[i, 1], mesh.corner[i, 2]
             for j in range(order):
                 plane = corner + j
                 plane -= na if plane >= na else 0
                 if low <= plane < high:
-                    share = lane(x, j)
                     for k in range(order):
                         row = grid[plane, b + k]
-                        store(row, c, few(spline, row, c) + z * (share * lane(y, k)))
+                        store(row, c, few(spline, row, c) + z * (weight[j] * weight[8 + k]))
     for plane in range(low, high):
         for k in range(order - 1):
             for c in range(nc + order - 1):
@@ -414,14 +420,14 @@ def _pull(parcel, block):
     _alpha, charge, spline, mesh = opened(parcel)
     na = mesh.points[0]
     order = len(spline.nodes)
-    grid = mesh.grid
+    grid, weight = mesh.grid, mesh.weight[block]
     for n in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         i = mesh.order[n]
-        x = weights_at(spline, mesh.part[i, 0])
-        y = weights_at(spline, mesh.part[i, 1])
+        store(weight, 0, weights_at(spline, mesh.part[i, 0]))
+        store(weight, 8, weights_at(spline, mesh.part[i, 1]))
+        store(weight, 16, slopes_at(spline, mesh.part[i, 0]))
+        store(weight, 24, slopes_at(spline, mesh.part[i, 1]))
         z = weights_at(spline, mesh.part[i, 2])
-        dx = slopes_at(spline, mesh.part[i, 0])
-        dy = slopes_at(spline, mesh.part[i, 1])
         dz = slopes_at(spline, mesh.part[i, 2])
         a, b, c = mesh.corner[i, 0], mesh.corner[i, 1], mesh.corner[i, 2]
         nothing = z * 0.0
@@ -435,11 +441,11 @@ def _pull(parcel, block):
             tilted = nothing
             for k in range(order):
                 row = few(spline, grid[plane, b + k], c)
-                flat = flat + row * lane(y, k)
-                tilted = tilted + row * lane(dy, k)
-            along_a = along_a + flat * lane(dx, j)
-            along_b = along_b + tilted * lane(x, j)
-            along_c = along_c + flat * lane(x, j)
+                flat = flat + row * weight[8 + k]
+                tilted = tilted + row * weight[24 + k]
+            along_a = along_a + flat * weight[16 + j]
+            along_b = along_b + tilted * weight[j]
+            along_c = along_c + flat * weight[j]
         ga = -charge[i] * mesh.points[0] * total(along_a * z) * (0.5 / pi)
         gb = -charge[i] * mesh.points[1] * total(along_b * z) * (0.5 / pi)
         gc = -charge[i] * mesh.points[2] * total(along_c * dz) * (0.5 / pi)

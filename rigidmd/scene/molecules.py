@@ -149,7 +149,7 @@ class Forces(Section):
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Of damped_shifted_force; 0 for none"""
-    ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] = 1e-4
+    ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] = 1e-5
     """Of ewald and pme: rms error of the force on a site, over that between two charges e at 1 Å; sets what follows"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
