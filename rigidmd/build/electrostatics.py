@@ -113,7 +113,7 @@ class Settings(NamedTuple):
     """Of an Ewald sum, and what it leaves out."""
 
     alpha: float  # 1/Å
-    waves: ewald.Waves
+    waves: ewald.Waves | None  # of Ewald; of PME those that tell what frozen molecules do to one another
     grid: tuple[int, int, int] | None  # of PME
     order: int | None
     real_error: float  # e²/Å², see ewald_errors
@@ -147,8 +147,9 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
                     [f"{asked}{given} at alpha = {alpha:.3g} 1/Å; ask for less, or take a longer cut-off"],
                 )
             grid, order = found
-        over = waves_for(charges, alpha, reciprocal, share)
-        return Settings(alpha, over, grid, order, beyond, mesh_error(charges, alpha, cell, grid, order))
+        left = mesh_error(charges, alpha, cell, grid, order)
+        over = waves_for(charges, alpha, reciprocal, 1e-3 * left) if charged.frozen.any() else None
+        return Settings(alpha, over, grid, order, beyond, left)
     if forces.ewald_k_max is not None:
         most = forces.ewald_k_max if isinstance(forces.ewald_k_max, tuple) else (forces.ewald_k_max,) * 3
         over = ewald.waves(most, forces.ewald_k2_max)
