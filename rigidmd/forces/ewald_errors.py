@@ -130,7 +130,7 @@ def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int
         twice[-1] = 1.0
     left = float((wrong * twice).sum()) / (volume * abs(np.linalg.det(proxy)))
     beyond = wave_error(charges, alpha, radius_of(int(np.prod(grid)), volume), volume)
-    return float(np.hypot(sqrt(charges.square / charges.count * left), beyond))
+    return float(np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond))  # rounding can be negative
 
 
 def smooth_size(least: float) -> int:

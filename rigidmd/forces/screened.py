@@ -21,6 +21,7 @@ from rigidmd.units import COULOMB
 #: in its evaluation makes, 1.5e-7 and 5e-15 for alpha times the cut-off up to 4. Fewer terms are faster: 12 for 16 took
 #: 4.4 for 4.9 ms of a step of 4096 waters.
 FIT_ERROR = {np.dtype(np.float64): 2e-16, np.dtype(np.float32): 3e-8}
+STEP = {np.dtype(np.float64): 4, np.dtype(np.float32): 2}
 
 
 class Screening(NamedTuple):
@@ -32,29 +33,37 @@ class Screening(NamedTuple):
 
 
 def screening(alpha: float, cutoff: float, dtype: type = np.float64) -> Screening:
-    """The polynomials for screening by alpha (1/Å) up to a cut-off (Å), for lanes of a NumPy dtype."""
+    """The polynomials for screening by alpha (1/Å) up to a cut-off (Å), for lanes of a NumPy dtype.
+
+    Series are cut where what is left is below FIT_ERROR of the value at r = 0. Both have as many terms, a multiple of
+    STEP, so that small changes of alpha meet the same compiled code.
+    """
     kind = np.dtype(dtype)
-    x = alpha * cutoff
-    scale = kind.type(2 / cutoff**2)
-    return Screening(scale, *(tuple(map(kind.type, _fitted(x, alpha, p, FIT_ERROR[kind]))) for p in (0, 2)))
+    series = [_series(alpha * cutoff, power) for power in (0, 2)]
+    left = [np.cumsum(np.abs(s[::-1]))[::-1] for s in series]
+    needed = max(int(np.sum(rest > FIT_ERROR[kind] * rest[0])) for rest in left)
+    terms = -(-max(needed, 1) // STEP[kind]) * STEP[kind]
+    strength = 2 / sqrt(pi) * alpha
+    energy, force = (np.polynomial.chebyshev.cheb2poly(s[:terms]) for s in series)
+    return Screening(
+        kind.type(2 / cutoff**2),
+        tuple(map(kind.type, strength * energy)),
+        tuple(map(kind.type, strength * 2 * alpha**2 * force)),
+    )
 
 
-def _fitted(x: float, alpha: float, power: int, error: float) -> np.ndarray:
-    """Coefficients in ascending powers of t for 2/sqrt(pi) alpha (2 alpha²)^(power/2) times the integral over s from 0
-    to 1 of s^power exp(-x² s² (1 + t)/2): erf(alpha r)/r for power 0, its force over r for power 2.
+def _series(x: float, power: int) -> np.ndarray:
+    """Chebyshev coefficients over t, -1 ... 1, of the integral over s from 0 to 1 of s^power exp(-x² s² (1 + t)/2).
 
-    The Chebyshev coefficients of the exponential are Bessel functions, all of one sign under the integral, so that even
-    the smallest is good to rounding and powers of t can be had from them. The series is cut where what is left is below
-    `error` of the value at r = 0; terms come in pairs, so that small changes of alpha meet the same compiled code.
+    With x = alpha cutoff that is, but for its strength, erf(alpha r)/r for power 0 and its force over r for power 2.
+    Those of the exponential are Bessel functions, all of one sign under the integral, so that even the smallest is good
+    to rounding and powers of t can be had from them.
     """
     node, weight = np.polynomial.legendre.leggauss(64 + int(8 * x))
     s, weight = 0.5 * (1 + node), 0.5 * weight
-    k = np.arange(16 + int(8 * x))[:, None]
-    series = (-1.0) ** k[:, 0] * (ive(k, 0.5 * (x * s) ** 2) @ (weight * s**power)) * np.where(k[:, 0] == 0, 1, 2)
-    left = np.cumsum(np.abs(series[::-1]))[::-1]
-    needed = max(1, int(np.sum(left > error * left[0])))
-    strength = 2 / sqrt(pi) * alpha * (2 * alpha**2) ** (power // 2)
-    return strength * np.polynomial.chebyshev.cheb2poly(series[: -(-needed // 2) * 2])
+    k = np.arange(16 + int(8 * x))
+    bessel = ive(k[:, None], 0.5 * (x * s) ** 2) @ (weight * s**power)
+    return np.where(k == 0, 1, 2) * (-1.0) ** k * bessel
 
 
 class ScreenedCoulomb(NamedTuple):

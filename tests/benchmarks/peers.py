@@ -605,7 +605,12 @@ def arguments() -> argparse.Namespace:
         "--steps 2,4,8 --json peers.json --figure peers.png",
     )
     add = parser.add_argument
-    add("--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1 (SPC/E), W2 (SPC/E with PME), W3 (N2); all")
+    add(
+        "--workloads",
+        type=choice(WORKLOADS),
+        default=list(WORKLOADS),
+        help="W1 (SPC/E), W2 (SPC/E with PME), W3 (N2); all",
+    )
     add("--engines", type=choice(ENGINES), default=list(ENGINES), help=f"of {','.join(ENGINES)}; all")
     add("--cores", type=numbers(int), default=[1, 2], help="of speed; 1,2")
     add("--accuracy-cores", type=int, help="of accuracy; the largest of --cores")
