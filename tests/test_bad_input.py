@@ -300,10 +300,6 @@ def bend(lines):
     lines[3] = lines[3][:20] + "   5.000   5.000   5.000" + lines[3][44:]
 
 
-def lose_velocity(lines):
-    lines[10] = lines[10][:44]
-
-
 def wild_velocity(lines):
     lines[10] = lines[10][:44] + "     nan  0.0000  0.0000"
 
@@ -319,7 +315,6 @@ def nonsense(lines):
         (rename, ["molecule 1", "'ETH'", "C2 H", "expected spce (O H2)"]),
         (overlap, ["molecules 1 and 2 overlap"]),
         (bend, ["molecule 1", "is no spce", "from the rigid template"]),
-        (lose_velocity, ["ASE cannot read it", "velocities were not specified"]),
         (wild_velocity, ["atom 9", "a velocity that is not a finite number"]),
         (nonsense, ["atom 9", "not a finite number"]),
     ],

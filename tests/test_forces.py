@@ -142,11 +142,16 @@ def test_a_list_with_little_room_grows_and_misses_nothing():
 @pytest.mark.parametrize("edge", [31.1, None])
 def test_lists_begin_with_about_the_room_they_need(edge):
     _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)
-    begun = [term.pairs.entries.shape[1] for term in engine.terms.values() if isinstance(term, PairForces)]
+    terms = [term for term in engine.terms.values() if isinstance(term, PairForces)]
+    begun = [(term.pairs.entries.shape[1], term.sums.others.shape[1]) for term in terms]
     engine.evaluate(state)
-    needed = [term.pairs.needed[:, 0].max() for term in engine.terms.values() if isinstance(term, PairForces)]
-    for room, most in zip(begun, needed, strict=True):
-        assert most <= room * 1.1 and room < 1.6 * most + 16
+    terms = [term for term in engine.terms.values() if isinstance(term, PairForces)]
+    for (entries, others), term in zip(begun, terms, strict=True):
+        lanes = 4 * len(term.pairs.clusters.order) // len(term.pairs.clusters.origin)
+        needed = term.pairs.needed.max(axis=0) * (1, 1, 3 * lanes)
+        assert needed[0] <= 1.1 * entries and entries < 1.6 * needed[0] + 16
+        if edge:
+            assert needed[2] <= 1.2 * others and others < 1.6 * needed[2] + 16
 
 
 def test_the_list_is_rebuilt_for_moves_and_for_turns():

@@ -26,7 +26,7 @@ RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 
 # schemes is a table of numbers that scenes name; it holds no code that knows of forces
 LIBRARIES = {
-    "ase": {"build/structure.py"},
+    "ase": {"build/structure_files.py", "build/matching.py"},
     "MDAnalysis": {"output/trajectory.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/pme.py"},

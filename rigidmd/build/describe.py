@@ -123,7 +123,8 @@ def array_bytes(value) -> int:
     """Bytes of all arrays in nested tuples."""
     if isinstance(value, System):
         # The state four times: the start, the one that moves, the last good one, forces and torques.
-        return 4 * array_bytes(value.state) + array_bytes(tuple(value.terms.values())) + array_bytes(value.model)
+        fixed = (tuple(value.terms.values()), value.model, value.sites)
+        return 4 * array_bytes(value.state) + array_bytes(fixed)
     if isinstance(value, np.ndarray):
         return value.nbytes
     return sum(array_bytes(part) for part in value) if isinstance(value, tuple) else 0

@@ -10,7 +10,8 @@ import numpy as np
 from rigidmd.build.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
-from rigidmd.build.structure import Arrangement, read_geometry, read_structure
+from rigidmd.build.structure import Arrangement, read_structure
+from rigidmd.build.structure_files import read_geometry
 from rigidmd.dynamics.advance import Model
 from rigidmd.errors import Faults, SceneError, StructureError
 from rigidmd.forces.lennard_jones import lennard_jones, tail
@@ -114,7 +115,7 @@ def build(scene: MolecularScene) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
     species = _species(scene)
     arrangement = _arrange(scene, species)
-    space = Orthorhombic(*arrangement.edges) if arrangement.edges else Unbounded()
+    space = Unbounded() if arrangement.cell is None else Orthorhombic(*map(float, np.diag(arrangement.cell)))
     cutoff = _cutoff(scene, space, species)
     frozen = np.array([entry.frozen for entry in scene.molecules])
     if frozen[arrangement.species].all():
@@ -154,6 +155,7 @@ def build(scene: MolecularScene) -> System:
             f"{n} molecules read from {scene.structure.file}; atoms against rigid templates: "
             f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
         )
+        system.notes += [f"{scene.structure.file}: {note}" for note in arrangement.notes]
         if faults := _overlaps(system):
             raise StructureError(str(scene.path(scene.structure.file)), faults)
     return system
@@ -221,14 +223,18 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules) -> tuple[Site, ...
 def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     if scene.structure is not None:
         path = scene.path(scene.structure.file)
-        found = read_structure(path, species, scene.box.edges, scene.box.periodic, scene.structure.tolerance)
+        start = scene.structure
+        found = read_structure(
+            path, species, scene.box.edges, scene.box.periodic, start.tolerance, start.frame, start.repeat
+        )
         faults = []
         for k, entry in enumerate(scene.molecules):
             present = int((found.species == k).sum())
             if entry.count is not None and entry.count != present:
                 faults.append(f"holds {present} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
         if scene.structure.velocities and found.velocity is None:
-            faults.append("holds no velocities, or not for every atom; leave out structure.velocities = true")
+            told = "".join(f"; {note}" for note in found.notes if "velocit" in note)
+            faults.append(f"holds no velocities for all atoms{told}. Leave out structure.velocities = true")
         if faults:
             raise StructureError(str(path), faults)
         return found
@@ -243,7 +249,7 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         rotation=random_rotations(rng, n),
         velocity=None,
         angular_momentum_body=None,
-        edges=edges if scene.box.periodic else None,
+        cell=np.diag(edges).astype(float) if scene.box.periodic else None,
         residual_rms=0.0,
         residual_max=0.0,
     )

@@ -53,29 +53,37 @@ def grow(tree, clusters):
 
 
 @kernel(fastmath=PAIR_FLAGS, counted=False)
-def within_reach(tree, low, high, radius2, stack, found, count):
+def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
     """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,); ascending.
 
-    Returns the new count, which may exceed the room; stack (levels, 2) is scratch.
+    Only those that are at most half a round ahead of cluster c, all clusters being thought of as a ring. Returns the
+    new count, which may exceed the room; stack (levels, 2) is scratch.
     """
     arity = width_of(tree.low)
     top = len(tree.level) - 2
+    half = clusters // 2
     depth = 0
+    size = arity**top  # clusters under a child of the family
     stack[0, 0] = 0  # family
     stack[0, 1] = _near(tree, tree.level[top], low, high, radius2)
     while depth >= 0:
         if stack[depth, 1] == 0:
             depth -= 1
+            size *= arity
             continue
         child = lowest_bit(stack[depth, 1])
         stack[depth, 1] &= stack[depth, 1] - 1
         node = stack[depth, 0] * arity + child
+        first = node * size
+        if not ((first <= c + half and first + size > c) or first <= c + half - clusters):
+            continue
         if depth == top:
             if count < len(found):
                 found[count] = node
             count += 1
         else:
             depth += 1
+            size //= arity
             stack[depth, 0] = node
             stack[depth, 1] = _near(tree, tree.level[top - depth] + node * arity, low, high, radius2)
     return count

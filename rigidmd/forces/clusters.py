@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of
+from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of, zeros
 from rigidmd.jit import PAIR_FLAGS, kernel
 
 BLOCKS = 16  # enough for 16 threads
@@ -40,19 +40,21 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
     return Clusters(
         bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
         order=np.zeros(slots, np.int64),
-        group=np.zeros(slots, np.int32),
+        group=zeros(slots, np.int32),
         anchor=np.zeros((slots, 3)),
-        origin=np.zeros(4 * count),
-        local=np.zeros(3 * slots, dtype),
-        reference=np.zeros(3 * slots, dtype),
+        origin=zeros(4 * count, np.float64),
+        local=zeros(3 * slots, dtype),
+        reference=zeros(3 * slots, dtype),
         moved2=np.zeros(blocks),
         wrapped=np.zeros((sites, 3)),
     )
 
 
 @kernel
-def sort_into_clusters(clusters, edges, position):
-    """Sort sites at positions (s, 3) in a box with these edges (3,) into clusters; they must then be settled there.
+def sort_into_clusters(clusters, cell, position):
+    """Sort sites at positions (s, 3) in a box of this cell (3, 3) into clusters; they must then be settled there.
+
+    They are brought into an upright brick with the cell's diagonal for edges, which fills space as well as the cell.
 
     Columns along z as wide as a cluster, up one and down the next, so that a cluster that begins in one column and ends
     in the next is compact too.
@@ -63,9 +65,12 @@ def sort_into_clusters(clusters, edges, position):
     high = np.full(3, -inf)
     wrapped = clusters.wrapped
     for i in range(s):
-        for k in range(3):
-            boxes = floor(position[i, k] / edges[k]) if edges[k] < inf else 0.0
-            wrapped[i, k] = position[i, k] - boxes * edges[k] if boxes != 0.0 else position[i, k]
+        wrapped[i] = position[i]
+        for k in range(2, -1, -1):
+            boxes = floor(wrapped[i, k] / cell[k, k]) if cell[k, k] < inf else 0.0
+            if boxes != 0.0:
+                for j in range(k + 1):
+                    wrapped[i, j] -= boxes * cell[k, j]
             low[k] = min(low[k], wrapped[i, k])
             high[k] = max(high[k], wrapped[i, k])
     extent = high - low

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.forces import pairs
-from rigidmd.forces.lanes import inverse_root, load
+from rigidmd.forces.lanes import inverse_root, load, zeros
 from rigidmd.forces.truncation import SWITCHES, Name, Polynomial, Shape, ended, ending, shape_of
 from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
@@ -27,7 +27,7 @@ class ReactionField(NamedTuple):
 
     def room(self, slots: int, dtype: type) -> "ReactionField":
         """The law with room for the charges in slots, in the precision of lanes."""
-        return self._replace(charge=np.zeros(slots, dtype))
+        return self._replace(charge=zeros(slots, dtype))
 
 
 def reaction_field(

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from rigidmd.forces import pairs
-from rigidmd.forces.lanes import inverse_root, load
+from rigidmd.forces.lanes import inverse_root, load, zeros
 from rigidmd.forces.truncation import (
     POLYNOMIALS,
     Bent,
@@ -41,7 +41,7 @@ class LennardJones(NamedTuple):
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
             return OneKind(*head, float(self.c12[0, 0]), float(self.c6[0, 0]))
-        table = np.zeros((2, kinds * slots), dtype)
+        table = zeros((2, kinds * slots), dtype)
         return ManyKinds(*head, np.zeros(slots, np.int32), *table)
 
 

@@ -12,18 +12,20 @@ list is cut into blocks of rows, filled by whichever thread takes them, so the l
 the same bits for any number of threads.
 """
 
-from math import ceil, inf, pi, sqrt
+from math import ceil, floor, inf, nan, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
 from rigidmd.forces.clusters import Clusters, clusters_of, follow_block, settle_block, sort_into_clusters
-from rigidmd.forces.lanes import bits, fill, load, load_beside, lowest_bit, smaller, width_of
-from rigidmd.forces.space import Space
+from rigidmd.forces.lanes import bits, count_bits, fill, load, load_beside, lowest_bit, smaller, store, width_of, zeros
+from rigidmd.forces.space import Space, cell_of
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
 from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, work
 
+IMAGE_BITS = 6
+IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
 SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
@@ -42,47 +44,68 @@ class Parts(NamedTuple):
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one law.
 
-    An entry is 32 * cluster + image, the image one of 27 (-1, 0, 1 boxes along x, y, z).
+    An entry is IMAGES * cluster + image; `shift` says where the image is.
     """
 
     cutoff: float  # Å
     skin: float  # Å
+    reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
     group: np.ndarray  # (s,) pairs inside one group are left out
     position: np.ndarray  # (s, 3) where the sites are now, lab frame, Å
-    edges: np.ndarray  # (3,) of the box, Å
+    cell: np.ndarray  # (3, 3) of the box, rows a, b, c, Å
     clusters: Clusters
     tree: BoxTree
-    shift: np.ndarray  # (4 * 27,) x, y, z, 0 of each image, Å
+    shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     row: np.ndarray  # (rows, SHELLS + 1) shell k of slots 2 r, 2 r + 1: entries[b, row[r, k]:row[r, k + 1]]
     entries: np.ndarray  # (blocks, capacity) int32
     special: np.ndarray  # (rows, 2) entries with a mask: masked[b, special[r, 0]:special[r, 1]]
     masked: np.ndarray  # (blocks, capacity, 3) entry, and as bits the lanes that count for either site of the row
-    needed: np.ndarray  # (blocks, 3) room the last build asked for: entries, masked entries, clusters from the first on
-    counters: np.ndarray  # (4,) usable (0 or 1); builds so far; shells that matter now; status of the preparation
+    needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
+    counters: np.ndarray  # (5,) usable (0 or 1); builds; shells that matter now; status of the preparation; images
     parts: Parts
 
 
-def empty_list(space: Space, group: np.ndarray, cutoff: float, skin: float, dtype: type) -> PairList:
-    """A list that will be built at its first use, with about the room that sites spread evenly would need."""
+@kernel(inline=True)
+def cluster_of(entry):
+    """The cluster that an entry names."""
+    return entry >> IMAGE_BITS
+
+
+@kernel(inline=True)
+def image_of(entry):
+    """The image of it."""
+    return entry & (IMAGES - 1)
+
+
+def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
+    """A list that will be built at its first use, with about the room that sites spread evenly would need.
+
+    reach : how far apart sites of one group can be, Å, infinite if nobody knows
+    """
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.moved2), len(clusters.order)
     rows = slots // 2
-    room = ceil(_clusters_met(space, len(clusters.origin) // 4, cutoff + skin) * rows / blocks)
+    count = len(clusters.origin) // 4
+    room = ceil(_clusters_met(space, count, cutoff + skin) * rows / blocks)
+    needed = np.zeros((blocks, 3), np.int64)
+    needed[:, 2] = _clusters_ahead(space, count, blocks, cutoff + skin)
     return PairList(
         cutoff=cutoff,
-        skin=min(skin, 0.5 * min(space)) if cutoff < inf else inf,  # else second images could come near between builds
+        reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
+        # longer, second images could come near between builds, and IMAGES would be too few
+        skin=min(skin, 0.45 * min(space.edges)) if cutoff < inf else inf,
         group=group,
         position=np.zeros((len(group), 3)),
-        edges=np.array(space),
+        cell=cell_of(space),
         clusters=clusters,
-        tree=box_tree(len(clusters.origin) // 4),
-        shift=np.zeros(4 * 27),
+        tree=box_tree(count),
+        shift=zeros(4 * IMAGES, np.float64),
         row=np.zeros((rows, SHELLS + 1), np.int32),
         entries=np.empty((blocks, room), np.int32),
         special=np.zeros((rows, 2), np.int32),
-        masked=np.empty((blocks, 0, 3), np.int32),
-        needed=np.zeros((blocks, 3), np.int64),
-        counters=np.zeros(4, np.int64),
+        masked=np.empty((blocks, ceil(1.5 * rows / blocks), 3), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
+        needed=needed,
+        counters=np.zeros(5, np.int64),
         parts=Parts(),
     )
 
@@ -96,6 +119,14 @@ def _clusters_met(space: Space, count: int, radius: float) -> float:
     edge = np.cbrt(space.volume / count)
     near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3  # Steiner's formula
     return min(0.42 * near / edge**3, count / 2) + 1  # half of them, a sixth less: measured, cubes touch with corners
+
+
+def _clusters_ahead(space: Space, count: int, blocks: int, radius: float) -> int:
+    """Clusters from the first of a block to the last that its rows are expected to meet."""
+    if space.volume == inf or radius == inf:
+        return 0
+    layers = (radius + 2 * np.cbrt(space.volume / count)) / space.x  # clusters are sorted along x first
+    return min(count, ceil(count * (min(layers, 0.5) + 1 / blocks)))
 
 
 def with_room(pairs: PairList) -> PairList:
@@ -176,11 +207,47 @@ def _prepare(parcel, block):
         if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
             pairs.counters[3] = NOT_FINITE
             return
-    sort_into_clusters(pairs.clusters, pairs.edges, pairs.position)
-    for image in range(27):
-        for k in range(3):
-            boxes = image // 3 ** (2 - k) % 3 - 1
-            pairs.shift[4 * image + k] = boxes * pairs.edges[k] if boxes != 0 else 0.0
+    sort_into_clusters(pairs.clusters, pairs.cell, pairs.position)
+    pairs.counters[4] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+
+
+@kernel
+def _find_images(cell, radius, shift):
+    """Shifts of the images of the brick (see clusters) that are within a radius of it; how many. No shift comes first.
+
+    Bricks stand in layers along c, in rows along b; 27 in an upright box, up to 48 in a slanted one, the radius being
+    no longer than any edge.
+    """
+    found = 1
+    for n in range(3):
+        shift[n] = 0.0
+    for z in range(-1, 2):
+        if z != 0 and cell[2, 2] == inf:
+            continue
+        first, last = _images_along(cell, 1, z * cell[2, 1] if z != 0 else 0.0, radius)
+        for y in range(first, last + 1):
+            x0 = (z * cell[2, 0] if z != 0 else 0.0) + (y * cell[1, 0] if y != 0 else 0.0)
+            left, right = _images_along(cell, 0, x0, radius)
+            for x in range(left, right + 1):
+                if x == y == z == 0:
+                    continue
+                for k in range(3):
+                    total = 0.0
+                    for n, vector in ((x, 0), (y, 1), (z, 2)):
+                        if n != 0:
+                            total += n * cell[vector, k]
+                    shift[4 * found + k] = total
+                found += 1
+    return found
+
+
+@kernel
+def _images_along(cell, k, offset, radius):
+    """First and last multiple of edge k that brings a brick, now at an offset, within a radius of the one at 0."""
+    edge = cell[k, k]
+    if edge == inf:
+        return 0, 0
+    return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
 
 
 @work(counted=False)
@@ -203,36 +270,35 @@ def _fill(parcel, block):
 class Scratch(NamedTuple):
     """What the rows of one cluster are made with."""
 
-    bounds2: np.ndarray  # (SHELLS,) squared outer radii of the shells, Å²
+    bounds2: np.ndarray  # (SHELLS,) squared outer radii of the shells, Å², in the precision of near2
+    cursor: np.ndarray  # (SHELLS,) where the next entry of a shell goes
     stack: np.ndarray  # (levels, 2) for within_reach
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     entry: np.ndarray  # (room,) candidates
-    inside: np.ndarray  # (room, SHELLS + 1) for each candidate the rows, as bits, with it in each shell or with a mask
-    special: np.ndarray  # (room,) candidates that need a mask for some row
-    row: np.ndarray  # (rows of a cluster, room)
-    ends: np.ndarray  # (rows of a cluster,) so far
+    each2: np.ndarray  # (lanes,) squared distances of the cluster's sites from a candidate
+    near2: np.ndarray  # (rows of a cluster, room) squared distance of a row from a candidate; no number with a mask
+    special: np.ndarray  # (rows of a cluster, room) candidates that need a mask with a row
+    specials: np.ndarray  # (rows of a cluster,) how many
 
 
 @kernel
 def _scratch(pairs, room):
     width = width_of(pairs.clusters.local)
-    bounds2 = np.empty(SHELLS)
+    bounds2 = np.empty(SHELLS, pairs.clusters.local.dtype)
     for k in range(SHELLS):
-        bounds2[k] = (
-            ((pairs.cutoff + k * pairs.skin / (SHELLS - 1)) * (1 + ROUNDING)) ** 2
-            if k
-            else (pairs.cutoff * (1 + ROUNDING)) ** 2
-        )
+        beyond = k * pairs.skin / (SHELLS - 1) if k > 0 else 0.0
+        bounds2[k] = ((pairs.cutoff + beyond) * (1 + ROUNDING)) ** 2
     return Scratch(
         bounds2,
+        np.empty(SHELLS, np.int64),
         np.empty((len(pairs.tree.level), 2), np.int64),
         np.empty(3),
         np.empty(3),
         np.empty(room, np.int64),
-        np.empty((room, SHELLS + 1), np.int64),
-        np.empty(room, np.int64),
-        np.empty((width // 2, room), np.int32),
+        np.empty(width, pairs.clusters.local.dtype),
+        np.empty((width // 2, room), pairs.clusters.local.dtype),
+        np.empty((width // 2, room), np.int64),
         np.empty(width // 2, np.int64),
     )
 
@@ -246,7 +312,7 @@ def fill_block(pairs, block):
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         candidates = _find_candidates(pairs, c, scratch)
         if candidates > len(scratch.entry):
-            scratch = _scratch(pairs, 2 * candidates)
+            scratch = _scratch(pairs, 256 * (candidates // 128))
             candidates = _find_candidates(pairs, c, scratch)
         entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
         window = max(window, ahead + c - clusters.bounds[block] + 1)
@@ -266,18 +332,18 @@ def _find_candidates(pairs, c, scratch):
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
     entry = scratch.entry
     candidates = 0
-    for image in range(27):
+    for image in range(pairs.counters[4]):
         reaches = True
         for k in range(3):
             shift = pairs.shift[4 * image + k]
             scratch.low[k] = tree.low[k, c] - shift
             scratch.high[k] = tree.high[k, c] - shift
             if shift != 0.0:
-                reaches &= abs(shift) < inf and scratch.high[k] > -radius and scratch.low[k] < pairs.edges[k] + radius
+                reaches &= scratch.high[k] > -radius and scratch.low[k] < pairs.cell[k, k] + radius
         if not reaches:
             continue
         first = candidates
-        found = within_reach(tree, scratch.low, scratch.high, radius * radius, scratch.stack, entry, first)
+        found = within_reach(tree, scratch.low, scratch.high, radius * radius, c, count, scratch.stack, entry, first)
         if found > len(entry):
             return found
         for n in range(first, found):
@@ -285,7 +351,7 @@ def _find_candidates(pairs, c, scratch):
             if ahead < 0:
                 ahead += count
             if 2 * ahead < count or (2 * ahead == count and c < entry[n]):
-                entry[candidates] = 32 * entry[n] + image
+                entry[candidates] = IMAGES * entry[n] + image
                 candidates += 1
     return candidates
 
@@ -296,97 +362,97 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
 
     Entries and masked entries of the block so far, and how far ahead on the ring the farthest cluster is.
     """
-    clusters = pairs.clusters
-    rows = width_of(clusters.local) // 2
-    count = len(clusters.origin) // 4
+    width = width_of(pairs.clusters.local)
+    rows = width // 2
+    count = len(pairs.clusters.origin) // 4
     entries, masked = pairs.entries[block], pairs.masked[block]
-    farthest = specials = 0
-    for n in range(candidates):
-        needs_mask = _sort_into_shells(pairs, c, scratch, n)
-        scratch.special[specials] = n
-        specials += needs_mask
-        ahead = (scratch.entry[n] >> 5) - c
-        farthest = max(farthest, ahead + count if ahead < 0 else ahead)
-    scratch.ends[:] = 0
-    for k in range(SHELLS):
-        for n in range(candidates):
-            inside = scratch.inside[n, k]
-            while inside != 0:
-                own = lowest_bit(inside) >> 1
-                inside &= inside - 1
-                scratch.row[own, scratch.ends[own]] = scratch.entry[n]
-                scratch.ends[own] += 1
-        for own in range(rows):
-            pairs.row[rows * c + own, k + 1] = scratch.ends[own]
+    farthest = 0
     for own in range(rows):
+        scratch.specials[own] = 0
+    for n in range(candidates):
+        _measure(pairs, c, scratch, n)
+        ahead = cluster_of(scratch.entry[n]) - c
+        farthest = max(farthest, ahead + count if ahead < 0 else ahead)
+    for own in range(rows):
+        near2 = scratch.near2[own]
+        for n in range(candidates, candidates + -candidates % width):
+            near2[n] = nan
         r = rows * c + own
-        enough = filled + scratch.ends[own] <= len(entries)
-        pairs.row[r, 0] = 0
-        for k in range(SHELLS + 1):
-            pairs.row[r, k] = pairs.row[r, k] + filled if enough else 0
-        if enough:
-            for n in range(scratch.ends[own]):
-                entries[filled + n] = scratch.row[own, n]
-        filled += scratch.ends[own]
+        begin = filled
+        for k in range(SHELLS):
+            scratch.cursor[k] = filled
+            pairs.row[r, k] = min(filled, len(entries))
+            filled = begin
+            for n in range(0, candidates, width):
+                filled += count_bits(bits(load(near2, n) <= scratch.bounds2[k]))
+        pairs.row[r, SHELLS] = min(filled, len(entries))
+        if filled <= len(entries):
+            # One loop over all shells: with one for each, soon over, the processor guessed wrong half the time.
+            for first in range(0, candidates, width):
+                inside = bits(load(near2, first) <= scratch.bounds2[SHELLS - 1])
+                while inside != 0:
+                    n = first + lowest_bit(inside)
+                    inside &= inside - 1
+                    shell = 0
+                    for k in range(SHELLS - 1):
+                        shell += near2[n] > scratch.bounds2[k]
+                    entries[scratch.cursor[shell]] = scratch.entry[n]
+                    scratch.cursor[shell] += 1
         pairs.special[r, 0] = min(filled_masked, len(masked))
-        for n in range(specials):
-            special = scratch.special[n]
-            if scratch.inside[special, SHELLS] >> 2 * own & 1:
-                entry = scratch.entry[special]
-                first = _mask_of_lanes(pairs, 2 * r, entry, scratch.bounds2[SHELLS - 1])
-                second = _mask_of_lanes(pairs, 2 * r + 1, entry, scratch.bounds2[SHELLS - 1])
-                if first | second:
-                    if filled_masked < len(masked):
-                        masked[filled_masked, 0] = entry
-                        masked[filled_masked, 1] = first
-                        masked[filled_masked, 2] = second
-                    filled_masked += 1
+        for n in range(scratch.specials[own]):
+            entry = scratch.special[own, n]
+            first_of_row = _mask_of_lanes(pairs, 2 * r, entry, scratch.bounds2[SHELLS - 1])
+            second = _mask_of_lanes(pairs, 2 * r + 1, entry, scratch.bounds2[SHELLS - 1])
+            if first_of_row | second:
+                if filled_masked < len(masked):
+                    masked[filled_masked, 0] = entry
+                    masked[filled_masked, 1] = first_of_row
+                    masked[filled_masked, 2] = second
+                filled_masked += 1
         pairs.special[r, 1] = min(filled_masked, len(masked))
     return filled, filled_masked, farthest
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _sort_into_shells(pairs, c, scratch, n):
-    """Which rows of a cluster have candidate n in which shell; whether some of them need a mask with it.
+def _measure(pairs, c, scratch, n):
+    """How near each row of a cluster is to candidate n, or that they need a mask.
 
     The sites are the lanes here, and the candidate's sites come one after the other: no sums across lanes, no guesses.
     """
     clusters = pairs.clusters
     local = clusters.local
     width = width_of(local)
-    everyone = (1 << width) - 1
     count = len(clusters.origin) // 4
-    other, image = scratch.entry[n] >> 5, scratch.entry[n] & 31
+    entry = scratch.entry[n]
+    other, image = cluster_of(entry), image_of(entry)
     at = 3 * width * c
     x = load(local, at) + apart(pairs, c, other, image, 0)
     y = load(local, at + width) + apart(pairs, c, other, image, 1)
     z = load(local, at + 2 * width) + apart(pairs, c, other, image, 2)
-    group = load_beside(clusters.group, width * c, local)
     nearest2 = fill(inf, local)
-    mates = group < group
     for lane in range(width):
         at = 3 * width * other + lane
         dx = x - local[at]
         dy = y - local[at + width]
         dz = z - local[at + 2 * width]
         nearest2 = smaller(nearest2, dx * dx + dy * dy + dz * dz)
-        mates = mates | (group == clusters.group[width * other + lane])
-    special = _rows_of(bits(mates))
+    special = 0
     if other == c or c == count - 1 or other == count - 1:
-        special = _rows_of(everyone)
-    taken = special
-    for k in range(SHELLS):
-        inside = _rows_of(bits(nearest2 <= scratch.bounds2[k])) & ~taken
-        scratch.inside[n, k] = inside
-        taken |= inside
-    scratch.inside[n, SHELLS] = special
-    return special != 0
-
-
-@kernel(inline=True)
-def _rows_of(sites):
-    """The rows with one or both of the sites that are given as bits, each as the bit of its first site."""
-    return (sites | sites >> 1) & 0x5555555555555555
+        special = (1 << width) - 1
+    elif bits(nearest2 <= pairs.reach2) != 0:
+        group = load_beside(clusters.group, width * c, local)
+        mates = group < group
+        for lane in range(width):
+            mates = mates | (group == clusters.group[width * other + lane])
+        special = bits(mates)
+    store(scratch.each2, 0, nearest2)
+    for own in range(width // 2):
+        if special >> 2 * own & 3:
+            scratch.near2[own, n] = nan  # inside no radius, not even an infinite one
+            scratch.special[own, scratch.specials[own]] = entry
+            scratch.specials[own] += 1
+        else:
+            scratch.near2[own, n] = min(scratch.each2[2 * own], scratch.each2[2 * own + 1])
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
@@ -398,7 +464,7 @@ def _mask_of_lanes(pairs, i, entry, radius2):
     local = clusters.local
     width = width_of(local)
     everyone = (1 << width) - 1
-    c, other, image = i // width, entry >> 5, entry & 31
+    c, other, image = i // width, cluster_of(entry), image_of(entry)
     at = 2 * width * c + i
     start = 3 * width * other
     dx = local[at] + apart(pairs, c, other, image, 0) - load(local, start)

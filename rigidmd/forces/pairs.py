@@ -5,6 +5,7 @@ and how its numbers for each site follow the sites into another order (`arrange`
 images, sums energies, virial and forces, and hands the forces to the bodies.
 """
 
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from rigidmd.forces.lanes import (
     double,
     fill,
     lane,
+    lane_count,
     load,
     load_beside,
     load_four,
@@ -23,10 +25,11 @@ from rigidmd.forces.lanes import (
     store,
     total,
     width_of,
+    zeros,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, empty_list, most_needed, update_list
+from rigidmd.forces.neighbors import PairList, cluster_of, empty_list, image_of, most_needed, update_list
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.space import Space
+from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
 from rigidmd.jit import PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
 
@@ -70,7 +73,8 @@ class PairForces(NamedTuple):
         """The term with its machine code and as much room as its last list asked for."""
         term = self._replace(pairs=neighbors.with_room(self.pairs))
         if (room := _room(term.pairs)) > term.sums.others.shape[1]:
-            others = np.zeros((len(term.sums.others), int(1.1 * room)), term.sums.others.dtype)
+            lanes = lane_count(dtype := term.sums.others.dtype)
+            others = zeros((len(term.sums.others), int(1.1 * room / lanes + 1) * lanes), dtype)
             term = term._replace(sums=term.sums._replace(others=others))
         if term.parts.forces == 0:
             content = (term.arranged, term.pairs, term.sums)
@@ -97,15 +101,23 @@ def pair_forces(
     group (s,) : sites of one group do not act on one another; the sites' molecules when not given
     """
     dtype = PRECISIONS[precision]
-    pairs = empty_list(space, sites.molecule if group is None else group, law.cutoff, skin, dtype)
+    if group is None:
+        group = sites.molecule
+    reach = _diameter(sites) if np.array_equal(group, sites.molecule) else inf
+    pairs = empty_list(space, group, reach, law.cutoff, skin, dtype)
     blocks, slots = len(pairs.needed), len(pairs.clusters.order)
     sums = Sums(
         force=np.zeros((len(sites.molecule), 3)),
-        own=np.zeros(3 * slots),
-        others=np.zeros((blocks, 0), dtype),
+        own=zeros(3 * slots, np.float64),
+        others=zeros((blocks, 3 * lane_count(dtype) * int(pairs.needed[:, 2].max())), dtype),
         tallies=np.zeros((blocks, TALLY_SIZE)),
     )
     return PairForces(law, law.room(slots, dtype), space, sites, pairs, sums, Parts())
+
+
+def _diameter(sites: BodySites | CentralSites) -> float:
+    """A bound on how far apart the sites of a molecule are, Å."""
+    return 2 * float(np.linalg.norm(sites.offset_body, axis=1).max()) if isinstance(sites, BodySites) else 0.0
 
 
 @kernel
@@ -137,9 +149,7 @@ def _add_pair_forces(term, state, load, tally):
         sums = term.sums
         place_sites(term.sites, state, pairs.position)
         builds = pairs.counters[1]
-        pairs.edges[0] = term.space.x
-        pairs.edges[1] = term.space.y
-        pairs.edges[2] = term.space.z
+        fill_cell(term.space, pairs.cell)
         status = update_list(pairs)
         if status != OK:
             return status
@@ -206,10 +216,22 @@ def block_forces(law, pairs, own, others, tallies, block):
             still = (zero, zero, zero)
             sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
             for n in range(pairs.special[i // 2, 0], pairs.special[i // 2, 1]):
+                between = _displacements(pairs, c, here, masked[n, 0])
                 masks = (masked[n, 1], masked[n, 2])
-                sums = _meet(law, pairs, block, c, i, here, masked[n, 0], masks, others, sums, tallies)
-            for n in range(pairs.row[i // 2, 0], pairs.row[i // 2, pairs.counters[2]]):
-                sums = _meet(law, pairs, block, c, i, here, entries[n], (None, None), others, sums, tallies)
+                sums = _meet(law, pairs, block, i, masked[n, 0], between, masks, others, sums, tallies)
+            # Displacements one entry ahead: what waits for them would fill the processor's queues before the next
+            # entry's could enter.
+            last = pairs.row[i // 2, pairs.counters[2]] - 1
+            entry = np.int32(0)
+            between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
+            if pairs.row[i // 2, 0] <= last:
+                entry = entries[pairs.row[i // 2, 0]]
+                between = _displacements(pairs, c, here, entry)
+            for n in range(pairs.row[i // 2, 0], last + 1):
+                ahead = entries[min(n + 1, last)]
+                after = _displacements(pairs, c, here, ahead)
+                sums = _meet(law, pairs, block, i, entry, between, (None, None), others, sums, tallies)
+                entry, between = ahead, after
             first, second, totals = sums
             for k in range(3):
                 own[at + k * width] = total(first[k])
@@ -220,29 +242,42 @@ def block_forces(law, pairs, own, others, tallies, block):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _meet(law, pairs, block, c, i, here, entry, masks, others, sums, tallies):
-    """The sites in slots i, i + 1 of cluster c meet another: forces into `others` and, with energies, onto `sums`."""
+def _displacements(pairs, c, here, entry):
+    """From a vector of other sites, those of an entry, to each of two sites of cluster c."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
-    other = entry >> 5
-    j = width * other
+    other = cluster_of(entry)
+    at = 3 * width * other
     offset = narrowed(
         load_four(clusters.origin, 4 * c)
-        - load_four(pairs.shift, 4 * (entry & 31))
+        - load_four(pairs.shift, 4 * image_of(entry))
         - load_four(clusters.origin, 4 * other),
         clusters.local,
     )
-    there = (
-        load(clusters.local, 3 * j) - lane(offset, 0),
-        load(clusters.local, 3 * j + width) - lane(offset, 1),
-        load(clusters.local, 3 * j + 2 * width) - lane(offset, 2),
-    )
+    x = load(clusters.local, at) - lane(offset, 0)
+    y = load(clusters.local, at + width) - lane(offset, 1)
+    z = load(clusters.local, at + 2 * width) - lane(offset, 2)
+    return _separation(here[0], x, y, z), _separation(here[1], x, y, z)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _separation(here, x, y, z):
+    """Displacements, and their squares, of a site from a vector of others."""
+    dx, dy, dz = here[0] - x, here[1] - y, here[2] - z
+    return dx, dy, dz, dx * dx + dy * dy + dz * dz
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
+    """The sites in slots i, i + 1 meet those of an entry: forces into `others` and, with energies, onto `sums`."""
+    width = width_of(pairs.clusters.local)
+    other = cluster_of(entry)
     first, second, totals = sums
-    gx, gy, gz, totals = _act(law, i, j, here[0], there, masks[0], totals, tallies)
-    hx, hy, hz, totals = _act(law, i + 1, j, here[1], there, masks[1], totals, tallies)
-    ahead = other - clusters.bounds[block]
+    gx, gy, gz, totals = _act(law, i, width * other, between[0], masks[0], totals, tallies)
+    hx, hy, hz, totals = _act(law, i + 1, width * other, between[1], masks[1], totals, tallies)
+    ahead = other - pairs.clusters.bounds[block]
     if ahead < 0:
-        ahead += len(clusters.origin) // 4
+        ahead += len(pairs.clusters.origin) // 4
     at = 3 * width * ahead
     store(others, at, load(others, at) - (gx + hx))
     store(others, at + width, load(others, at + width) - (gy + hy))
@@ -255,12 +290,9 @@ def _meet(law, pairs, block, c, i, here, entry, masks, others, sums, tallies):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _act(law, i, j, here, there, mask, totals, tallies):
+def _act(law, i, j, between, mask, totals, tallies):
     """Force on a site from each of a vector of others; energy and virial, where wanted, onto the vectors `totals`."""
-    dx = here[0] - there[0]
-    dy = here[1] - there[1]
-    dz = here[2] - there[2]
-    r2 = dx * dx + dy * dy + dz * dz
+    dx, dy, dz, r2 = between
     counts = r2 < law.cutoff * law.cutoff
     if mask is not None:
         counts = counts & mask_of(mask, r2)

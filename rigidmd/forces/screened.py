@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import erfc, ive
 
 from rigidmd.forces import pairs
-from rigidmd.forces.lanes import inverse_root, load, polynomial
+from rigidmd.forces.lanes import inverse_root, load, polynomial, zeros
 from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
 
@@ -76,7 +76,7 @@ class ScreenedCoulomb(NamedTuple):
 
     def room(self, slots: int, dtype: type) -> "ScreenedCoulomb":
         """The law with room for the charges in slots, in the precision of lanes."""
-        return self._replace(charge=np.zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype))
+        return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype))
 
 
 def screened_coulomb(charge_e: np.ndarray, cutoff: float, alpha: float) -> ScreenedCoulomb:
@@ -100,7 +100,7 @@ class DampedShiftedForce(NamedTuple):
 
     def room(self, slots: int, dtype: type) -> "DampedShiftedForce":
         """The law with room for the charges in slots, in the precision of lanes."""
-        return self._replace(charge=np.zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype))
+        return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype))
 
 
 def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> DampedShiftedForce:

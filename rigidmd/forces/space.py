@@ -1,11 +1,11 @@
-"""The space molecules live in: an orthorhombic periodic box, or none. Chosen by type, so no box costs nothing."""
+"""The space molecules live in: a periodic box with right angles, a slanted one, or none. Chosen by type."""
 
-from math import inf
+from math import inf, prod
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.jit import PAIR_FLAGS, implements, is_a
+from rigidmd.jit import implements, is_a, kernel
 
 
 class Orthorhombic(NamedTuple):
@@ -16,9 +16,32 @@ class Orthorhombic(NamedTuple):
     z: float
 
     @property
+    def edges(self) -> tuple[float, float, float]:
+        """Edges of the upright brick that repeats along the cell's vectors, Å."""
+        return tuple(self[:3])
+
+    @property
     def volume(self) -> float:
         """Å³"""
-        return self.x * self.y * self.z
+        return prod(self.edges)
+
+
+class Triclinic(NamedTuple):
+    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å; the names are those of LAMMPS.
+
+    A brick with edges x, y, z repeats along a, b and c without gaps too, and so is as good a box: sites are brought
+    into that brick, where upright lists serve them.
+    """
+
+    x: float
+    y: float
+    z: float
+    xy: float
+    xz: float
+    yz: float
+
+    edges = Orthorhombic.edges
+    volume = Orthorhombic.volume
 
 
 class Unbounded(NamedTuple):
@@ -28,51 +51,27 @@ class Unbounded(NamedTuple):
     y: float = inf
     z: float = inf
 
-    @property
-    def volume(self) -> float:
-        """Infinite."""
-        return inf
+    edges = Orthorhombic.edges
+    volume = Orthorhombic.volume
 
 
-Space = Orthorhombic | Unbounded
+Space = Orthorhombic | Triclinic | Unbounded
 
 
-def nearest_image(space, dx, dy, dz):
-    """The shortest periodic image of a displacement (Å); itself where there is no box."""
-    raise TypeError("compiled code only")
-
-
-@implements(nearest_image, PAIR_FLAGS, inline=True)
-def _nearest_image(space, dx, dy, dz):
-    if is_a(space, Unbounded):
-        return lambda space, dx, dy, dz: (dx, dy, dz)
-
-    def nearest(space, dx, dy, dz):
-        # 1/x is the same all along a loop and leaves it; dx / x would be a division for every pair.
-        return (
-            dx - space.x * np.rint(dx * (1 / space.x)),
-            dy - space.y * np.rint(dy * (1 / space.y)),
-            dz - space.z * np.rint(dz * (1 / space.z)),
-        )
-
-    return nearest
-
-
-def wrap_index(space, index, count):
-    """Cell index along one axis brought into 0 ... count - 1, or -1 for a cell outside an unbounded space."""
-    raise TypeError("compiled code only")
-
-
-@implements(wrap_index, inline=True)
-def _wrap_index(space, index, count):
-    if is_a(space, Unbounded):
-        return lambda space, index, count: index if 0 <= index < count else -1
-    return lambda space, index, count: index % count
+def space_of(cell: np.ndarray | None) -> Space:
+    """The space with this cell matrix (3, 3), rows a, b, c with a along x and b in the xy plane, Å; None for no box."""
+    if cell is None:
+        return Unbounded()
+    (x, _, _), (xy, y, _), (xz, yz, z) = (map(float, row) for row in cell)
+    return Triclinic(x, y, z, xy, xz, yz) if xy or xz or yz else Orthorhombic(x, y, z)
 
 
 def cell_of(space: Space) -> np.ndarray:
     """Cell matrix (3, 3), rows the edges a, b, c, Å."""
-    return np.diag(np.array(space))
+    cell = np.diag(np.array(space.edges))
+    if isinstance(space, Triclinic):
+        cell[1, 0], cell[2, 0], cell[2, 1] = space[3:]
+    return cell
 
 
 def fill_cell(space, cell):
@@ -82,15 +81,23 @@ def fill_cell(space, cell):
 
 @implements(fill_cell)
 def _fill_cell(space, cell):
-    if not is_a(space, Orthorhombic):
-        return None
+    if is_a(space, Triclinic):
 
-    def fill(space, cell):
-        changed = cell[0, 0] != space.x or cell[1, 1] != space.y or cell[2, 2] != space.z
-        cell[:] = 0.0
-        cell[0, 0] = space.x
-        cell[1, 1] = space.y
-        cell[2, 2] = space.z
-        return changed
+        def fill_slanted(space, cell):
+            slants = _put(cell, 1, 0, space.xy) | _put(cell, 2, 0, space.xz) | _put(cell, 2, 1, space.yz)
+            return slants | _put_edges(space, cell)
 
-    return fill
+        return fill_slanted
+    return lambda space, cell: _put_edges(space, cell)
+
+
+@kernel
+def _put_edges(space, cell):
+    return _put(cell, 0, 0, space.x) | _put(cell, 1, 1, space.y) | _put(cell, 2, 2, space.z)
+
+
+@kernel
+def _put(cell, k, j, value):
+    changed = cell[k, j] != value
+    cell[k, j] = value
+    return changed

@@ -41,7 +41,12 @@ class Structure(Section):
     """Where the molecules are at the start, from a file."""
 
     file: str
-    """File that ASE reads (.gro, .pdb, .xyz, .cif, ...) or `final.npz` of an earlier run; beside or below the scene"""
+    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, or `final.npz` of an
+    earlier run; beside or below the scene"""
+    frame: Annotated[int, Strict()] | None = None
+    """Which of several structures in the file: 1 is the first, -1 the last; needed where there are several"""
+    repeat: tuple[Count, Count, Count] = (1, 1, 1)
+    """How many times the file's cell stands side by side along a, b, c: from a crystal's cell to a crystal"""
     velocities: Flag = False
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
@@ -344,6 +349,8 @@ class MolecularScene(Scene):
                 faults.append("box needs lengths_A or density_g_cm3, or there must be a structure file")
         elif self.box.density_g_cm3 is not None:
             faults.append("box.density_g_cm3 and a structure file contradict each other: leave one out")
+        elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
+            faults.append("structure.repeat repeats the file's cell: leave out box.lengths_A and periodic = false")
         if self.start.temperature_K is None and self.stages[0].temperature_K is None:
             from_file = self.structure is not None and self.structure.velocities
             if not from_file:

@@ -1,0 +1,162 @@
+"""What a pair of sites costs in each kernel, and where a step of a liquid goes: one core, every vector width.
+
+    python tests/benchmarks/kernels.py --workloads W1,W3 --bits 512,256,128
+
+The liquids are W1 and W3 of peers.py. A lane is one site of a vector that meets another site; it is useful if the two
+are inside the cut-off and act on one another. Times are the fastest of many calls, since other programs can only add to them; each width runs in a process of its own, since it is
+chosen when the package is imported.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+
+import numba
+import numpy as np
+from numba import njit
+from peers import WORKLOADS, choice, numbers, start_of
+from scipy.spatial import cKDTree
+
+from rigidmd import Scene, Simulation
+from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.forces.pairs import PRECISIONS, PairForces
+from rigidmd.forces.sites import load_from_sites, place_sites
+from rigidmd.forces.terms import no_load
+from rigidmd.jit import SIMD_BITS, call, call_blocks, packed
+
+STEP = 2e-3  # ps
+STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step
+SECONDS = 0.5  # for each measurement
+ENDINGS = ("shift", "switch", "smooth_switch")
+
+
+@njit
+def run_blocks(address, content, blocks):
+    """All blocks of a work on this thread."""
+    call_blocks(address, packed(content), blocks)
+
+
+@njit
+def run_once(address, content):
+    """A work that has one block."""
+    call(address, packed(content), 0)
+
+
+def milliseconds(function, *arguments) -> float:
+    """Shortest time of a call, ms."""
+    function(*arguments)
+    taken = []
+    while sum(taken) < SECONDS or len(taken) < 5:
+        began = time.perf_counter()
+        function(*arguments)
+        taken.append(time.perf_counter() - began)
+    return 1e3 * min(taken)
+
+
+def useful_pairs(term: PairForces) -> int:
+    """Pairs of sites of different molecules inside the cut-off."""
+    edges, position, group = np.array(term.space.edges), term.pairs.position, term.pairs.group
+    tree = cKDTree(np.mod(position, edges) % edges, boxsize=edges)
+    found = tree.query_pairs(term.law.cutoff, output_type="ndarray")
+    return int((group[found[:, 0]] != group[found[:, 1]]).sum())
+
+
+def lanes_of(term: PairForces) -> int:
+    """Lanes that the loop works on with the list as it is."""
+    pairs = term.pairs
+    rows = np.sum(pairs.row[:, pairs.counters[2]] - pairs.row[:, 0]) + np.sum(pairs.special[:, 1] - pairs.special[:, 0])
+    return int(rows) * 2 * 4 * len(pairs.clusters.order) // len(pairs.clusters.origin)
+
+
+def measure(job: dict) -> list[dict]:
+    """Rows of both tables for one workload, precision and ending, in this process' vector width."""
+    work = WORKLOADS[job["workload"]]
+    folder = start_of(job["workload"], "own").sites_file.parent
+    scene = Scene.from_dict(work.scene(job["ending"], precision=job["precision"]), folder)
+    simulation = Simulation(scene)
+    engine, state = simulation.engine, simulation.state
+    numba.set_num_threads(1)
+    scheme, still = SCHEMES["velocity_verlet"], NoThermostat()
+    engine.advance(state, scheme, STEP, STEPS, still)
+    builds = [term.pairs.counters[1] for term in engine.terms.values()]
+    began = time.perf_counter()
+    engine.advance(state, scheme, STEP, STEPS, still)
+    step = 1e3 * (time.perf_counter() - began) / STEPS
+    found = []
+    load = no_load(state)
+    for (name, term), before in zip(engine.terms.items(), builds, strict=True):
+        pairs, blocks = term.pairs, len(term.pairs.needed)
+        parts, content = pairs.parts, (term.arranged, pairs, term.sums)
+        every = STEPS / max(1, pairs.counters[1] - before)
+        lanes, useful = lanes_of(term), useful_pairs(term)
+        forces = milliseconds(run_blocks, term.parts.forces, content, blocks)
+        found.append({
+            **job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * PRECISIONS[job["precision"]]().itemsize),
+            "kernel": f"{name}, {type(term.arranged).__name__}", "step": step, "every": every,
+            "per_pair": 1e6 * forces / useful, "per_lane": 1e6 * forces / lanes, "useful": useful / lanes,
+            "parts": {
+                "pairs": forces,
+                "gather": milliseconds(run_blocks, term.parts.gather, content, blocks),
+                "follow": milliseconds(run_blocks, parts.follow, pairs, blocks),
+                "sites": milliseconds(place_sites, term.sites, state, pairs.position)
+                + milliseconds(load_from_sites, term.sites, state, load, term.sums.force),
+                "list": (
+                    milliseconds(run_once, parts.prepare, pairs)
+                    + milliseconds(run_blocks, parts.settle, pairs, blocks)
+                    + milliseconds(run_once, parts.grow, pairs)
+                    + milliseconds(run_blocks, parts.fill, pairs, blocks)
+                ) / every,
+            },
+        })  # fmt: skip
+    return found
+
+
+def main() -> None:
+    """Measure and print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--workloads", type=choice(WORKLOADS), default=["W1", "W3"], help="W1,W3")
+    parser.add_argument("--bits", type=numbers(int), default=[SIMD_BITS], help="vector widths; 512,256,128")
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.job:
+        print(json.dumps(measure(json.loads(asked.job))))
+        return
+    rows = []
+    for bits in asked.bits:
+        for workload in asked.workloads:
+            start_of(workload, "own")
+            for precision, ending in [*(("mixed", ending) for ending in ENDINGS), ("double", ENDINGS[0])]:
+                job = {"workload": workload, "precision": precision, "ending": ending}
+                command = [sys.executable, __file__, "--job", json.dumps(job)]
+                environment = os.environ | {"RIGIDMD_SIMD_BITS": str(bits), "NUMBA_NUM_THREADS": "1"}
+                done = subprocess.run(command, env=environment, capture_output=True, text=True)
+                if done.returncode:
+                    sys.exit(done.stderr)
+                rows += json.loads(done.stdout.splitlines()[-1])
+                print(".", end="", file=sys.stderr, flush=True)
+    print(
+        "\n| | kernel | precision | ending | lanes | ns a useful pair | ns a lane | useful lanes |\n" + "|---" * 8 + "|"
+    )
+    for r in rows:
+        print(
+            f"| {r['workload']} | {r['kernel']} | {r['precision']} | {r['ending']} | {r['lanes']} "
+            f"| {r['per_pair']:.2f} | {r['per_lane']:.2f} | {100 * r['useful']:.0f} % |"
+        )
+    print(
+        "\n| ms of a step | lanes | " + " | ".join(rows[0]["parts"]) + " | list every | the step |\n" + "|---" * 9 + "|"
+    )
+    for r in rows:
+        if r["ending"] == ENDINGS[0]:
+            parts = " | ".join(f"{part:.3f}" for part in r["parts"].values())
+            print(
+                f"| {r['workload']} {r['kernel'].partition(',')[0]}, {r['precision']} | {r['lanes']} | {parts} "
+                f"| {r['every']:.1f} steps | {r['step']:.2f} |"
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,922 @@
+"""Structure files as people have them: read rightly, or refused with one clear message."""
+
+from math import inf
+from pathlib import Path
+
+import ase
+import ase.io
+import numpy as np
+import pytest
+from conftest import small_scene
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rigidmd.build.cells import standard_rotation
+from rigidmd.build.matching import _close_pairs
+from rigidmd.build.structure import read_structure
+from rigidmd.build.structure_files import element_of, read_geometry
+from rigidmd.build.system import build
+from rigidmd.errors import SceneError, StructureError
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.molecules import Molecule, Site, load_model, molecule
+from rigidmd.output.state import write_state
+from rigidmd.output.trajectory import TrajectoryFile, write_topology
+from rigidmd.scene import Scene
+from rigidmd.units import GRAM_PER_CM3
+
+TOLERANCE = 0.15
+
+
+def chiral() -> Molecule:
+    """CHFClBr, left-handed; its mirror image must not be taken for it."""
+    corners = {"H": (1, 1, 1), "F": (1, -1, -1), "Cl": (-1, 1, -1), "Br": (-1, -1, 1)}
+    lengths, masses = {"H": 1.09, "F": 1.36, "Cl": 1.76, "Br": 1.94}, {"H": 1.0, "F": 19.0, "Cl": 35.4, "Br": 79.9}
+    sites = [Site(name="C", element="C", mass_u=12.0, position_A=(0.0, 0.0, 0.0))]
+    for e, corner in corners.items():
+        place = tuple(float(lengths[e] * x / np.sqrt(3)) for x in corner)
+        sites.append(Site(name=e.upper(), element=e, mass_u=masses[e], position_A=place))
+    return molecule("halothane", tuple(sites), residue_names=("HAL",))
+
+
+def tetrachloromethane() -> Molecule:
+    """Half of the orders of its chlorines have all distances right and are mirror images."""
+    corners = 1.766 / np.sqrt(3) * np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
+    sites = [
+        Site(name=f"CL{k}", element="Cl", mass_u=35.45, position_A=tuple(map(float, x))) for k, x in enumerate(corners)
+    ]
+    carbon = Site(name="C", element="C", mass_u=12.011, position_A=(0.0, 0.0, 0.0))
+    return molecule("tetrachloromethane", (carbon, *sites), residue_names=("CCL4",))
+
+
+def benzene() -> Molecule:
+    """Twelve atoms of two kinds: 518,400 orders, 12 of which fit."""
+    sites = []
+    for e, radius, mass in (("C", 1.397, 12.011), ("H", 2.483, 1.008)):
+        for k in range(6):
+            place = (radius * float(np.cos(k * np.pi / 3)), radius * float(np.sin(k * np.pi / 3)), 0.0)
+            sites.append(Site(name=f"{e}{k + 1}", element=e, mass_u=mass, position_A=place))
+    return molecule("benzene", tuple(sites), residue_names=("BNZ",))
+
+
+def ion(element: str, mass: float) -> Molecule:
+    return molecule(element, (Site(name=element, element=element, mass_u=mass, position_A=(0.0, 0.0, 0.0)),))
+
+
+SPECIES = {
+    "sodium": ion("Na", 22.99),
+    "chloride": ion("Cl", 35.45),
+    "spce": load_model("spce"),
+    "tip4p2005": load_model("tip4p2005"),
+    "nitrogen": load_model("nitrogen"),
+    "argon": load_model("argon"),
+    "chiral": chiral(),
+    "benzene": benzene(),
+    "tetrachloromethane": tetrachloromethane(),
+}
+
+
+class Truth:
+    """Molecules that are known: on a lattice so wide that none touch, turned at random."""
+
+    def __init__(self, kinds: list[str], seed: int = 0, edges=(14.0, 15.0, 16.0), cell=None):
+        rng = np.random.default_rng(seed)
+        self.species = [SPECIES[kind] for kind in kinds]
+        self.cell = np.diag(edges) if cell is None else np.array(cell)
+        side = int(np.ceil(np.cbrt(len(kinds))))
+        grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)[: len(kinds)]
+        self.centre = ((grid + 0.1 * rng.random(grid.shape)) / side) @ self.cell
+        self.rotation = random_rotations(rng, len(kinds))
+        self.velocity = rng.standard_normal((len(kinds), 3))
+        self.omega = 5 * rng.standard_normal((len(kinds), 3))  # lab
+        for k, m in enumerate(self.species):  # a linear body does not turn about its axis, a point not at all
+            body = self.rotation[k].T @ self.omega[k]
+            self.omega[k] = self.rotation[k] @ (body * (m.inertia > 0))
+
+    def atoms(self, massless=True):
+        """(name, element, molecule, position, velocity) of every site, molecules whole."""
+        return [
+            (
+                m.site_names[s],
+                m.elements[s],
+                k,
+                self.centre[k] + (arm := self.rotation[k] @ m.positions_body[s]),
+                self.velocity[k] + np.cross(self.omega[k], arm),
+            )
+            for k, m in enumerate(self.species)
+            for s in range(len(m.masses))
+            if massless or m.masses[s] > 0
+        ]
+
+    def angular_momentum_body(self):
+        return np.array(
+            [m.inertia * (q.T @ w) for m, q, w in zip(self.species, self.rotation, self.omega, strict=True)]
+        )
+
+
+def same_molecules(found, truth: Truth, species: list[Molecule], error: float, cell=None):
+    """Every molecule is found once, all sites of all kinds in place modulo the lattice. Returns the pairing."""
+    cell = truth.cell if cell is None else cell
+
+    def apart(a, b):
+        step = (a - b) @ np.linalg.inv(cell)
+        return np.linalg.norm((step - np.round(step)) @ cell, axis=-1)
+
+    assert len(found.species) == len(truth.species)
+    distance = apart(found.position[:, None], truth.centre)
+    partner = distance.argmin(axis=1)
+    assert sorted(partner) == list(range(len(truth.species)))
+    for n, k in enumerate(partner):
+        model, true = species[found.species[n]], truth.species[k]
+        assert model.name == true.name
+        sites = found.position[n] + model.positions_body @ found.rotation[n].T
+        there = truth.centre[k] + true.positions_body @ truth.rotation[k].T
+        for s, element in enumerate(model.elements):
+            like = [i for i, e in enumerate(true.elements) if e == element]
+            assert apart(sites[s], there[like]).min() <= error, (model.name, model.site_names[s])
+    return partner
+
+
+def gro(atoms, box, digits=3, velocities=False, names=None, residues=True, residue_names=None) -> str:
+    """A .gro of (name, element, molecule, position in Å, velocity in Å/ps); box as its last line, nm."""
+    width = digits + 5
+    lines = ["t", str(len(atoms))]
+    for i, (name, _, k, x, v) in enumerate(atoms):
+        called = (names or {}).get(name, name)
+        number = (k + 1) % 100000 if residues else 1
+        residue = (residue_names or {}).get(k, "SOL" if residues else "")
+        line = f"{number:5d}{residue:<5}{called:>5}{(i + 1) % 100000:5d}" + "".join(
+            f"{c / 10:{width}.{digits}f}" for c in x
+        )
+        if velocities:
+            line += "".join(f"{c / 10:{width}.{digits + 1}f}" for c in v)
+        lines.append(line)
+    return "\n".join([*lines, box]) + "\n"
+
+
+def box_of(cell) -> str:
+    return " ".join(f"{x / 10:.6f}" for x in np.diag(cell))
+
+
+def pdb(atoms, cryst, names=None, element_column=True, number=None, residue="HOH") -> str:
+    lines = [cryst] if cryst else []
+    for i, (name, element, k, x, _) in enumerate(atoms):
+        called = (names or {}).get(name, name)
+        label = f" {called:<3}" if len(called) < 4 else called
+        serial = number(k) if number else f"{(k + 1) % 10000:4d}"
+        tail = f"          {element.upper() if element != 'X' else '':>2}" if element_column else ""
+        lines.append(
+            f"HETATM{(i + 1) % 100000:5d} {label} {residue:>3} A{serial}    {x[0]:8.3f}{x[1]:8.3f}{x[2]:8.3f}"
+            f"  1.00  0.00{tail}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def cryst1(cell) -> str:
+    return "CRYST1" + "".join(f"{x:9.3f}" for x in np.diag(cell)) + "".join(f"{a:7.2f}" for a in (90, 90, 90)) + " P 1"
+
+
+def xyz(atoms, cell, names=None) -> str:
+    """Extended .xyz, a name or else the element in the first column."""
+    lattice = f'Lattice="{" ".join(f"{x:.12f}" for x in np.ravel(cell))}"' if cell is not None else ""
+    rows = [
+        f"{names[name] if names else element} {x[0]:.10f} {x[1]:.10f} {x[2]:.10f}" for name, element, _, x, _ in atoms
+    ]
+    return "\n".join([str(len(rows)), lattice, *rows]) + "\n"
+
+
+def wrapped(atoms, cell):
+    """Every atom inside the cell, molecules split."""
+
+    def wrap(x):
+        f = x @ np.linalg.inv(cell)
+        return (f - np.floor(f)) @ cell
+
+    return [(name, e, k, wrap(x), v) for name, e, k, x, v in atoms]
+
+
+def read(tmp_path: Path, text: str, name: str, species=("spce",), edges=None, periodic=True, **options):
+    (tmp_path / name).write_text(text)
+    models = [SPECIES[s] if isinstance(s, str) else s for s in species]
+    return read_structure(tmp_path / name, models, edges, periodic, TOLERANCE, **options)
+
+
+# outside data
+
+WATER, HEAVY_BOX = 18.0154, 1.66053906660  # u; g/cm³ of 1 u/Å³
+
+
+def density(count, mass, volume):
+    return count * mass * HEAVY_BOX / volume
+
+
+ICE_IH_VOLUME = 7.82**2 * 7.36 * np.sqrt(3) / 2
+# file, model, scene's box, count, g/cm³, rms and largest distance from the template in Å, note; or a message
+REFERENCE = [
+    ("structures/spc216.gro", "spce", None, 216, density(216, WATER, 18.6206**3), 0.0038, 0.0116, ""),
+    ("structures/spc216.gro", "tip4p2005", None, 216, 1.0008, 0.0492, 0.0675, "216 sites without mass that the file"),
+    ("structures/tip4p.gro", "tip4p2005", None, 216, density(216, WATER, 18.6824**3), 0.0040, 0.0109, ""),
+    ("structures/tip4p.gro", "spce", None, 216, 0.9909, 0.0492, 0.0685, "216 sites without mass (MW) that no model"),
+    ("structures/openmm_spce_box.pdb", "spce", None, 895, density(895, WATER, 30.0**3), 0.0004, 0.0013, ""),
+    ("structures/openmm_tip3p_box.pdb", "tip3p", None, 895, density(895, WATER, 30.0**3), 0.0004, 0.0013, ""),
+    (
+        "structures/genice_ice1h_tip4p_seed42.gro", "tip4p2005", None,
+        192, density(192, WATER, 23.4685163 * 14.7071453 * 18.0730370), 0.0040, 0.0111, "",
+    ),
+    ("structures/genice_ice1h_tip4p_seed42.gro", "spce", None, 192, 0.9208, 0.0488, 0.0682, "(MW) that no model has"),
+    ("structures/chemfiles_water_297_frame1.pdb", "spce", None, 99, density(99, WATER, 15.0**3), 0.0490, 0.0608, ""),
+    ("structures/chemfiles_water_297_frame1.pdb", "tip3p", None, 99, 0.8775, 0.0004, 0.0013, ""),
+    ("structures/N2_alpha_nitrogen.cif", "nitrogen", None, 4, density(4, 28.0134, 5.644**3), 0.0171, 0.0171, ""),
+    (
+        "structures/ice_XI_like_8water_P1.cif", "spce", None,
+        8, density(8, WATER, 4.452382 * 7.70757 * 7.278858), 0.0244, 0.0332, "",
+    ),
+    ("structures/H2O_ice_Ih.cif", "tip4p2005", None, "angles 90, 90, 120°; only boxes with right angles"),
+    # All its hydrogens are there (an ordered model of 1933), 0.82 Å from their oxygens.
+    ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
+    ("structures/H2O_ice_Ih.cif", "spce", inf, "is no spce: an atom is 0.173 Å from the rigid template"),
+    ("awkward/two_water_gro.gro", "spce", None, 2, density(2, WATER, 100.0**3), 0.0041, 0.0063, ""),
+    ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 tell no element"),
+    (
+        "awkward/two_water_gro_widebox.gro", "spce", None,
+        2, density(2, WATER, 76.4092 * 79.1768 * 73.1922), 0.0041, 0.0063, "",
+    ),
+    ("awkward/short-cryst1.pdb", "spce", None, 3, density(3, WATER, 15.0**3), 0.0489, 0.0601, ""),
+    ("awkward/water4_tinker.arc", "spce", None, "has no box: give [box] lengths_A, or periodic = false"),
+    ("awkward/water4_tinker.arc", "spce", inf, 4, None, 0.0289, 0.0565, ""),
+    ("awkward/water_spc_99_chem.cssr", "spce", None, "its cell, a cube of 1 Å, stands for none"),
+    ("awkward/water_spc_99_chem.cssr", "spce", 15.0, 99, density(99, WATER, 15.0**3), 0.0490, 0.0600, "cube of 1 Å"),
+    ("awkward/triclinic-1.lmp", "spce", None, "holds no atoms"),
+    ("awkward/missing_atomname.gro", "spce", None, "has atoms called (no name)"),
+    ("awkward/missing_atomname.gro", "argon", None, "has atoms called (no name)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFERENCE, ids=lambda case: f"{Path(case[0]).name}-{case[1]}-{case[2]}")
+def test_reference_files(reference, case):
+    file, model, edge, *expected = case
+    edges = None if edge in (None, inf) else (edge,) * 3
+    model = load_model(model)
+
+    def found():
+        return read_structure(reference / file, [model], edges, edge != inf, TOLERANCE)
+
+    if isinstance(expected[0], str):
+        with pytest.raises(StructureError) as refusal:
+            found()
+        assert expected[0] in str(refusal.value)
+        return
+    count, density_there, rms, largest, note = expected
+    found = found()
+    assert len(found.species) == count
+    if edge == inf:  # the file's own cell served only to make molecules whole
+        assert found.cell is None
+    else:
+        per_volume = count * model.mass / np.linalg.det(found.cell) / GRAM_PER_CM3
+        assert per_volume == pytest.approx(density_there, rel=2e-4)
+    assert found.residual_rms == pytest.approx(rms, abs=1e-4)
+    assert found.residual_max == pytest.approx(largest, abs=1e-4)
+    assert any(note in said for said in found.notes) if note else not found.notes
+
+
+def test_the_table_names_every_reference_file(reference):
+    there = {f"{folder}/{p.name}" for folder in ("structures", "awkward") for p in (reference / folder).iterdir()}
+    assert there == {case[0] for case in REFERENCE}
+
+
+# the same molecules in every disguise
+
+NAMES = [
+    {"OW": "OW", "HW1": "HW1", "HW2": "HW2", "MW": "MW"},
+    {"OW": "O", "HW1": "H1", "HW2": "H2", "MW": "M"},
+    {"OW": "OH2", "HW1": "H1", "HW2": "H2", "MW": "EPW"},
+    {"OW": "O", "HW1": "H", "HW2": "H", "MW": "EP"},
+    {"OW": "Ow", "HW1": "1HW", "HW2": "2HW", "MW": "LP1"},
+    {"OW": "OT", "HW1": "HT", "HW2": "HT", "MW": "X"},
+    {"OW": "O1", "HW1": "HO1", "HW2": "HO2", "MW": "DUM"},
+]
+
+
+@pytest.mark.parametrize("names", NAMES, ids=lambda names: "-".join(names.values()))
+@pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
+@pytest.mark.parametrize(("there", "wanted"), [("spce", "spce"), ("tip4p2005", "tip4p2005"), ("tip4p2005", "spce")])
+def test_names_of_water(names, ending, there, wanted, tmp_path):
+    truth = Truth([there] * 8)
+    atoms = truth.atoms()
+    if ending == "gro":
+        text, error = gro(atoms, box_of(truth.cell), names=names), 0.02
+    elif ending == "pdb":
+        text, error = pdb(atoms, cryst1(truth.cell), names, element_column=False), 0.002
+    else:
+        text, error = xyz(atoms, truth.cell, names), 1e-8
+    found = read(tmp_path, text, f"a.{ending}", (wanted,))
+    if there == wanted:
+        same_molecules(found, truth, [SPECIES[wanted]], error)
+        assert found.notes == ()
+    else:
+        assert len(found.species) == 8
+        assert any("8 sites without mass" in note and "left out" in note for note in found.notes)
+
+
+def without_massless(truth):
+    return truth.atoms(massless=False)
+
+
+def hydrogens_first(truth):
+    return sorted(truth.atoms(massless=False), key=lambda atom: (atom[2], atom[1] != "H"))
+
+
+def oxygens_of_all_first(truth):
+    return sorted(truth.atoms(massless=False), key=lambda atom: (atom[1] != "O", atom[0]))
+
+
+def between_the_oxygens(truth):
+    return sorted(truth.atoms(massless=False), key=lambda atom: (atom[2], "HW1 OW HW2".index(atom[0])))
+
+
+@pytest.mark.parametrize("order", [without_massless, hydrogens_first, oxygens_of_all_first, between_the_oxygens])
+@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize("ending", ["gro", "gro without residues", "pdb", "xyz", "cif"])
+def test_order_of_atoms(order, split, ending, tmp_path):
+    truth = Truth(["tip4p2005"] * 9, 1)
+    atoms = order(truth)
+    if split:
+        atoms = wrapped(atoms, truth.cell)
+    species, error = [SPECIES["tip4p2005"]], 1e-7
+    if ending == "xyz":
+        text = xyz(atoms, truth.cell)
+    elif ending == "pdb":
+        text, error = pdb(atoms, cryst1(truth.cell)), 0.002
+    elif ending == "cif":
+        plain = ase.Atoms([a[1] for a in atoms], [a[3] for a in atoms], cell=truth.cell, pbc=True)
+        ase.io.write(tmp_path / "b.cif", plain)
+        text = (tmp_path / "b.cif").read_text()
+    else:
+        text = gro(atoms, box_of(truth.cell), digits=9, residues=ending == "gro")
+    found = read(tmp_path, text, f"a.{ending.split()[0]}", species)
+    same_molecules(found, truth, species, error)
+    assert any("9 sites without mass that the file lacks (tip4p2005): built" in note for note in found.notes)
+    if order is oxygens_of_all_first and ending in ("gro", "pdb"):
+        assert any("told by bonding distance" in note for note in found.notes)
+
+
+def test_names_begin_with_an_element_of_the_scene_if_they_can():
+    water = frozenset({"O", "H"})
+    names = {"OW": "O", "HO": "H", "1HW": "H", "M": "X", "MW": "X", "CL": "Cl", "B1": "B", "": "", "17": ""}
+    assert {name: element_of(name, water) for name in names} == names
+    assert element_of("Na", frozenset("N")) == "Na"  # nobody writes a nitrogen so
+    assert element_of("NA", frozenset({"N", "Na"})) == "Na"
+    assert element_of("CA", frozenset("C")) == "C"
+
+
+@pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
+def test_ions_among_waters(ending, tmp_path):
+    truth = Truth(["spce", "sodium", "chloride", "spce", "chloride"], 2)
+    upper = {"Na": "NA", "Cl": "CL"} | {name: name for name in ("OW", "HW1", "HW2")}
+    species = [SPECIES[name] for name in ("spce", "sodium", "chloride", "nitrogen")]
+    text = {
+        "gro": gro(truth.atoms(), box_of(truth.cell), names=upper, residue_names={1: "NA", 2: "CL", 4: "CL"}),
+        "pdb": pdb(truth.atoms(), cryst1(truth.cell), upper, residue="MIX"),
+        "xyz": xyz(oxygens_of_all_first(truth), truth.cell),
+    }
+    same_molecules(read(tmp_path, text[ending], f"a.{ending}", species), truth, species, 0.02)
+
+
+# a property: nothing that leaves the molecules what they are changes what is read
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    kinds=st.lists(st.sampled_from(["spce", "tip4p2005", "nitrogen", "argon", "chiral", "benzene", "tetrachloromethane"]), min_size=1, max_size=8),
+    seed=st.integers(0, 2**31),
+    slant=st.booleans(),
+    mirrored=st.booleans(),
+)  # fmt: skip
+def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(kinds, seed, slant, mirrored, tmp_path):
+    kinds = [kind if kind != "tip4p2005" or "spce" not in kinds else "spce" for kind in kinds]  # those two look alike
+    rng = np.random.default_rng(seed)
+    cell = np.diag([17.0, 19.0, 21.0]) + (np.tril(rng.uniform(-8, 8, (3, 3)), -1) if slant else 0.0)
+    truth = Truth(kinds, seed, cell=cell)
+    rotation = random_rotations(rng, 1)[0]
+    shift = rng.uniform(-50, 50, 3)
+    atoms = [
+        (name, e, k, (x + shift + rng.integers(-3, 4, 3) @ cell) @ rotation.T, v) for name, e, k, x, v in truth.atoms(False)
+    ]  # fmt: skip
+    rng.shuffle(atoms)
+    written = cell @ rotation.T * ([[1], [1], [-1]] if mirrored else 1)
+    species = [SPECIES[kind] for kind in sorted(set(kinds))]
+    found = read(tmp_path, xyz(atoms, written), "a.xyz", species, periodic=not slant)
+    truth.centre = truth.centre + shift
+    same_molecules(found, truth, species, 1e-6)
+    assert any("was turned" in note for note in found.notes)
+    if not slant:
+        assert found.cell == pytest.approx(cell)
+
+
+def test_a_turned_cell_turns_velocities_too(tmp_path):
+    truth = Truth(["spce", "nitrogen", "argon", "tip4p2005"], 3)
+    species = [SPECIES[name] for name in ("nitrogen", "argon", "spce")]
+    truth.species[3] = SPECIES["spce"]
+    rotation = random_rotations(np.random.default_rng(5), 1)[0]
+    atoms = truth.atoms()
+    plain = ase.Atoms([a[1] for a in atoms], [rotation @ a[3] for a in atoms], cell=truth.cell @ rotation.T, pbc=True)
+    plain.set_velocities([rotation @ a[4] / 98.22694788464063 for a in atoms])
+    ase.io.write(tmp_path / "a.extxyz", plain)
+    found = read(tmp_path, (tmp_path / "a.extxyz").read_text(), "b.extxyz", species)
+    partner = same_molecules(found, truth, species, 1e-6)
+    assert found.velocity == pytest.approx(truth.velocity[partner], abs=1e-5)
+    lab = np.einsum("nij,nj->ni", found.rotation, found.angular_momentum_body)
+    true = np.einsum("nij,nj->ni", truth.rotation, truth.angular_momentum_body())[partner]
+    assert lab == pytest.approx(true, abs=1e-4)
+
+
+def test_the_standard_orientation_keeps_the_lattice():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        cell = rng.standard_normal((3, 3))
+        turned, rotation = standard_rotation(cell)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+        assert np.array_equal(turned, np.tril(turned))
+        assert (np.diag(turned) > 0).all()
+        whole = turned @ np.linalg.inv(cell @ rotation.T)  # of old vectors in new ones
+        assert whole == pytest.approx(np.diag([1, 1, np.sign(np.linalg.det(cell))]))
+    same, rotation = standard_rotation(np.diag([3.0, 4.0, 5.0]))
+    assert np.array_equal(same, np.diag([3.0, 4.0, 5.0]))
+    assert np.array_equal(rotation, np.eye(3))
+
+
+def test_molecules_of_a_slanted_cell_are_made_whole_but_the_cell_is_refused(tmp_path):
+    cell = [[12.0, 0, 0], [9.0, 11.0, 0], [-8.0, 7.0, 12.0]]
+    truth = Truth(["spce"] * 8, 6, cell=cell)
+    text = xyz(wrapped(truth.atoms(), truth.cell), truth.cell)
+    same_molecules(read(tmp_path, text, "a.xyz", periodic=False), truth, [SPECIES["spce"]], 1e-6)
+    atoms = wrapped(truth.atoms(), truth.cell)
+    plain = ase.Atoms([a[1] for a in atoms], [a[3] for a in atoms], cell=truth.cell, pbc=True)
+    for name in ("b.gro", "b.cif", "b.lmp"):
+        ase.io.write(tmp_path / name, plain, **({"format": "lammps-data", "masses": True} if name == "b.lmp" else {}))
+        found = read(tmp_path, (tmp_path / name).read_text(), name, periodic=False)
+        assert found.residual_max < 0.02
+        same_molecules(found, truth, [SPECIES["spce"]], 0.02)
+    with pytest.raises(StructureError, match=r"angles .*°; only boxes with right angles are handled"):
+        read(tmp_path, text, "a.xyz")
+
+
+def test_residuals_are_those_of_the_best_fit(tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    truth = Truth(["spce", "nitrogen", "argon", "benzene", "spce"], 21)
+    species = [SPECIES[name] for name in ("spce", "nitrogen", "argon", "benzene")]
+    rng = np.random.default_rng(1)
+    atoms = [(name, e, k, x + 0.02 * rng.standard_normal(3), v) for name, e, k, x, v in truth.atoms()]
+    found = read(tmp_path, xyz(wrapped(atoms, truth.cell), truth.cell), "a.xyz", species)
+    squares = []
+    for k, m in enumerate(truth.species):
+        points = np.array([x for _, _, owner, x, _ in atoms if owner == k])
+        points = points - m.masses @ points / m.mass
+        if len(points) > 2:
+            rotation, _ = Rotation.align_vectors(points, m.positions_body, weights=m.masses)
+            points = rotation.inv().apply(points)
+        else:  # along the axis, which SciPy finds not unique
+            points = m.positions_body * np.linalg.norm(points[0]) / max(m.radius, 1e-9)
+        squares += list(((points - m.positions_body) ** 2).sum(axis=1))
+    assert found.residual_rms == pytest.approx(np.sqrt(np.mean(squares)))
+    assert found.residual_max == pytest.approx(np.sqrt(np.max(squares)))
+
+
+def test_a_mirror_image_is_another_molecule(tmp_path):
+    truth = Truth(["chiral"] * 4, 7)
+    mirrored = [(name, e, k, x * [-1, 1, 1], v) for name, e, k, x, v in truth.atoms()]
+    with pytest.raises(
+        StructureError, match=r"molecule 1 \(atoms 1 to 5, by bonding distance\) is no halothane: an atom is"
+    ):
+        read(tmp_path, xyz(mirrored, truth.cell), "a.xyz", ["chiral"])
+
+
+def test_hydrogen_bonds_are_none_of_the_bonds_of_larger_atoms(tmp_path):
+    """Waters 1.8 Å apart, in a scene that has bonds of 1.94 Å between other elements."""
+    rows = [("O", 0, 0, 0), ("H", 1, 0, 0), ("H", -1 / 3, 0.9428, 0)]
+    rows += [("O", 2.8, 0, 0), ("H", 3.3774, 0.8165, 0), ("H", 3.3774, -0.8165, 0)]
+    atoms = [("", e, 0, np.array([x, y, z]), None) for e, x, y, z in rows]
+    atoms += [(name, e, k, x + 8, v) for name, e, k, x, v in Truth(["chiral"]).atoms()]
+    found = read(tmp_path, xyz(atoms, np.diag([20.0] * 3)), "a.xyz", ["spce", "chiral"])
+    assert found.species.tolist() == [0, 0, 1]
+
+
+def test_close_pairs_in_any_cell():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        cell = np.tril(rng.uniform(-10, 10, (3, 3)), -1) + np.diag(rng.uniform(6, 12, 3))
+        points = rng.random((15, 3)) @ cell
+        radius = rng.uniform(2, 4)
+        images = np.stack(np.meshgrid(*[np.arange(-10, 11)] * 3), -1).reshape(-1, 3) @ cell
+        step = points[:, None] - points
+        wanted = {
+            (i, j) for i in range(15) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
+        }
+        assert 0 < len(wanted) < 105
+        i, j, distance = _close_pairs(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
+        assert {(max(a, b), min(a, b)) for a, b in zip(i, j, strict=True) if a != b} == wanted
+        assert distance.max(initial=0.0) <= radius
+
+
+# formats
+
+
+def test_further_digits_and_velocities_of_a_gro(tmp_path):
+    truth = Truth(["tip4p2005"] * 5, 8)
+    species = [SPECIES["tip4p2005"]]
+    for digits, error in ((3, 0.02), (6, 2e-5), (9, 2e-8)):
+        found = read(tmp_path, gro(truth.atoms(), box_of(truth.cell), digits, velocities=True), "a.gro", species)
+        same_molecules(found, truth, species, error)
+        assert found.velocity == pytest.approx(truth.velocity, abs=2 * error)
+        # of inertia below 3 u Å² and arms below 1 Å
+        assert found.angular_momentum_body == pytest.approx(truth.angular_momentum_body(), abs=40 * error)
+
+
+def test_velocities_of_some_atoms(tmp_path):
+    truth = Truth(["tip4p2005"] * 5, 9)
+
+    def lines(drop):
+        text = gro(truth.atoms(), box_of(truth.cell), velocities=True).splitlines()
+        return "\n".join(line[:44] if drop(line) else line for line in text) + "\n"
+
+    found = read(tmp_path, lines(lambda line: "MW" in line), "a.gro", ["tip4p2005"])  # they follow from the others
+    assert found.velocity == pytest.approx(truth.velocity, abs=0.02)
+    text = lines(lambda line: "2SOL    HW1" in line)
+    found = read(tmp_path, text, "b.gro", ["tip4p2005"])
+    assert found.velocity is None
+    assert found.notes == ("1 of its atoms have no velocity (the first is atom 6): none is used",)
+    data = small_scene({"tip4p2005": 5}, None).model_dump(exclude={"start"}) | {
+        "box": {},
+        "structure": {"file": "b.gro", "velocities": True},
+        "forces": {"cutoff_A": 5.0},
+    }
+    with pytest.raises(StructureError, match=r"no velocities for all atoms; 1 of its .*the first is atom 6"):
+        build(Scene.from_dict(data, tmp_path))
+
+
+def test_velocities_in_a_column_without_units_are_not_used(tmp_path):
+    truth = Truth(["argon"] * 2)
+    text = xyz(truth.atoms(), truth.cell).splitlines()
+    text[1] += " Properties=species:S:1:pos:R:3:vel:R:3"
+    text[2:] = [line + " 1 2 3" for line in text[2:]]
+    found = read(tmp_path, "\n".join(text) + "\n", "a.xyz", ["argon"])
+    assert found.velocity is None
+    assert found.notes == ("the column vel does not say its units and is not used (ASE writes momenta instead)",)
+
+
+def frames_of(ending, truths):
+    if ending == "gro":
+        return "".join(gro(t.atoms(), box_of(t.cell)) for t in truths)
+    if ending == "xyz":
+        return "".join(xyz(t.atoms(), t.cell, NAMES[0]) for t in truths)
+    if ending == "arc":
+        return "".join(arc(t.atoms(), t.cell) for t in truths)
+    models = [f"MODEL {k}\n{pdb(t.atoms(), '')}TER\nENDMDL\n" for k, t in enumerate(truths, 1)]
+    return cryst1(truths[0].cell) + "\n" + "".join(models) + "END\n"
+
+
+@pytest.mark.parametrize("ending", ["gro", "xyz", "pdb", "arc"])
+def test_one_of_several_frames(ending, tmp_path):
+    truths = [Truth(["spce"] * n, n) for n in (2, 3, 4)]
+    text = frames_of(ending, truths)
+    for frame, truth in ((1, truths[0]), (2, truths[1]), (-1, truths[2])):
+        found = read(tmp_path, text, f"a.{ending}", frame=frame)
+        same_molecules(found, truth, [SPECIES["spce"]], 0.02)
+        assert np.diag(found.cell) == pytest.approx(np.diag(truth.cell), abs=2e-3)
+    with pytest.raises(
+        StructureError, match=r"holds 3 structures.*say which by structure.frame .1 to 3, -1 for the last"
+    ):
+        read(tmp_path, text, f"a.{ending}")
+    with pytest.raises(StructureError, match=r"structure.frame is 4: it holds 3, 1 is the first and -1 the last"):
+        read(tmp_path, text, f"a.{ending}", frame=4)
+    one = read(tmp_path, frames_of(ending, truths[:1]), f"b.{ending}")  # a single MODEL is no choice
+    assert len(one.species) == 2
+
+
+def arc(atoms, cell) -> str:
+    lines = [f"{len(atoms):6d}  molecules"]
+    if cell is not None:
+        lines.append(" ".join(f"{x:.6f}" for x in (*np.diag(cell), 90, 90, 90)))
+    lines += [f"{i:6d} {e} {x[0]:.10f} {x[1]:.10f} {x[2]:.10f} 1 {i}" for i, (_, e, _, x, _) in enumerate(atoms, 1)]
+    return "\n".join(lines) + "\n"
+
+
+def cssr(atoms, cell, fractional) -> str:
+    edges = "".join(f"{x:8.3f}" for x in np.diag(cell))
+    angles = "".join(f"{90:8.3f}" for _ in range(3))
+    lines = [
+        f" REFERENCE STRUCTURE = 00000   A,B,C ={edges}",
+        f"   ALPHA,BETA,GAMMA ={angles}    SPGR =  1 P 1",
+        f"{len(atoms):4d}{0 if fractional else 1:4d}",
+        "     0 title : title",
+    ]
+    for i, (_, e, _, x, _) in enumerate(atoms, 1):
+        place = x @ np.linalg.inv(cell) if fractional else x
+        lines.append(
+            f"{i:4d} {e + str(i):<4} {place[0]:9.5f} {place[1]:9.5f} {place[2]:9.5f}" + "   0" * 8 + "   0.000"
+        )
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("fractional", [False, True])
+def test_cssr(fractional, tmp_path):
+    truth = Truth(["spce"] * 4, 10)
+    text = cssr(wrapped(truth.atoms(), truth.cell), truth.cell, fractional)
+    same_molecules(read(tmp_path, text, "a.cssr"), truth, [SPECIES["spce"]], 1e-3)
+    with pytest.raises(StructureError, match="space group P 21/c; only P1"):
+        read(tmp_path, text.replace("1 P 1", "P 21/c"), "a.cssr")
+
+
+def test_arc(tmp_path):
+    truth = Truth(["spce"] * 4, 11)
+    same_molecules(read(tmp_path, arc(truth.atoms(), truth.cell), "a.arc"), truth, [SPECIES["spce"]], 1e-7)
+    found = read(tmp_path, arc(truth.atoms(), None), "b.txyz", edges=tuple(np.diag(truth.cell)))
+    same_molecules(found, truth, [SPECIES["spce"]], 1e-7)
+
+
+def lammps(truth, first_line, velocity_unit, molecule_ids=True) -> str:
+    """A data file; velocity_unit in Å/ps."""
+    atoms = truth.atoms()
+    edges = np.diag(truth.cell)
+    lines = [first_line, "", f"{len(atoms)} atoms", "3 atom types", ""]
+    lines += [f"0 {x:.9f} {axis}lo {axis}hi" for x, axis in zip(edges, "xyz", strict=True)]
+    lines += ["", "Masses", "", "1 15.9994", "2 1.008", "3 39.948", "", "Atoms # full", ""]
+    types = {"O": 1, "H": 2, "Ar": 3, "X": 3}
+    lines += [
+        f"{i} {k + 1 if molecule_ids else 0} {types[e]} 0.0 {x[0]:.10f} {x[1]:.10f} {x[2]:.10f}"
+        for i, (_, e, k, x, _) in enumerate(atoms, 1)
+    ]
+    lines += ["", "Velocities", ""]
+    lines += [f"{i} " + " ".join(f"{c / velocity_unit:.12f}" for c in v) for i, (*_, v) in enumerate(atoms, 1)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("molecule_ids", [True, False])
+@pytest.mark.parametrize(("units", "velocity_unit"), [("real", 1000.0), ("metal", 1.0), (None, 1.0)])
+def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
+    truth = Truth(["spce", "argon", "spce"], 12)
+    species = [SPECIES["argon"], SPECIES["spce"]]
+    first = "LAMMPS data file via write_data, version 1, timestep = 0" + (f", units = {units}" if units else "")
+    found = read(tmp_path, lammps(truth, first, velocity_unit, molecule_ids), "a.data", species)
+    partner = same_molecules(found, truth, species, 1e-7)
+    if units:
+        assert found.velocity == pytest.approx(truth.velocity[partner], rel=1e-5)
+    else:
+        assert found.velocity is None
+        assert any("does not say its units" in note for note in found.notes)
+
+
+def test_lammps_sites_of_almost_no_mass(tmp_path):
+    truth = Truth(["tip4p2005"] * 3, 12)
+    text = lammps(truth, "x, units = real", 1.0).replace("3 39.948", "3 1e-10")
+    found = read(tmp_path, text, "a.data", ["tip4p2005"])
+    same_molecules(found, truth, [SPECIES["tip4p2005"]], 1e-6)
+    assert found.notes == ()
+
+
+def test_long_pdbs_whose_numbers_run_out(tmp_path):
+    truth = Truth(["spce"] * 8, 13)
+    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"A{k:03d}")  # hybrid-36
+    same_molecules(read(tmp_path, text, "a.pdb"), truth, [SPECIES["spce"]], 0.002)
+    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"   {k // 2}")  # two of each number, in two chains
+    lines = [line.replace(" A   ", " B   ") if (k - 1) % 6 < 3 else line for k, line in enumerate(text.splitlines())]
+    assert read(tmp_path, "\n".join(lines) + "\n", "c.pdb").notes == ()
+    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: "****")  # GROMACS and others beyond 9999
+    same_molecules(read(tmp_path, text, "b.pdb"), truth, [SPECIES["spce"]], 0.002)
+
+
+@pytest.mark.parametrize("ending", ["xyz", "pdb"])
+def test_what_this_engine_writes_it_reads(ending, tmp_path):
+    system = build(small_scene({"tip4p2005": 8}, 20.0))
+    moved = system.state.copy()
+    moved.position[:] += 1.0
+    file = TrajectoryFile(tmp_path / f"t.{ending}", system, 1.0, velocities=False, wrapped=True)
+    for k, state in enumerate((system.state, moved)):
+        file.write(state, float(k), k)
+    file.close()
+    write_topology(tmp_path / "t.gro", system, moved, wrapped=True)
+    write_state(tmp_path / "t.npz", system, moved)
+    for name, frame, error in ((f"t.{ending}", -1, 2e-3), ("t.gro", None, 0.02), ("t.npz", None, 0.0)):
+        found = read_structure(tmp_path / name, system.species, None, True, TOLERANCE, frame)
+        step = found.position - moved.position
+        assert np.abs(step - 20 * np.round(step / 20)).max() <= error
+        assert np.diag(found.cell) == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize("there", ["H", "D"])
+@pytest.mark.parametrize("wanted", ["H", "D"])
+@pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
+def test_heavy_water_starts_like_light(there, wanted, ending, tmp_path):
+    truth = Truth(["spce"] * 3, 20)
+    atoms = [(name, e.replace("H", there), k, x, v) for name, e, k, x, v in truth.atoms()]
+    text = {
+        "gro": gro(atoms, box_of(truth.cell)),
+        "pdb": pdb(atoms, cryst1(truth.cell)),
+        "xyz": xyz(atoms, truth.cell),
+    }
+    sites = [Site(**site | {"element": site["element"].replace("H", wanted)}) for site in SPECIES["spce"].sites()]
+    water = molecule("spce", tuple(sites), residue_names=("SOL", "HOH"))
+    found = read(tmp_path, text[ending], f"a.{ending}", [water])
+    assert found.residual_max < 0.02
+
+
+def test_a_geometry_of_heavy_hydrogen_has_its_mass(tmp_path):
+    (tmp_path / "a.xyz").write_text("3\n\nOW 0 0 0\nD 0.8 0.6 0\nM 0 0.1 0\n")
+    names, elements, masses, _ = read_geometry(tmp_path / "a.xyz")
+    assert (names, elements) == (["OW", "D", "M"], ["O", "D", "X"])
+    assert masses == pytest.approx([15.999, 2.0141, 0.0])
+
+
+# crystals
+
+
+def cif(occupancy=1.0) -> str:
+    return f"""data_x
+_cell_length_a 5.0
+_cell_length_b 6.0
+_cell_length_c 7.0
+_cell_angle_alpha 90
+_cell_angle_beta 90
+_cell_angle_gamma 90
+_symmetry_space_group_name_H-M 'P 1'
+loop_
+_atom_site_label
+_atom_site_type_symbol
+_atom_site_fract_x
+_atom_site_fract_y
+_atom_site_fract_z
+_atom_site_occupancy
+O1 O 0.9 0.5 0.5 1.0
+H1 H 0.0633 0.5962 0.5 {occupancy}
+H2 H 0.7367 0.5962 0.5 1.0
+"""
+
+
+def test_a_crystal_is_repeated_from_its_cell(tmp_path):
+    one = read(tmp_path, cif(), "ice.cif")
+    assert len(one.species) == 1
+    many = read(tmp_path, cif(), "ice.cif", repeat=(4, 3, 2))
+    assert np.diag(many.cell) == pytest.approx([20, 18, 14])
+    assert len(many.species) == 24
+    assert many.residual_rms == one.residual_rms
+    step = many.position - one.position
+    cells = step / [5, 6, 7]
+    assert cells == pytest.approx(np.round(cells))
+    assert len({tuple(c) for c in np.round(cells).astype(int)}) == 24
+    data = small_scene({"spce": 24}, None).model_dump() | {
+        "box": {},
+        "structure": {"file": "ice.cif", "repeat": [4, 3, 2]},
+        "forces": {"cutoff_A": 5.0},
+    }
+    system = build(Scene.from_dict(data, tmp_path))
+    assert tuple(system.space) == pytest.approx((20, 18, 14))
+    for box in ({"lengths_A": 20.0}, {"periodic": False}):
+        with pytest.raises(SceneError, match=r"structure.repeat repeats the file's cell"):
+            Scene.from_dict(data | {"box": box}, tmp_path)
+
+
+def test_a_disordered_crystal_is_refused(tmp_path):
+    with pytest.raises(StructureError, match=r"occupied only partly \(H 0.5\): the crystal is disordered"):
+        read(tmp_path, cif(0.5), "ice.cif")
+
+
+# boxes
+
+
+@pytest.mark.parametrize(
+    ("box", "note"),
+    [
+        ("   0.00000   0.00000   0.00000", ""),
+        ("   1.00000   1.00000   0.00000", "its cell has no volume and is not used"),
+    ],
+)
+def test_no_box(box, note, tmp_path):
+    truth = Truth(["spce"] * 3, 14)
+    text = gro(truth.atoms(), box)
+    with pytest.raises(StructureError, match=r"has no box.*give \[box\] lengths_A, or periodic = false"):
+        read(tmp_path, text, "a.gro")
+    found = read(tmp_path, text, "a.gro", edges=(14.0, 15.0, 16.0))
+    same_molecules(found, truth, [SPECIES["spce"]], 0.02)
+    assert found.notes == ((note,) if note else ())
+    assert read(tmp_path, text, "a.gro", periodic=False).cell is None
+
+
+def test_placeholder_boxes(tmp_path):
+    truth = Truth(["spce"] * 3, 14)
+    text = pdb(truth.atoms(), cryst1(np.eye(3)))
+    with pytest.raises(StructureError, match=r"has no box .its cell, a cube of 1 Å, stands for none"):
+        read(tmp_path, text, "a.pdb")
+    same_molecules(read(tmp_path, text, "a.pdb", edges=(14.0, 15.0, 16.0)), truth, [SPECIES["spce"]], 0.002)
+
+
+def test_the_scene_may_want_another_box_than_the_file(tmp_path):
+    truth = Truth(["spce"] * 8, 15)
+    text = gro(wrapped(truth.atoms(), truth.cell), box_of(truth.cell), 9)
+    found = read(tmp_path, text, "a.gro", edges=(30.0, 30.0, 30.0))
+    assert found.residual_max < 1e-6  # whole by the file's box, not the scene's
+    assert found.notes == ("the scene's box counts, not that of the file",)
+    assert np.diag(found.cell) == pytest.approx(30)
+
+
+def test_a_slab_has_no_box_of_its_own(tmp_path):
+    truth = Truth(["spce"] * 2)
+    text = xyz(truth.atoms(), truth.cell).replace('Lattice="', 'pbc="T T F" Lattice="')
+    with pytest.raises(StructureError, match=r"has no box .its cell is periodic along a, b only"):
+        read(tmp_path, text, "a.xyz")
+
+
+# damage
+
+
+def cut(text, lines):
+    return "\n".join(text.splitlines()[:lines]) + "\n"
+
+
+WATERS = Truth(["spce"] * 4)
+GRO = gro(WATERS.atoms(), box_of(WATERS.cell))
+DAMAGED = {
+    "cut.gro": (cut(GRO, 8), r"line 2 promises 12 atoms and a box, 5 are there: truncated\?"),
+    "cut_in_line.gro": (cut(GRO, 13) + GRO.splitlines()[13][:30] + "\n1 1 1\n", r"line 14: expected an atom of a .gro"),
+    "no_number.gro": (GRO.replace("\n12\n", "\ntwelve\n"), r"line 2: expected the number of atoms, found 'twelve'"),
+    "too_few.gro": (
+        GRO.replace("\n12\n", "\n11\n"),
+        r"line 14: expected the box, 3 or 9 numbers .is the number of atoms right",
+    ),
+    "no_box.gro": (cut(GRO, 14), r"promises 12 atoms and a box, 11 are there"),
+    "box.gro": (cut(GRO, 14) + "1.4 1.5\n", r"line 15: expected the box, 3 or 9 numbers .*found '1.4 1.5'"),
+    "nan.gro": (GRO.replace(GRO.splitlines()[4][20:28], "     nan"), r"atom 3 has a position that is not a finite"),
+    "nan_box.gro": (cut(GRO, 14) + "1.4 nan 1.4\n", r"its box has an edge that is not a finite number"),
+    "empty.gro": ("", "holds no atoms"),
+    "cut.pdb": (cryst1(WATERS.cell) + "\nATOM      1  O   HOH A   1       1.000   2.0\n", "ASE cannot read it"),
+    "edges_only.pdb": ("CRYST1   14.000   15.000   16.000\n" + pdb(WATERS.atoms(), ""), "line 1: CRYST1 needs three"),
+    "alternate.pdb": (
+        "ATOM      1  O  AHOH A   1       1.000   2.000   3.000\nATOM      2  O  BHOH A   1       1.000   2.000   3.100\n",
+        "alternate locations A, B",
+    ),
+    "empty.pdb": ("END\n", "holds no atoms"),
+    "cut.xyz": (cut(xyz(WATERS.atoms(), WATERS.cell), 9), "ASE cannot read it"),
+    "words.xyz": ("3\n\nO a b c\nH 0 0 0\nH 0 0 0\n", "ASE cannot read it"),
+    "cut.arc": (cut(arc(WATERS.atoms(), None), 9), r"promises 12 atoms, 8 are there"),
+    "words.arc": (cut(arc(WATERS.atoms(), None), 12) + "x y\n", "line 13: expected an atom of Tinker's format"),
+    "cut.cssr": (cut(cssr(WATERS.atoms(), WATERS.cell, True), 9), "line 3 promises 12 atoms, 5 are there"),
+    "short.cssr": ("a\nb\n", "too short for a .cssr"),
+    "cut.data": (cut(lammps(WATERS, "x", 1.0), 24), "ASE cannot read it|molecule 2"),
+    "no_masses.data": (lammps(WATERS, "x", 1.0).replace("Masses", "Madness"), "no section Masses"),
+    "cut.cif": (cut(cif(), 8), "holds no atoms|ASE cannot read it"),
+    "binary.gro": ("\x00\x01", "line 2: expected the number of atoms"),
+    "strange.foo": ("x", "format is unknown to ASE"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_files_get_a_message(name, tmp_path):
+    text, message = DAMAGED[name]
+    with pytest.raises(StructureError, match=message):
+        read(tmp_path, text, name)
+
+
+def test_titles_in_any_encoding(tmp_path):
+    (tmp_path / "a.gro").write_bytes(GRO.replace("t\n", "Gefrierpunkt 0 °C\n", 1).encode("latin-1"))
+    assert len(read_structure(tmp_path / "a.gro", [SPECIES["spce"]], None, True, TOLERANCE).species) == 4
+    (tmp_path / "a.gro").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(StructureError, match="line 2: expected the number of atoms"):
+        read_structure(tmp_path / "a.gro", [SPECIES["spce"]], None, True, TOLERANCE)
+
+
+@pytest.mark.parametrize(("unit", "angstrom"), [("nm", 10.0), ("bohr", 0.529177210903)])
+def test_coordinates_in_other_units(unit, angstrom, tmp_path):
+    truth = Truth(["spce"] * 8, 16)
+    atoms = [(name, e, k, x / angstrom, v) for name, e, k, x, v in truth.atoms()]
+    with pytest.raises(StructureError, match=f"seem to be in {unit}, not in Å"):
+        read(tmp_path, xyz(atoms, truth.cell / angstrom), "a.xyz")
+
+
+def test_species_that_the_scene_lacks(tmp_path):
+    truth = Truth(["spce", "nitrogen", "spce", "argon"], 17)
+    with pytest.raises(
+        StructureError, match=r"atoms called Ar, N, which are in no molecule of the scene: spce \(O H2\)"
+    ):
+        read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz")
+    text = gro(truth.atoms(), box_of(truth.cell), residue_names={1: "N2", 3: "AR"})
+    with pytest.raises(StructureError, match=r"molecule 2 \(atoms 4 to 5, residue 'N2'\) has atoms N2, expected spce"):
+        read(tmp_path, text, "a.gro")
+
+
+def test_like_species_need_residue_names(tmp_path):
+    truth = Truth(["spce"] * 3, 18)
+    with pytest.raises(
+        StructureError, match=r"molecule 1 .atoms 1 to 3, .* may be spce or tip4p2005: give them residue_names"
+    ):
+        read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz", ["spce", "tip4p2005"])
+
+
+def test_nothing_is_printed_or_warned(tmp_path, capsys, recwarn):
+    truth = Truth(["tip4p2005"] * 3, 19)
+    for ending, text in {
+        "pdb": pdb(truth.atoms(), cryst1(truth.cell), element_column=False),
+        "xyz": xyz(truth.atoms(), truth.cell, NAMES[0]),
+        "data": lammps(WATERS, "x", 1.0),
+    }.items():
+        read(tmp_path, text, f"a.{ending}", ["tip4p2005"])
+    assert capsys.readouterr() == ("", "")
+    assert not recwarn.list
