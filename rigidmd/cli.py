@@ -71,6 +71,9 @@ def _parser() -> argparse.ArgumentParser:
         "--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], help="unit of energy (kJ/mol; J for a body)"
     )
     energy.add_argument("--json", action="store_true", help="print JSON")
+    energy.add_argument(
+        "--accuracy", action="store_true", help="also measure the error of Coulomb forces, of Ewald sums and PME"
+    )
 
     check = _command(
         commands, "check", _check, "say what would happen, and run nothing", "rigidmd check systems/water_nitrogen.toml"
@@ -211,7 +214,7 @@ def _energy(options: argparse.Namespace) -> int:
     if isinstance(scene, BodyScene):
         return _body_energy(scene, options)
     unit = options.unit or "kJ/mol"
-    found = Simulation(scene).start_energy(ENERGY_UNITS[unit], unit)
+    found = Simulation(scene).start_energy(ENERGY_UNITS[unit], unit, options.accuracy)
     if options.json:
         print(json.dumps(found, indent=2))
         return 0
@@ -225,6 +228,15 @@ def _energy(options: argparse.Namespace) -> int:
         print(f"  {'pressure':<22}{found['pressure_bar']:>22.10g} bar")
     force, molecule = found["largest_force_per_A"], found["largest_force_molecule"]
     print(f"  {'largest force':<22}{force:>22.10g} {unit}/Å on molecule {molecule}")
+    if options.accuracy:
+        error = found["accuracy"]
+        print(f"Coulomb forces on sites, held against {error['reference']}")
+        print(f"  {'rms force':<22}{error['rms_force_per_A']:>22.4g} {unit}/Å")
+        relative = f"{error['relative']:.2g} of it, {error['in_e2_per_A2']:.2g} e²/Å²"
+        print(f"  {'rms error':<22}{error['rms_error_per_A']:>22.4g} {unit}/Å: {relative}")
+        print(f"  {'estimated':<22}{error['estimated_per_A']:>22.4g} {unit}/Å")
+        print(f"  {'largest error':<22}{error['largest_error_per_A']:>22.4g} {unit}/Å")
+        print(f"  {'error of the energy':<22}{error['energy_error']:>22.4g} {unit}")
     return 0
 
 
@@ -232,6 +244,8 @@ def _body_energy(scene, options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.simulation import Simulation
 
+    if options.accuracy:
+        raise SceneError(scene.source, ["--accuracy is for molecules with Ewald sums"])
     if options.unit is not None:
         raise SceneError(scene.source, [f"--unit {options.unit} is for molecules; the energy of a body is in J"])
     found = Simulation(scene).start_energy()

@@ -1,6 +1,7 @@
 """A system in words: what would happen if it ran, and what was left out."""
 
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from rigidmd.build.cells import angles_deg, right_angled
 from rigidmd.build.system import System, build
 from rigidmd.dynamics.odes import Solver
 from rigidmd.dynamics.schemes import Scheme
+from rigidmd.forces.pairs import PairForces
 from rigidmd.forces.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
@@ -88,9 +90,7 @@ def _molecules(system: System) -> str:
     lines += [f"  {note}" for note in system.notes]
     lines.append("\ncompiled in:")
     for name, term in system.terms.items():
-        reach = f"cut-off {system.cutoff:g} Å, {scene.forces.truncation}" if system.cutoff < inf else "no cut-off"
-        skin = f"neighbour list with a skin of {scene.forces.skin_A:g} Å"
-        lines.append(f"  {name.replace('_', ' ')}: {len(term.pairs.group)} sites, {reach}, {skin}")
+        lines.append(f"  {name.replace('_', ' ')}: {_term(system, name, term)}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if any(stage.ensemble == "nvt" for stage in scene.stages):
@@ -101,6 +101,15 @@ def _molecules(system: System) -> str:
     lines += [f"  {k}: {_stage(stage)}" for k, stage in enumerate(scene.stages)]
     lines.append(f"\nmemory: about {array_bytes(system) / 1e6:.1f} MB for state, forces and neighbour lists")
     return "\n".join(lines)
+
+
+def _term(system: System, name: str, term: NamedTuple) -> str:
+    if not isinstance(term, PairForces):
+        return type(term).__name__
+    reach = f"cut-off {system.cutoff:g} Å" if system.cutoff < inf else "no cut-off"
+    if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
+        reach += f", {system.scene.forces.truncation}"
+    return f"{len(term.pairs.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
 
 
 def _stage(stage: Stage) -> str:

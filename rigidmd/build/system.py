@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.cells import reduced
+from rigidmd.build.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
 from rigidmd.build.structure import Arrangement, read_structure
 from rigidmd.build.structure_files import read_geometry
 from rigidmd.dynamics.advance import Model
 from rigidmd.errors import Faults, SceneError, StructureError
-from rigidmd.forces.coulomb import reaction_field, self_energy
 from rigidmd.forces.lennard_jones import lennard_jones, tail
 from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.sites import BodySites, CentralSites
@@ -35,7 +35,7 @@ from rigidmd.molecules import (
 )
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import Molecules
-from rigidmd.units import COULOMB, GRAM_PER_CM3, KJ_PER_MOL
+from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 DEFAULT_CUTOFF = 9.0  # Å
 #: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
@@ -70,11 +70,12 @@ class System:
     terms: dict[str, NamedTuple]
     freedom: Freedom
     constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
-    tail_pressure: float  # u/(Å ps²)
+    tail_pressure: float  # u/(Å ps²), all that no motion changes
     sites: Sites
     from_lattice: bool
     cutoff: float  # Å
     left_out: list[str]
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -138,7 +139,7 @@ def build(scene: MolecularScene) -> System:
         np.zeros(1),
         np.zeros(1),
     )
-    terms, constants, tail_pressure = _terms(scene, species, model, space, cutoff)
+    terms, constants, tail_pressure, charges = _terms(scene, species, model, space, cutoff, state)
     system = System(
         scene=scene,
         species=species,
@@ -153,6 +154,8 @@ def build(scene: MolecularScene) -> System:
         from_lattice=scene.structure is None,
         cutoff=cutoff,
         left_out=_left_out(scene, terms, model, space),
+        force_error=charges.force_error if charges else None,
+        notes=list(charges.notes) if charges else [],
     )
     _set_momenta(system, arrangement)
     system.notes += [
@@ -285,6 +288,7 @@ def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> flo
         faults.append(f"forces.switch_start_A = {start:g} is not below the cut-off of {cutoff:g} Å")
     if forces.tail_correction and space.volume == inf:
         faults.append("forces.tail_correction needs a periodic box: without one there is no liquid beyond the cut-off")
+    faults += electrostatic_faults(scene, space, cutoff)
     if faults:
         raise SceneError(scene.source, faults)
     return cutoff
@@ -359,8 +363,10 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
     return found
 
 
-def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float):
-    """Terms by name, constant energies by name, tail pressure."""
+def _terms(
+    scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float, state: State
+) -> tuple[dict[str, NamedTuple], dict[str, float], float, Electrostatics | None]:
+    """Terms by name, constant energies by name, tail pressure, what charges are."""
     forces = scene.forces
     index = model.species
     usual = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
@@ -393,19 +399,16 @@ def _terms(scene: MolecularScene, species: list[Molecule], model: Model, space: 
         )
         if forces.tail_correction:
             constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
+    found = None
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if forces.electrostatics != "none" and any(len(c) for c in chosen):
-        charge = np.concatenate([species[k].charges[chosen[k]] for k in index])
-        law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
         sites = _taking_part(species, index, chosen)
-        terms["coulomb"] = pair_forces(law, space, sites, forces.skin_A, scene.precision, _groups(sites, frozen[index]))
-        if cutoff < inf:
-            constants["reaction_field_self"] = sum(
-                int((index == k).sum())
-                * self_energy(law._replace(charge=m.charges[c] * np.sqrt(COULOMB)), m.positions_body[c])
-                for k, (m, c) in enumerate(zip(species, chosen, strict=True))
-            )
-    return terms, constants, tail_pressure
+        charged = Charged(species, index, frozen[index], chosen, sites, _groups(sites, frozen[index]))
+        found = electrostatics(scene, charged, space, cutoff, start, state)
+        terms |= found.terms
+        constants |= found.constants
+        tail_pressure += found.pressure
+    return terms, constants, tail_pressure, found
 
 
 def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
@@ -413,10 +416,14 @@ def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) ->
     out = []
     if "lennard_jones" not in terms:
         out.append("Lennard-Jones: no site has it")
-    if "coulomb" not in terms:
+    if not any(name.startswith("coulomb") for name in terms):
         out.append(
             "charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one")
         )
+    elif "coulomb_reciprocal" not in terms:
+        out.append(f"sums over periodic images, Fourier transforms: electrostatics is {scene.forces.electrostatics}")
+    elif scene.forces.electrostatics == "ewald":
+        out.append("Fourier transforms: electrostatics is ewald, wave by wave")
     if isinstance(model.rotor, NoRotor):
         out.append("rotation and torques: every molecule is a point")
     if space.volume == inf:

@@ -11,8 +11,19 @@ from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import answer
-from rigidmd.forces.pairs import with_own_list, with_room
-from rigidmd.forces.terms import ASK, LIST_FULL, NOT_FINITE, TALLY_SIZE, Load, NoForce, State, add_term, no_load
+from rigidmd.forces.terms import (
+    ASK,
+    LIST_FULL,
+    NOT_FINITE,
+    TALLY_SIZE,
+    Load,
+    NoForce,
+    State,
+    add_term,
+    no_load,
+    with_own_work,
+    with_room,
+)
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
 
@@ -42,7 +53,7 @@ class Engine:
         self.model = model
         self.names = list(terms)
         # a list that another engine has left would have its pairs in another order, and sum other last bits
-        self._terms = tuple(with_own_list(term) for term in terms.values()) or (NoForce(),)
+        self._terms = tuple(with_own_work(term) for term in terms.values()) or (NoForce(),)
         self._applied = applied or {}
         self.load: Load | None = None
         self._probe: Probe | None = None

@@ -185,6 +185,12 @@ def load_four(typing, array, index):
 
 
 @intrinsic
+def load_eight(typing, array, index):
+    """Eight numbers from array[index] on."""
+    return _load(Lanes(array.dtype, 8), array) if _is_row(array) else None
+
+
+@intrinsic
 def store(typing, array, index, lanes):
     """Write a vector to array[index], array[index + 1], ..."""
 
@@ -400,6 +406,41 @@ def lane(typing, x, k):
         return builder.extract_element(arguments[0], arguments[1])
 
     return x.dtype(x, types.intp), emit
+
+
+@intrinsic
+def polynomial(typing, coefficients, x):
+    """Sum of coefficients[k] x^k; a tuple of floats in ascending order, x a number or a vector.
+
+    Even and odd powers apart: two chains of multiply-adds, each half as long, hide one another's latency.
+    """
+    if not isinstance(coefficients, types.BaseTuple) or not isinstance(x, Lanes | types.Float):
+        return None
+
+    def emit(context, builder, signature, arguments):
+        values, x_value = arguments
+        kinds = signature.args[0].types
+
+        def constant(k):
+            number = builder.extract_value(values, k)
+            if isinstance(x, Lanes):
+                return _filled(context, builder, number, kinds[k], x)
+            return context.cast(builder, number, kinds[k], x)
+
+        def chain(powers, y):
+            total = constant(powers[-1])
+            for k in powers[-2::-1]:
+                total = builder.fadd(builder.fmul(total, y, flags=FLAGS), constant(k), flags=FLAGS)
+            return total
+
+        square = builder.fmul(x_value, x_value, flags=FLAGS)
+        even, odd = range(0, len(kinds), 2), range(1, len(kinds), 2)
+        found = chain(even, square)
+        if len(odd):
+            found = builder.fadd(builder.fmul(chain(odd, square), x_value, flags=FLAGS), found, flags=FLAGS)
+        return found
+
+    return x(coefficients, x), emit
 
 
 @intrinsic

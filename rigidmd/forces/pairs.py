@@ -64,6 +64,29 @@ class PairForces(NamedTuple):
     sums: Sums
     parts: Parts
 
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.sums.force
+
+    def with_room(self) -> "PairForces":
+        """The term with its machine code and as much room as its last list asked for."""
+        term = self._replace(pairs=neighbors.with_room(self.pairs))
+        if (room := _room(term.pairs)) > term.sums.others.shape[1]:
+            lanes = lane_count(dtype := term.sums.others.dtype)
+            others = zeros((len(term.sums.others), int(1.1 * room / lanes + 1) * lanes), dtype)
+            term = term._replace(sums=term.sums._replace(others=others))
+        if term.parts.forces == 0:
+            content = (term.arranged, term.pairs, term.sums)
+            parts = (part.address(content) for part in (_forces, _forces_and_energies, _gather))
+            term = term._replace(parts=Parts(*parts))
+        return term
+
+    def with_own_work(self) -> "PairForces":
+        """The term with a list and work arrays that it shares with no other."""
+        precision = next(name for name, dtype in PRECISIONS.items() if dtype == self.sums.others.dtype)
+        return pair_forces(self.law, self.space, self.sites, self.pairs.skin, precision, self.pairs.group)
+
 
 def pair_forces(
     law: NamedTuple,
@@ -97,33 +120,10 @@ def _diameter(sites: BodySites | CentralSites) -> float:
     return 2 * float(np.linalg.norm(sites.offset_body, axis=1).max()) if isinstance(sites, BodySites) else 0.0
 
 
-def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with its machine code and as much room as its last list asked for; other terms as they are."""
-    if not isinstance(term, PairForces):
-        return term
-    term = term._replace(pairs=neighbors.with_room(term.pairs))
-    if (room := _room(term.pairs)) > term.sums.others.shape[1]:
-        lanes = lane_count(dtype := term.sums.others.dtype)
-        others = zeros((len(term.sums.others), int(1.1 * room / lanes + 1) * lanes), dtype)
-        term = term._replace(sums=term.sums._replace(others=others))
-    if term.parts.forces == 0:
-        content = (term.arranged, term.pairs, term.sums)
-        term = term._replace(parts=Parts(*(part.address(content) for part in (_forces, _forces_and_energies, _gather))))
-    return term
-
-
 @kernel
 def _room(pairs):
     """Room that a block needs for forces on the sites of others."""
     return 3 * width_of(pairs.clusters.local) * most_needed(pairs, 2)
-
-
-def with_own_list(term: NamedTuple) -> NamedTuple:
-    """The term with work arrays that it shares with no other; other terms as they are."""
-    if not isinstance(term, PairForces):
-        return term
-    precision = next(name for name, dtype in PRECISIONS.items() if dtype == term.sums.others.dtype)
-    return pair_forces(term.law, term.space, term.sites, term.pairs.skin, precision, term.pairs.group)
 
 
 def pair(law, i, j, r2):

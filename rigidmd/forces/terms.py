@@ -84,6 +84,16 @@ def _add_no_force(term, state, load, tally):
         return lambda term, state, load, tally: OK
 
 
+def with_room(term: NamedTuple) -> NamedTuple:
+    """The term with its machine code and all the room that it asked for; a term that needs none as it is."""
+    return term.with_room() if hasattr(term, "with_room") else term
+
+
+def with_own_work(term: NamedTuple) -> NamedTuple:
+    """The term with work arrays that it shares with no other; a term that has none as it is."""
+    return term.with_own_work() if hasattr(term, "with_own_work") else term
+
+
 @kernel
 def add_term(term, state, load, tally):
     """`add_forces` of one term, to be called from Python."""

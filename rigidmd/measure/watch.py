@@ -163,7 +163,8 @@ def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | N
         return None  # where a coordinate has no digits left for distances
     sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
     near = system.of_sites(lambda m: np.full(len(m.epsilon), BARE if m.epsilon.any() else NAKED))
-    charge = system.of_sites(lambda m: m.charges) if "coulomb" in system.terms else np.zeros(len(sigma))
+    acts = any(name.startswith("coulomb") for name in system.terms)
+    charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
     found = []
     reach = max(OVERLAP * sigma.max(), near.max() * system.smallest_diameter)
     for i, j, distance in close_pairs(system, state, reach):

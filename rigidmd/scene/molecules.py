@@ -25,6 +25,22 @@ SPECIES_FILES = ("file", "parameters")
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
+WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
+GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
+
+#: Keys of `Forces` that only some kinds of electrostatics know.
+ELECTROSTATIC_KEYS = {
+    "reaction_field_permittivity": ("reaction_field",),
+    "damping_per_A": ("damped_shifted_force",),
+    "ewald_accuracy": ("ewald", "pme"),
+    "ewald_alpha_per_A": ("ewald", "pme"),
+    "ewald_surface_permittivity": ("ewald", "pme"),
+    "ewald_k_max": ("ewald",),
+    "ewald_k2_max": ("ewald",),
+    "ewald_k_radius_per_A": ("ewald",),
+    "pme_order": ("pme",),
+    "pme_grid": ("pme",),
+}
 
 
 class Structure(Section):
@@ -159,10 +175,28 @@ class Forces(Section):
     """Parameters of particular pairs, in place of the mixing rule"""
     tail_correction: Flag = False
     """Add the energy and pressure of Lennard-Jones beyond the cut-off"""
-    electrostatics: Literal["reaction_field", "none"] = "reaction_field"
-    """How charges act; none ignores them"""
+    electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
+    """How charges act: ewald and pme with all periodic images, the others within the cut-off; none ignores them"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
+    damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
+    """Of damped_shifted_force; 0 for none"""
+    ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] = 1e-5
+    """Of ewald and pme: rms error of the force on a site, over that between two charges e at 1 Å; sets what follows"""
+    ewald_alpha_per_A: Positive | None = None
+    """Splitting parameter: charges are screened by erfc(alpha r)"""
+    ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
+    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each"""
+    ewald_k2_max: Count | None = None
+    """Of ewald: largest n_x² + n_y² + n_z² besides"""
+    ewald_k_radius_per_A: Positive | None = None
+    """Of ewald: largest length of k"""
+    ewald_surface_permittivity: Permittivity = inf
+    """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
+    pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
+    """Of pme: order of the B-splines, 4 is cubic"""
+    pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
+    """Of pme: grid points along each edge"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.3
     """Extra radius of the neighbour list; speed only, never the result"""
 
@@ -170,9 +204,23 @@ class Forces(Section):
     def _nothing_idle(self):
         if self.switch_start_A is not None and "switch" not in self.truncation:
             raise ValueError(f"switch_start_A would do nothing with truncation = {self.truncation!r}")
-        if self.electrostatics == "none" and self.reaction_field_permittivity != inf:
-            raise ValueError("reaction_field_permittivity would do nothing with electrostatics = 'none'")
+        fields, method = type(self).model_fields, self.electrostatics
+        for key, methods in ELECTROSTATIC_KEYS.items():
+            if getattr(self, key) != fields[key].default and method not in methods:
+                raise ValueError(f"{key} would do nothing with electrostatics = {method!r}")
+        if self.ewald_k2_max is not None and self.ewald_k_max is None:
+            raise ValueError("ewald_k2_max needs ewald_k_max beside it")
+        if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
+            raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
+        settled = self.gives_waves or (self.pme_grid is not None and self.pme_order is not None)
+        if settled and self.ewald_alpha_per_A is not None and "ewald_accuracy" in self.model_fields_set:
+            raise ValueError("ewald_accuracy would do nothing: alpha and what goes with it are all given")
         return self
+
+    @property
+    def gives_waves(self) -> bool:
+        """Whether the scene says which waves an Ewald sum takes."""
+        return self.ewald_k_max is not None or self.ewald_k_radius_per_A is not None
 
 
 class Start(Section):

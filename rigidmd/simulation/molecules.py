@@ -15,6 +15,7 @@ from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.terms import Load, State
 from rigidmd.measure import watch
+from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
@@ -24,7 +25,7 @@ from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import WITH_VELOCITIES
 from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
 from rigidmd.simulation.subjects import choose_for_molecules
-from rigidmd.units import BOLTZMANN, FEMTOSECOND
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
 
 STREAM_THERMOSTAT = 3  # see build.system for the others
 LAST_GOOD_STATE = "last_good_state.npz"
@@ -336,11 +337,14 @@ class MolecularSimulation(Simulation):
 
         return summary_text(results.summary)
 
-    def start_energy(self, size: float, unit: str) -> dict:
-        """Energies, virial, pressure and largest force of the start; energies in a unit of `size` u Å²/ps²."""
+    def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
+        """Energies, virial, pressure and largest force of the start; energies in a unit of `size` u Å²/ps².
+
+        measure_accuracy : also how far Coulomb forces are from those of a longer Ewald sum
+        """
         seen, relief = self.start()
         force, molecule = seen.largest_force
-        return {
+        found = {
             "unit": unit,
             "molecules": len(self.system.model.species),
             "relief_steps": relief.steps if relief else 0,
@@ -353,3 +357,16 @@ class MolecularSimulation(Simulation):
             "largest_force_per_A": force / size,
             "largest_force_molecule": molecule + 1,
         }
+        if measure_accuracy:
+            error = accuracy(self.system, self.state)
+            found["accuracy"] = {
+                "reference": error.reference,
+                "rms_force_per_A": error.force / size,
+                "rms_error_per_A": error.measured / size,
+                "relative": error.relative,
+                "in_e2_per_A2": error.measured / COULOMB,
+                "estimated_per_A": error.estimated / size,
+                "largest_error_per_A": error.largest / size,
+                "energy_error": error.energy / size,
+            }
+        return found

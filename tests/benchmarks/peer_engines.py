@@ -95,10 +95,11 @@ class Rigidmd:
             done += now
             if job["every"]:
                 look()
-        lists = [term.pairs for term in engine.terms.values()]
+        lists = [term.pairs for term in engine.terms.values() if hasattr(term, "pairs")]
         settings = (
             f"list {lists[0].cutoff + lists[0].skin:.4g} Å, rebuilt when a site has moved {lists[0].skin / 2:g} Å"
         )
+        settings += "".join(f"; {note}" for note in system.notes if note.startswith("pme"))
         return series(job, looks) | {"seconds": seconds, "timed_steps": done, "settings": settings}
 
 
@@ -125,7 +126,8 @@ class OpenMM:
         edge = float(sites["edge"]) / 10
         system.setDefaultPeriodicBoxVectors((edge, 0, 0), (0, edge, 0), (0, 0, edge))
         force = openmm.NonbondedForce()
-        force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+        method = "PME" if job["workload"]["pme"] else "CutoffPeriodic"
+        force.setNonbondedMethod(getattr(openmm.NonbondedForce, method))
         force.setCutoffDistance(cutoff)
         force.setUseDispersionCorrection(False)
         force.setReactionFieldDielectric(job["workload"]["permittivity"])
@@ -193,9 +195,13 @@ class Gromacs:
             "integrator": "md", "dt": job["timestep_fs"] * 1e-3, "nsteps": job["steps"], "continuation": "yes",
             "cutoff-scheme": "verlet", "nstlist": work["nstlist"], "verlet-buffer-tolerance": job["options"]["buffer"],
             "rvdw": work["cutoff"] / 10, "rcoulomb": work["cutoff"] / 10, "vdw-modifier": "potential-shift",
-            "coulombtype": "reaction-field" if work["charged"] else "cut-off", "epsilon-rf": work["permittivity"],
             "lincs-iter": 2, "nstenergy": every, "nstcalcenergy": every, "nstlog": 0,
         }  # fmt: skip
+        if work["pme"]:
+            options |= {"coulombtype": "PME"}
+        else:
+            kind = "reaction-field" if work["charged"] else "cut-off"
+            options |= {"coulombtype": kind, "epsilon-rf": work["permittivity"]}
         (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
         (folder / "run.gro").write_text(gro(sites, leapfrog_velocity(job, sites)))
         (folder / "run.top").write_text(top(sites))
@@ -230,6 +236,8 @@ class Lammps:
         work, skin = job["workload"], job["options"]["skin_A"]
         cutoff = work["cutoff"]
         style = f"lj/cut/coul/dsf {DSF_ALPHA} {cutoff} {cutoff}" if work["charged"] else f"lj/cut {cutoff}"
+        if work["pme"]:
+            style = f"lj/cut/coul/long {cutoff} {cutoff}"
         coefficients = [
             f"pair_coeff {k + 1} {k + 1} {epsilon / KCAL:.15g} {sigma:.15g}"
             for k, (epsilon, sigma) in enumerate(zip(sites["epsilon"], sites["sigma"], strict=True))
@@ -239,6 +247,7 @@ class Lammps:
             "units real", "atom_style full", "boundary p p p", "read_data run.data",
             f"pair_style {style}", "pair_modify shift yes mix arithmetic", *coefficients,
             f"neighbor {skin} bin", "neigh_modify exclude molecule/intra all every 1 delay 0 check yes",
+            *([f"kspace_style pppm {work['accuracy']:g}"] if work["pme"] else []),
             "fix 1 all rigid/nve/small molecule", f"timestep {job['timestep_fs']}",
             "thermo_style custom step pe ke etotal", "thermo_modify norm no format float %.15g",
             f"thermo {job['every'] or job['steps']}", f"run {job['steps']}",

@@ -1,0 +1,93 @@
+"""Forces of Ewald sums as a scene asks for them, held against a sum so long that nothing is missing."""
+
+from math import pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erf
+
+from rigidmd.build.momenta import mobile
+from rigidmd.build.system import System, build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.errors import SceneError
+from rigidmd.forces.terms import State
+from rigidmd.units import COULOMB
+
+#: The sum that others are held against leaves out so much of what they are estimated to.
+TIGHTER = 1e-3
+TIGHTEST = 1e-12  # e²/Å²; float64 has no more digits
+
+
+class Accuracy(NamedTuple):
+    """Errors of the Coulomb forces on sites, u Å/ps², and of the Coulomb energy."""
+
+    estimated: float  # rms
+    measured: float  # rms
+    largest: float
+    force: float  # rms of the forces themselves
+    energy: float  # u Å²/ps²
+    reference: str  # what was held against
+
+    @property
+    def relative(self) -> float:
+        """Measured, over the rms force."""
+        return self.measured / self.force
+
+
+def accuracy(system: System, state: State) -> Accuracy:
+    """Of a system's Ewald sums at a state. Raises SceneError where it has none."""
+    scene = system.scene
+    if system.force_error is None:
+        method = scene.forces.electrostatics
+        raise SceneError(
+            scene.source,
+            [f"--accuracy is that of Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"],
+        )
+    forces = scene.forces.model_copy(
+        update={
+            "electrostatics": "ewald",
+            "ewald_accuracy": max(TIGHTER * system.force_error / COULOMB, TIGHTEST),
+            **dict.fromkeys(("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "pme_order", "pme_grid")),
+        }
+    )
+    tight = scene.model_copy(update={"forces": forces, "precision": "double"})
+    reference = build(tight)
+    moves = mobile(system.model)[system.terms["coulomb_real"].sites.molecule]
+    found, energy = _coulomb(system, state)
+    exact, exact_energy = _coulomb(reference, state)
+    error = np.linalg.norm((found - exact)[moves], axis=1)
+    return Accuracy(
+        estimated=system.force_error,
+        measured=float(np.sqrt((error**2).mean())),
+        largest=float(error.max()),
+        force=float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())),
+        energy=energy - exact_energy,
+        reference=next(note for note in reference.notes if note.startswith("ewald")),
+    )
+
+
+def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
+    """Coulomb forces on charged sites (s, 3), pairs inside molecules left out, and the Coulomb energy."""
+    engine = Engine(system.model, {name: term for name, term in system.terms.items() if name.startswith("coulomb")})
+    _, tallies = engine.evaluate(state)
+    terms = engine.terms
+    force = sum(term.site_force for term in terms.values() if hasattr(term, "site_force"))
+    real = terms["coulomb_real"]
+    force = force + _inside(real.law.charge, real.pairs.position, real.sites.first, real.law.alpha)
+    constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
+    return force, sum(tally.energy for tally in tallies.values()) + constants
+
+
+def _inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, alpha: float) -> np.ndarray:
+    """Forces (s, 3) that take out what the reciprocal part does between sites of one molecule."""
+    force = np.zeros_like(position)
+    count = np.diff(first)
+    for apart in range(1, count.max(initial=1)):
+        i = np.concatenate([np.arange(a, a + n - apart) for a, n in zip(first[:-1], count, strict=True) if n > apart])
+        d = position[i] - position[i + apart]
+        r = np.linalg.norm(d, axis=1)
+        slope = erf(alpha * r) / r**3 - 2 * alpha / sqrt(pi) * np.exp(-((alpha * r) ** 2)) / r**2
+        pull = (charge[i] * charge[i + apart] * slope)[:, None] * d
+        np.subtract.at(force, i, pull)
+        np.add.at(force, i + apart, pull)
+    return force

@@ -1,0 +1,601 @@
+"""Ewald sums, smooth PME and damped shifted force: published figures, the slow oracle, gradients, accuracy, threads."""
+
+import json
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+from conftest import ROOT, built, shaken, small_scene
+from reference import KE, EwaldOracle, nearest
+from scipy.special import erfc, hyp1f1
+
+from rigidmd.build.describe import describe
+from rigidmd.build.system import build
+from rigidmd.dynamics.engine import Engine
+from rigidmd.errors import SceneError
+from rigidmd.forces.ewald import sum_of, waves
+from rigidmd.forces.screened import screening
+from rigidmd.forces.space import Triclinic, cell_of, space_of
+from rigidmd.measure.accuracy import accuracy
+from rigidmd.measure.drift import slope
+from rigidmd.measure.observables import observe
+from rigidmd.mechanics.rotation import from_vector
+from rigidmd.scene import Scene
+from rigidmd.scene.molecules import Box
+from rigidmd.simulation import Simulation
+from rigidmd.units import BOLTZMANN, COULOMB, KJ_PER_MOL
+
+BOXES = [{"lengths_A": [13.0, 12.5, 15.0]}, {"lengths_A": [13.0, 14.0, 15.0], "angles_deg": [75.0, 100.0, 65.0]}]
+TIGHT = {"cutoff_A": 6.4, "ewald_alpha_per_A": 0.9}  # erfc is 3e-16 at the cut-off
+TIGHT_EWALD = TIGHT | {"electrostatics": "ewald", "ewald_k_max": 20}
+TIGHT_PME = TIGHT | {"electrostatics": "pme", "pme_grid": [32, 36, 40], "pme_order": 8}
+SALT = [
+    {"name": "Na", "count": 6, "sites": [{"name": "NA", "element": "Na", "mass_u": 22.99, "charge_e": 1.0, "sigma_A": 2.2,
+      "epsilon_K": 60.0, "position_A": [0.0, 0.0, 0.0]}]},
+    {"model": "tip4p2005", "count": 9},
+]  # fmt: skip
+
+
+def coulomb(components):
+    """Coulomb energy of components of the potential energy."""
+    return sum(energy for name, energy in components.items() if name.startswith("coulomb"))
+
+
+def charged_sites(system, state):
+    """Positions, charges (e) and molecules of the charged sites."""
+    charge = system.of_sites(lambda m: m.charges)
+    on = charge != 0
+    return system.site_positions(state)[on], charge[on], system.sites.molecule[on]
+
+
+# --- the pair law ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("alpha", "cutoff"), [(0.25, 9.0), (0.35, 9.0), (0.28, 10.0), (0.9, 6.0)])
+@pytest.mark.parametrize(("dtype", "error"), [(np.float64, 1e-14), (np.float32, 4e-7)])
+def test_polynomials_are_erfc(alpha, cutoff, dtype, error):
+    """Relative to the functions at r = 0, in the precision of the lanes; 1.5e-7 and 5e-15 where alpha is usual."""
+    found = screening(alpha, cutoff, dtype)
+    r = np.linspace(0.5, cutoff, 500)
+    t = (found.scale * (r**2).astype(dtype) - dtype(1)).astype(dtype)
+    x2 = (alpha * r) ** 2
+    for coefficients, at_zero, exact in (
+        (found.energy, 2 * alpha / np.sqrt(np.pi), hyp1f1(0.5, 1.5, -x2)),  # erf(x)/x
+        (
+            found.force,
+            4 * alpha**3 / (3 * np.sqrt(np.pi)),
+            hyp1f1(1.5, 2.5, -x2),
+        ),  # erf(x)/x³ - 2 exp(-x²)/(sqrt(pi) x²)
+    ):
+        value = np.polyval(coefficients[::-1], t)
+        assert value.dtype == dtype
+        assert np.abs(value / at_zero - exact).max() < error
+
+
+def test_damped_shifted_force_is_fennell_and_gezelter():
+    alpha, cutoff = 0.2, 6.0
+    forces = {"cutoff_A": cutoff, "electrostatics": "damped_shifted_force", "damping_per_A": alpha}
+    system, engine, state = built({"tip4p2005": 8, "spce": 6}, 13.0, 3, forces=forces)
+    x, q, owner = charged_sites(system, state)
+    slope_at = erfc(alpha * cutoff) / cutoff**2 + 2 * alpha / np.sqrt(np.pi) * np.exp(-((alpha * cutoff) ** 2)) / cutoff
+
+    def law(r):
+        return erfc(alpha * r) / r - erfc(alpha * cutoff) / cutoff + slope_at * (r - cutoff) if r < cutoff else 0.0
+
+    pairs = own = 0.0
+    for i in range(len(x)):
+        own -= q[i] ** 2 * (alpha / np.sqrt(np.pi) + 0.5 * (erfc(alpha * cutoff) / cutoff + slope_at * cutoff))
+        for j in range(i):
+            if owner[i] == owner[j]:
+                r = np.linalg.norm(x[i] - x[j])
+                own += q[i] * q[j] * (law(r) - 1 / r)
+            else:
+                pairs += q[i] * q[j] * law(np.linalg.norm(nearest(x[i] - x[j], cell_of(system.space))))
+    seen = observe(system, engine, state)
+    assert seen.components["coulomb"] == pytest.approx(KE * pairs, rel=1e-10)
+    assert seen.components["damped_self"] == pytest.approx(KE * own, rel=1e-10)
+
+
+# --- published figures -----------------------------------------------------------------------------------------------
+
+
+def published(value, digits=6):
+    """Whatever rounds to a figure printed with so many digits."""
+    return pytest.approx(value, abs=0.501 * 10 ** (np.floor(np.log10(abs(value))) - digits + 1))
+
+
+def nist_scene(file, cell, folder, **waves):
+    """A NIST configuration of SPC/E, molecules made whole, with NIST's settings."""
+    rows = [line.split() for line in file.read_text().splitlines()]
+    x = np.array([row[1:4] for row in rows if len(row) == 5], float).reshape(-1, 3, 3)
+    x[:, 1:] -= np.round((x[:, 1:] - x[:, :1]) @ np.linalg.inv(cell)) @ cell
+    rows = [f"{name} {a:.12f} {b:.12f} {c:.12f}" for m in x for name, (a, b, c) in zip("OHH", m, strict=True)]
+    lattice = " ".join(f"{edge:.15g}" for edge in np.ravel(cell))
+    (folder / "water.xyz").write_text("\n".join([str(len(rows)), f'Lattice="{lattice}"', *rows]) + "\n")
+    angle = np.radians(109.47)
+    sites = [
+        {"name": "O", "element": "O", "mass_u": 15.9994, "charge_e": -0.8476, "sigma_A": 3.16555789, "epsilon_K": 78.19743111,
+         "position_A": [0.0, 0.0, 0.0]},
+        {"name": "H1", "element": "H", "mass_u": 1.008, "charge_e": 0.4238, "position_A": [1.0, 0.0, 0.0]},
+        {"name": "H2", "element": "H", "mass_u": 1.008, "charge_e": 0.4238,
+         "position_A": [float(np.cos(angle)), float(np.sin(angle)), 0.0]},
+    ]  # fmt: skip
+    data = {
+        "structure": {"file": "water.xyz"},
+        "molecules": [{"name": "water", "sites": sites}],
+        "forces": {
+            "cutoff_A": 10.0,
+            "truncation": "plain",
+            "tail_correction": True,
+            "electrostatics": "ewald",
+            **waves,
+        },
+        "start": {"temperature_K": 0.0},
+        "stages": [{"duration_ps": 1.0}],
+    }
+    return Scene.from_dict(data, folder)
+
+
+# of components, in NIST's tables
+NIST_NAMES = {
+    "lennard_jones": "disp", "lennard_jones_tail": "LRC", "coulomb_real": "real", "coulomb_reciprocal": "fourier",
+    "coulomb_self": "self", "coulomb_intramolecular": "intra",
+}  # fmt: skip
+
+
+def in_kelvin(components):
+    """Energies over kB; NIST has CODATA 2010, ours differ in the eighth digit."""
+    older = 1.602176565e-19**2 / (4 * np.pi * 8.854187817e-12 * 1.3806488e-23) * 1e10 / (COULOMB / BOLTZMANN)
+    assert set(components) == set(NIST_NAMES)
+    return {name: energy / BOLTZMANN * (older if "coulomb" in name else 1) for name, energy in components.items()}
+
+
+def check_nist_moments(seen, rotation, moments):
+    """Virial tensor, force and torque on the first molecule."""
+    tensor = np.array(moments["W_sym_K"])
+    assert (seen.virial + seen.virial.T) / 2 / BOLTZMANN == pytest.approx(tensor, abs=3e-6 * np.abs(tensor).max())
+    force = seen.load.force[0] / BOLTZMANN
+    torque = rotation @ seen.load.torque_body[0] / BOLTZMANN
+    assert force == pytest.approx(np.array(moments["mol1_force_K_per_A"]), abs=1e-6 * np.abs(force).max())
+    assert torque == pytest.approx(np.array(moments["mol1_torque_K"]), abs=2e-4 * np.abs(torque).max())
+
+
+@pytest.mark.parametrize("config", [1, 3])
+def test_nist_spce_component_by_component(reference, config, tmp_path):
+    table = json.loads((reference / "nist_spce_cuboid" / "REFERENCE.json").read_text())
+    file = reference / "nist_spce_cuboid" / f"spce_sample_config_periodic{config}.txt"
+    system = build(
+        nist_scene(file, 20 * np.eye(3), tmp_path, ewald_alpha_per_A=5.6 / 20, ewald_k_max=5, ewald_k2_max=26)
+    )
+    seen = observe(system, Engine(system.model, system.terms), system.state)
+    found = in_kelvin(seen.components)
+    figures = table["NIST_10A"][f"config{config}"]
+    for name, printed in NIST_NAMES.items():
+        assert found[name] == published(figures[f"E_{printed}"]), name
+    assert sum(found.values()) == pytest.approx(figures["E_total"], rel=2e-5)  # NIST's own erfc is good to 1e-7
+
+    derived = table["DERIVED_by_this_hunt"]
+    exact = derived["exact_erfc_10A"][f"config{config}"]
+    for name, key in zip(NIST_NAMES, ("Elj", "Elrc", "Ereal", "Efour", "Eself", "Eintra"), strict=True):
+        assert found[name] == pytest.approx(exact[key], rel=2e-9), name
+    moments = next(value for key, value in derived.items() if key.startswith("molecular_virial"))[f"config{config}"]
+    check_nist_moments(seen, system.state.rotation[0], moments)
+
+
+def test_nist_spce_in_a_triclinic_cell(reference, tmp_path):
+    folder = reference / "nist_spce_noncuboid"
+    table = json.loads((folder / "REFERENCE.json").read_text())
+    figures = table["NIST"]["triclinic_sample_periodic1"]
+    cell = Box(lengths_A=figures["abc_A"][0], angles_deg=figures["alpha_beta_gamma_deg"]).cell
+    radius = 2 * np.pi * 7 / np.diag(cell).min() * np.sqrt(1.00001)  # waves as REFERENCE.json says
+    file = folder / "spce_triclinic_sample_periodic1.txt"
+    system = build(
+        nist_scene(file, cell, tmp_path, ewald_alpha_per_A=0.285, ewald_k_max=7, ewald_k_radius_per_A=radius)
+    )
+    assert system.terms["coulomb_reciprocal"].waves.total == 2 * 755
+    seen = observe(system, Engine(system.model, system.terms), system.state)
+    found = in_kelvin(seen.components)
+    for name, printed in NIST_NAMES.items():
+        assert found[name] == published(figures[f"E_{printed}"]), name
+    moments = table["DERIVED_by_this_hunt"]["molecular_virial_etc (NIST k set)"]["triclinic_sample_periodic1"]
+    check_nist_moments(seen, system.state.rotation[0], moments)
+
+
+@pytest.mark.parametrize("method", ["ewald", "pme"])
+def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
+    """Energy and forces of OpenMM's test, which has them from GROMACS: Lennard-Jones cut at 10 Å."""
+    given = json.loads((reference / "openmm" / "REFERENCE.json").read_text())["triclinic_8_ions"]
+    (tmp_path / "ions.gro").write_bytes((reference / "openmm" / "triclinic.gro").read_bytes())
+    ions = [
+        {"name": name, "residue_names": [name.upper(), name], "sites": [
+            {"name": name, "element": name, "mass_u": mass, "charge_e": charge, "sigma_A": 10 * given["LJ"][name][0],
+             "epsilon_kJ_mol": given["LJ"][name][1], "position_A": [0.0, 0.0, 0.0]}]}
+        for name, mass, charge in (("Cl", 35.45, -1.0), ("Na", 22.99, 1.0))
+    ]  # fmt: skip
+    data = {
+        "structure": {"file": "ions.gro"},
+        "molecules": ions,
+        "forces": {"cutoff_A": 10.0, "truncation": "plain", "electrostatics": method, "ewald_accuracy": 1e-6},
+        "start": {"temperature_K": 100.0},
+        "stages": [{"duration_ps": 1.0}],
+    }
+    system = build(Scene.from_dict(data, tmp_path))
+    assert cell_of(system.space) == pytest.approx(10 * np.array(given["box_nm"]))
+    seen = observe(system, Engine(system.model, system.terms), system.state)
+    assert sum(seen.components.values()) / KJ_PER_MOL == pytest.approx(given["DERIVED_converged"]["no_LRC"], rel=1e-6)
+    forces = 10 * seen.load.force / KJ_PER_MOL
+    assert forces == pytest.approx(np.array(given["forces_kJ_mol_nm"]), abs=given["force_rtol"] * np.abs(forces).max())
+
+
+@pytest.mark.parametrize(("method", "asked", "error"), [("ewald", 1e-10, 1e-9), ("pme", 1e-8, 1e-7)])
+def test_madelung_constant_of_rock_salt(reference, method, asked, error, tmp_path):
+    lines = (reference / "openmm" / "nacl_crystal.xyz").read_text().splitlines()[2:]
+    rows = [(line.split()[0], *(10 * float(x) for x in line.split()[1:4])) for line in lines]
+    text = [str(len(rows)), 'Lattice="28.2 0 0 0 28.2 0 0 0 28.2"', *(" ".join(map(str, row)) for row in rows)]
+    (tmp_path / "salt.xyz").write_text("\n".join(text) + "\n")
+    ions = [
+        {"name": name, "sites": [{"name": name, "element": name, "mass_u": mass, "charge_e": charge,
+         "sigma_A": 1.0, "epsilon_K": 1e-9, "position_A": [0.0, 0.0, 0.0]}]}
+        for name, mass, charge in (("Na", 22.99, 1.0), ("Cl", 35.45, -1.0))
+    ]  # fmt: skip
+    data = {
+        "structure": {"file": "salt.xyz"},
+        "molecules": ions,
+        "forces": {"cutoff_A": 12.0, "electrostatics": method, "ewald_accuracy": asked},
+        "start": {"temperature_K": 100.0},
+        "stages": [{"duration_ps": 1.0}],
+    }
+    system = build(Scene.from_dict(data, tmp_path))
+    seen = observe(system, Engine(system.model, system.terms), system.state)
+    madelung = -coulomb(seen.components) / (COULOMB / 2.82 * 500)
+    assert madelung == pytest.approx(1.7475645946331822, rel=error)
+    given = json.loads((reference / "openmm" / "REFERENCE.json").read_text())["nacl_crystal"]["E_kJ_mol"]
+    assert coulomb(seen.components) / KJ_PER_MOL == pytest.approx(given, rel=1e-6)
+    assert np.abs(seen.load.force).max() < 100 * error * COULOMB / 2.82**2
+
+
+# --- the oracle ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("box", BOXES)
+@pytest.mark.parametrize("limit", [{"ewald_k_max": [5, 4, 7]}, {"ewald_k_max": 6, "ewald_k2_max": 30}])
+def test_ewald_is_the_oracle_term_by_term(limit, box):
+    forces = {"cutoff_A": 6.0, "electrostatics": "ewald", "ewald_alpha_per_A": 0.4, "ewald_surface_permittivity": 4.0}
+    scene = small_scene({"tip4p2005": 8, "nitrogen": 3, "spce": 5}, None, box=box, forces=forces | limit)
+    system, engine, state = shaken(build(scene), 4)
+    most = np.array(limit["ewald_k_max"]) * np.ones(3)
+    square = limit.get("ewald_k2_max", np.inf)
+    oracle = EwaldOracle(
+        *charged_sites(system, state), cell_of(system.space), 0.4, 6.0,
+        lambda n: (np.abs(n) <= most).all(axis=1) & ((n**2).sum(axis=1) <= square),
+    )  # fmt: skip
+    found = observe(system, engine, state).components
+    assert found["coulomb_real"] == pytest.approx(oracle.real, rel=1e-11)
+    assert found["coulomb_reciprocal"] == pytest.approx(oracle.reciprocal, rel=1e-11)
+    assert found["coulomb_self"] == pytest.approx(oracle.self, rel=1e-11)
+    assert found["coulomb_intramolecular"] == pytest.approx(oracle.intramolecular, rel=1e-11)
+    assert found["coulomb_surface"] == pytest.approx(oracle.surface(4.0), rel=1e-11)
+    assert "coulomb_background" not in found
+
+
+def salty(edges, method, **more):
+    """Ions and water with a net charge, shaken."""
+    scene = small_scene({}, None, molecules=SALT, box={"lengths_A": edges}, forces=method | more)
+    return shaken(build(scene), 8)
+
+
+@pytest.mark.parametrize("method", [TIGHT_EWALD, TIGHT_PME])
+def test_total_does_not_depend_on_how_it_is_split(method):
+    """A charged box with everything in it; the oracle at another alpha."""
+    system, engine, state = salty([13.0, 14.0, 15.0], method)
+    oracle = EwaldOracle(*charged_sites(system, state), cell_of(system.space), 1.0, 6.4, lambda n: n[:, 0] == n[:, 0])
+    found = observe(system, engine, state).components
+    assert found["coulomb_background"] == pytest.approx(-np.pi / (2 * 2730 * 0.81) * 36 * KE, rel=1e-10)
+    assert coulomb(found) == pytest.approx(oracle.total, rel=1e-9 if method is TIGHT_EWALD else 1e-6)
+
+
+def test_frozen_molecules_do_not_act_on_one_another():
+    """The energy is that of the whole box less that of the frozen molecules alone."""
+    molecules = [{**SALT[0], "frozen": True}, {**SALT[1], "count": 6}]
+    pressures = {}
+    for method in (TIGHT_EWALD, TIGHT_PME):
+        scene = small_scene({}, None, molecules=molecules, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=method)
+        system = build(scene)
+        x, q, owner = charged_sites(system, system.state)
+        whole, alone = (
+            EwaldOracle(
+                x[chosen], q[chosen], owner[chosen], cell_of(system.space), 1.0, 6.4, lambda n: n[:, 0] == n[:, 0]
+            )
+            for chosen in (slice(None), owner < 6)
+        )
+        seen = observe(system, Engine(system.model, system.terms), system.state)
+        # of the sums that cancel, as good as the grid is; see test_total_does_not_depend_on_how_it_is_split
+        error = 3e-6 if method is TIGHT_PME else 1e-10
+        assert coulomb(seen.components) == pytest.approx(whole.total - alone.total, abs=error * abs(whole.self))
+        pressures[method["electrostatics"]] = seen.pressure * 3 * system.space.volume
+        assert abs(system.constants["coulomb_frozen"]) > abs(coulomb(seen.components))
+    # what the grid leaves in the energy changes with the volume to a power of twice the order of the splines
+    assert pressures["pme"] == pytest.approx(pressures["ewald"], abs=16 * 3e-6 * abs(whole.self))
+
+
+def test_waves_without_compiled_code():
+    system, engine, state = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
+    engine.evaluate(state)
+    term = engine.terms["coulomb_reciprocal"]
+    energy, force, virial = sum_of(term.charge, term.work.position, cell_of(system.space), term.alpha, term.waves)
+    assert energy == pytest.approx(term.work.tallies[:, 0].sum(), rel=1e-11)
+    assert force == pytest.approx(term.work.force, abs=1e-11 * np.abs(force).max())
+    assert virial.ravel() == pytest.approx(term.work.tallies[:, 1:].sum(axis=0), rel=1e-9, abs=1e-9 * abs(energy))
+
+
+def test_waves_of_a_slanted_cell():
+    """The reciprocal parts by themselves; a shift by a lattice vector and another choice of b and c change nothing."""
+    slanted = Triclinic(13.0, 14.0, 15.0, 4.0, -3.0, 5.0)
+    found = {}
+    for method in (TIGHT_EWALD, TIGHT_PME):
+        system, _, state = salty([13.0, 14.0, 15.0], method)
+        term = system.terms["coulomb_reciprocal"]._replace(space=slanted)
+        engine = Engine(system.model, {"waves": term})
+        _, tallies = engine.evaluate(state)
+        term = engine.terms["waves"]
+        position = (term.work if method is TIGHT_EWALD else term.mesh).position
+        found[method["electrostatics"]] = (tallies["waves"].energy, term.site_force.copy(), tallies["waves"].virial)
+        energy, force, _ = sum_of(term.charge, position, cell_of(slanted), 0.9, waves((20, 20, 20)))
+        error = 1e-11 if method is TIGHT_EWALD else 3e-6
+        assert tallies["waves"].energy == pytest.approx(energy, rel=error)
+        assert term.site_force == pytest.approx(force, abs=10 * error * np.abs(force).max())
+        moved = state.copy()
+        moved.position[0] += cell_of(slanted)[2]
+        assert engine.evaluate(moved)[1]["waves"].energy == pytest.approx(tallies["waves"].energy, rel=1e-11)
+    other = term._replace(space=slanted._replace(xy=slanted.xy - slanted.x))
+    assert Engine(system.model, {"waves": other}).evaluate(state)[1]["waves"].energy == pytest.approx(energy, rel=3e-6)
+    assert found["pme"][2] == pytest.approx(found["ewald"][2], abs=1e-4 * np.abs(found["ewald"][2]).max())
+
+
+# --- gradients -------------------------------------------------------------------------------------------------------
+
+
+def total(system, engine, state):
+    return coulomb(observe(system, engine, state).components)
+
+
+@pytest.mark.parametrize("method", [TIGHT_EWALD, TIGHT_PME])
+@pytest.mark.parametrize(("surface", "angles"), [(np.inf, 90.0), (2.0, 90.0), (np.inf, 80.0)])
+def test_forces_and_torques_are_the_gradient(method, surface, angles):
+    molecules = [SALT[1]] if surface < np.inf else SALT
+    scene = small_scene(
+        {}, None, molecules=molecules, box={"lengths_A": [13.5, 14.0, 15.0], "angles_deg": [angles] * 3},
+        forces=method | {"ewald_surface_permittivity": surface},
+    )  # fmt: skip
+    system, engine, state = shaken(build(scene), 8)
+    engine = Engine(system.model, {name: term for name, term in system.terms.items() if name.startswith("coulomb")})
+    load, _ = engine.evaluate(state)
+    scale = np.abs(load.force).max()
+    h = 1e-3
+
+    def change(move):
+        # the difference over h and 2 h, extrapolated: error of order h⁴
+        def energy(step):
+            moved = state.copy()
+            move(moved, step)
+            return total(system, engine, moved)
+
+        return (8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
+
+    for m in range(0, len(state.position), 4):
+        for k in range(3):
+
+            def shift(moved, step, m=m, k=k):
+                moved.position[m, k] += step
+
+            def turn(moved, step, m=m, k=k):
+                moved.rotation[m] = moved.rotation[m] @ from_vector(step * np.eye(3)[k])
+
+            assert load.force[m, k] == pytest.approx(-change(shift), abs=1e-7 * scale)
+            assert load.torque_body[m, k] == pytest.approx(-change(turn), abs=1e-7 * scale)
+
+
+@pytest.mark.parametrize(
+    ("method", "surface", "angles"),
+    [
+        (TIGHT_EWALD, np.inf, 90.0), (TIGHT_EWALD, 2.0, 90.0), (TIGHT_PME, np.inf, 90.0), (TIGHT_PME, 2.0, 90.0),
+        (TIGHT_EWALD, np.inf, 80.0), (TIGHT_PME, np.inf, 80.0),
+    ],
+)  # fmt: skip
+def test_virial_is_the_slope_of_the_energy_with_the_volume(method, surface, angles):
+    """Along each edge by itself with Ewald. On a grid only all together: the best influence function is not strained."""
+    molecules = [SALT[1]] if surface < np.inf else SALT
+    scene = small_scene(
+        {}, None, molecules=molecules, box={"lengths_A": [13.5, 14.0, 15.0], "angles_deg": [angles] * 3},
+        forces=method | {"ewald_surface_permittivity": surface},
+    )  # fmt: skip
+    system, _, state = shaken(build(scene), 9)
+    terms = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
+    virial = sum(tally.virial for tally in Engine(system.model, terms).evaluate(state)[1].values())
+    h = 1e-4
+
+    def energy(stretch):
+        cell = cell_of(system.space) * stretch
+        stretched = {name: term._replace(space=space_of(cell)) for name, term in terms.items()}
+        moved = state.copy()
+        moved.position[:] *= stretch
+        tallies = Engine(system.model, stretched).evaluate(moved)[1]
+        return sum(tally.energy for tally in tallies.values())
+
+    def change(along):
+        return (
+            8 * (energy(1 + h * along) - energy(1 - h * along)) - energy(1 + 2 * h * along) + energy(1 - 2 * h * along)
+        ) / (12 * h)
+
+    scale = np.abs(virial).max()
+    assert virial.trace() == pytest.approx(-change(np.ones(3)), abs=1e-7 * scale)
+    if method is TIGHT_EWALD:
+        for k in range(3):
+            assert virial[k, k] == pytest.approx(-change(np.eye(3)[k]), abs=1e-7 * scale)
+
+
+# --- accuracy --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["ewald", "pme"])
+@pytest.mark.parametrize("asked", [1e-3, 1e-4, 1e-5, 1e-6])
+def test_forces_are_as_accurate_as_asked_for(method, asked):
+    """Measured against a tight Ewald sum: within a factor 2 of the request, either way; and as estimated."""
+    forces = {"cutoff_A": 7.7, "electrostatics": method, "ewald_accuracy": asked}
+    system, _, state = built({"spce": 125}, 15.52, 7, forces=forces)
+    found = accuracy(system, state)
+    assert 0.5 * asked < found.measured / COULOMB < 2 * asked
+    assert found.estimated == pytest.approx(found.measured, rel=0.6)
+
+
+@pytest.mark.parametrize("order", [3, 4, 5, 6, 7, 8])
+def test_every_order_of_splines_keeps_to_its_estimate(order):
+    forces = {
+        "cutoff_A": 7.7,
+        "electrostatics": "pme",
+        "ewald_alpha_per_A": 0.4,
+        "pme_order": order,
+        "pme_grid": [20, 18, 21],
+    }
+    system, _, state = built({"spce": 125}, 15.52, 7, forces=forces)
+    found = accuracy(system, state)
+    assert found.estimated == pytest.approx(found.measured, rel=0.5)
+
+
+def test_single_precision_is_good_enough_for_1e_5():
+    forces = {"cutoff_A": 7.7, "electrostatics": "pme", "ewald_accuracy": 1e-5}
+    errors = []
+    for precision in ("double", "mixed"):
+        system, _, state = built({"spce": 125}, 15.52, 7, forces=forces, precision=precision)
+        errors.append(accuracy(system, state).measured)
+    assert errors[1] == pytest.approx(errors[0], rel=0.1)
+
+
+@pytest.mark.parametrize("method", ["ewald", "pme"])
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+def test_same_bits_for_any_number_of_threads(method, precision):
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one core")
+    forces = {"cutoff_A": 9.0, "electrostatics": method, "ewald_accuracy": 1e-4, "skin_A": 0.3}
+    system, _, state = built({"spce": 400}, 22.9, 7, forces=forces, precision=precision)
+    seen = []
+    for threads in (1, 2):
+        numba.set_num_threads(threads)
+        load, tallies = Engine(system.model, system.terms).evaluate(state)
+        seen.append((load.force.tobytes(), load.torque_body.tobytes(), str(tallies)))
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert seen[0] == seen[1]
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
+
+
+def nve(timestep, duration, start=None):
+    data = {
+        "box": {"lengths_A": 18.6},
+        "molecules": [{"model": "spce", "count": 216}],
+        "start": {"temperature_K": 298.0},
+        "forces": {"cutoff_A": 9.0, "truncation": "smooth_switch", "electrostatics": "pme", "ewald_accuracy": 1e-6},
+        "stages": [
+            {"ensemble": "nvt", "temperature_K": 298.0, "duration_ps": 1.0},
+            {"duration_ps": duration, "timestep_fs": timestep},
+        ],
+        "output": {"trajectory": False, "log_interval_ps": duration / 50},
+    }
+    return Simulation(Scene.from_dict(data)).run().samples.rows
+
+
+def conserved(rows):
+    """Times (ps) and conserved energy (kJ/mol per molecule) of the last stage."""
+    rows = [row for row in rows if row.stage == 1]
+    return np.array([row.time for row in rows]), np.array([row.conserved for row in rows]) / 216 / KJ_PER_MOL
+
+
+def test_energy_errors_of_pme_are_of_order_2():
+    """The energy that the grid gives is kept: its fluctuation falls with the square of the step."""
+    spread = [np.std(conserved(nve(dt, 0.4))[1]) for dt in (2.0, 1.0)]
+    assert np.log2(spread[0] / spread[1]) == pytest.approx(2, abs=0.25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("timestep", [1.0, 2.0])
+def test_no_drift_over_50_ps(timestep):
+    time, energy = conserved(nve(timestep, 50.0))
+    found = slope(time, energy)
+    assert abs(found.value) < 3 * found.error
+    assert found.error < 1e-4  # kJ/mol per molecule per ps: a tenth of GROMACS's drift with its defaults
+
+
+# --- input -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("forces", "words"),
+    [
+        ({"ewald_accuracy": 1e-3}, "ewald_accuracy would do nothing with electrostatics = 'reaction_field'"),
+        ({"electrostatics": "pme", "ewald_k_max": 5}, "ewald_k_max would do nothing with electrostatics = 'pme'"),
+        ({"electrostatics": "ewald", "pme_order": 4}, "pme_order would do nothing"),
+        ({"electrostatics": "pme", "damping_per_A": 0.1}, "damping_per_A would do nothing"),
+        ({"electrostatics": "ewald", "reaction_field_permittivity": 80.0}, "reaction_field_permittivity would do nothing"),
+        ({"electrostatics": "ewald", "ewald_k2_max": 9}, "ewald_k2_max needs ewald_k_max"),
+        ({"electrostatics": "ewald", "ewald_k_max": 9, "ewald_alpha_per_A": 0.3, "ewald_accuracy": 1e-4},
+         "ewald_accuracy would do nothing: alpha"),
+        ({"electrostatics": "pme", "pme_order": 9}, "pme_order: is 9, must not be more than 8"),
+        ({"electrostatics": "pme", "pme_grid": [4, 8, 8]}, "pme_grid.0: is 4, must not be less than 8"),
+        ({"electrostatics": "ewald", "ewald_alpha_per_A": 2.0}, "far below rounding; at most 1.33 is of use"),
+        ({"electrostatics": "damped_shifted_force", "damping_per_A": 2.0}, "at most 1.33 is of use"),
+        ({"electrostatics": "pme", "pme_grid": [8, 8, 8], "pme_order": 4, "ewald_accuracy": 1e-6}, None),
+        ({"electrostatics": "pme", "pme_grid": [8, 8, 8], "ewald_accuracy": 1e-6}, "cannot be had with the forces.pme_order or"),
+    ],
+)  # fmt: skip
+def test_settings_that_make_no_sense(forces, words):
+    data = {"cutoff_A": 6.0} | forces
+    if words is None:
+        build(small_scene({"spce": 20}, 13.0, forces=data))
+        return
+    with pytest.raises(SceneError) as error:
+        build(small_scene({"spce": 20}, 13.0, forces=data))
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(("method", "words"), [
+    ("ewald", "sums over the images of a periodic box, and there is none"),
+    ("pme", "sums over the images of a periodic box, and there is none"),
+    ("damped_shifted_force", "ends at a cut-off; give forces.cutoff_A"),
+])  # fmt: skip
+def test_what_needs_a_box_or_a_cut_off_says_so(method, words):
+    with pytest.raises(SceneError, match=words):
+        build(small_scene({"spce": 3}, None, forces={"electrostatics": method}))
+
+
+def test_a_charged_box_is_said_and_has_no_dipole():
+    system, _, _ = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
+    assert any("net charge of +6 e" in note for note in system.notes)
+    with pytest.raises(SceneError, match="a box with a net charge has no dipole of its own"):
+        salty([13.0, 14.0, 15.0], TIGHT_EWALD, ewald_surface_permittivity=2.0)
+
+
+def test_check_says_how_and_what_is_left_out():
+    water = {"cutoff_A": 6.0, "electrostatics": "pme", "ewald_accuracy": 1e-4}
+    text = describe(small_scene({"spce": 20}, 13.0, forces=water))
+    assert "splines of order" in text and "estimated rms error of the force on a site" in text
+    text = describe(small_scene({"spce": 20}, 13.0, forces=water | {"electrostatics": "ewald"}))
+    assert "waves, |n| up to" in text and "Fourier transforms: electrostatics is ewald" in text
+    assert "Fourier transforms: electrostatics is reaction_field" in describe(small_scene({"spce": 20}, 18.1))
+
+
+def test_scenes_without_pme_need_no_fourier_transforms():
+    script = """
+import sys
+sys.modules["rocket_fft"] = None  # an import of it fails
+from rigidmd.build.system import build
+from rigidmd.scene import Scene
+for forces in ({}, {"electrostatics": "ewald", "cutoff_A": 6.0}):
+    data = {"box": {"lengths_A": 18.1}, "molecules": [{"model": "spce", "count": 9}], "forces": forces,
+            "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.1}]}
+    build(Scene.from_dict(data))
+assert "rigidmd.forces.pme" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, timeout=300)
