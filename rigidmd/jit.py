@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import os
 import re
+import secrets
 import shutil
 import tempfile
 import time
@@ -91,8 +92,13 @@ CACHE_FOLDER = _cache_folder()
 class Index(IndexDataCacheFile):
     """What is compiled, by the types of the arguments. One with types of a module that is not there counts as absent.
 
-    A term of somebody's own would otherwise leave an index that nobody else can read.
+    A term of somebody's own would otherwise leave an index that nobody else can read. Files of machine code have names
+    of their own: Numba numbers them, and two processes that compile at once, for different types, would write under one
+    number what the index then gives to either; seen, it ended in a crash of every later run.
     """
+
+    def _data_name(self, number):
+        return f"{super()._data_name(number)}.{secrets.token_hex(8)}"
 
     def _load_index(self):
         try:
