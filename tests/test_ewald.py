@@ -217,7 +217,7 @@ def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
     data = {
         "structure": {"file": "ions.gro"},
         "molecules": ions,
-        "forces": {"cutoff_A": 10.0, "truncation": "plain", "electrostatics": method, "ewald_accuracy": 1e-6},
+        "forces": {"cutoff_A": 10.0, "truncation": "plain", "electrostatics": method, "ewald_accuracy": 1e-8},
         "start": {"temperature_K": 100.0},
         "stages": [{"duration_ps": 1.0}],
     }
