@@ -84,6 +84,15 @@ def test_molecules_start_where_the_last_stage_does():
     assert all(trial.position_error < 1 for trial in found.trials)
 
 
+def test_mixed_precision_says_what_its_forces_lose():
+    scene = small_scene({"spce": 60}, 18.5, precision="mixed")
+    found = precision(scene, ["velocity_verlet"], [2.0], span=0.01, repeats=1)
+    force, torque = found.subject.rounding
+    assert 1e-8 < force < 1e-5 and 1e-8 < torque < 1e-5
+    assert f"forces differ from double ones by {force:.1e} of their rms" in "\n".join(advice(found))
+    assert precision(small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1).subject.rounding is None
+
+
 def test_only_what_keeps_its_order_is_tried():
     wheel = Scene.read(ROOT / "systems" / "satellite_wheel.toml")
     found = precision(wheel, span=5.0, repeats=1)

@@ -29,6 +29,8 @@ from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
+#: Along an edge, as forces.ewald_k_max has it: more would take all memory.
+MOST_WAVES = 1000
 #: A sum of charges smaller than this share of the sum of their sizes is rounding.
 NEUTRAL = 1e-10
 
@@ -153,6 +155,10 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
     if forces.gives_waves:
         most = forces.ewald_k_max if isinstance(forces.ewald_k_max, tuple | None) else (forces.ewald_k_max,) * 3
         radius = forces.ewald_k_radius_per_A
+        longest = np.linalg.norm(cell, axis=1).max()
+        if radius is not None and most is None and radius * longest > 2 * pi * MOST_WAVES:
+            fault = f"forces.ewald_k_radius_per_A = {radius:g} is more than {MOST_WAVES} waves along an edge of the box"
+            raise SceneError(scene.source, [fault])
         over = (
             ewald.waves(most, forces.ewald_k2_max) if radius is None else ewald.waves_within(reciprocal, radius, most)
         )

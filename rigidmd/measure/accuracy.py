@@ -1,4 +1,4 @@
-"""Forces of Ewald sums as a scene asks for them, held against a sum so long that nothing is missing."""
+"""Errors of forces as a scene asks for them: of Ewald sums, and of single precision between pairs."""
 
 from math import pi, sqrt
 from typing import NamedTuple
@@ -47,7 +47,8 @@ def accuracy(system: System, state: State) -> Accuracy:
         update={
             "electrostatics": "ewald",
             "ewald_accuracy": max(TIGHTER * system.force_error / COULOMB, TIGHTEST),
-            **dict.fromkeys(("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "pme_order", "pme_grid")),
+            **dict.fromkeys(("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")),
+            **dict.fromkeys(("pme_order", "pme_grid")),
         }
     )
     tight = scene.model_copy(update={"forces": forces, "precision": "double"})
@@ -64,6 +65,20 @@ def accuracy(system: System, state: State) -> Accuracy:
         energy=energy - exact_energy,
         reference=next(note for note in reference.notes if note.startswith("ewald")),
     )
+
+
+def rounding(system: System, state: State) -> tuple[float, float] | None:
+    """Rms errors of forces and torques that `precision = "mixed"` makes, over their rms; None in double precision."""
+    scene = system.scene
+    if scene.precision == "double":
+        return None
+    double = build(scene.model_copy(update={"precision": "double"}))
+    found, exact = (Engine(s.model, s.terms).evaluate(state)[0] for s in (system, double))
+    errors = []
+    for a, b in zip(found, exact, strict=True):
+        size = float(np.linalg.norm(b))
+        errors.append(float(np.linalg.norm(a - b)) / size if size > 0 else 0.0)
+    return errors[0], errors[1]
 
 
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:

@@ -61,6 +61,7 @@ class Subject:
     energy, in words, with a note on it; energy_size : that unit in the units of `energy`. kinetic : a kinetic energy by
     which divergence is judged. kept(state) : relative errors of all else that is conserved. observe(engine, state,
     step) : of molecules in a box, what averages are taken of; None of others. reference : the method of the reference.
+    rounding : relative rms errors of forces and torques in mixed precision; None in double.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Subject:
     kept: Callable[[State], dict[str, float]]
     observe: Callable[[Engine, State, float], Observation] | None = None
     molecules: int = 1
+    rounding: tuple[float, float] | None = None
 
 
 @dataclass

@@ -129,6 +129,13 @@ def advice(found: Precision) -> list[str]:
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
         f"reference: {s.reference} in {found.reference_steps} steps, its own error about {found.reference_error:.0e}",
     ]
+    if s.rounding is not None:
+        force, torque = s.rounding
+        lines.append(
+            f"mixed precision: forces differ from double ones by {force:.1e} of their rms"
+            + (f", torques by {torque:.1e}" if torque else "")
+            + "; the reference is in mixed precision too"
+        )
     for name in dict.fromkeys(t.integrator for t in found.trials):
         faults = [t.fault for t in found.trials if t.integrator == name and t.fault]
         if "diverges" in faults:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.errors import SceneError
+from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.precision import Precision, Subject, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.simulation.molecules import MolecularSimulation
@@ -69,6 +70,7 @@ def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, f
         simulation.start()
         state = simulation.state
     subject = molecular_subject(simulation.system, state, last.rotor, span or SPAN_PS)
+    subject.rounding = rounding(simulation.system, state)
     own = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
     return subject, last.timestep_fs / own
 
