@@ -111,7 +111,10 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False, count
     """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder.
 
     inline: make LLVM inline it wherever it is called, for what runs in an inner loop. Terms are passed as their fields,
-    forty arguments and more, and a call costs more than a pair of sites.
+    forty arguments and more, and a call costs more than a pair of sites. And for whatever has fastmath: a function that
+    is called by its name may be there twice, by itself and compiled into its caller, with sums in another order, and
+    which of them is taken depends on what else the process has compiled; seen, a run had other last bits when it came
+    from the cache.
     counted: False for a loop that takes views of arrays in passing but neither allocates nor returns any, and all it
     calls: the references are then not counted. Counting, atomic, made 47 ns of the 7 that a vector of pairs takes.
     Such a loop takes elements by their index: iterating over a view ended in a crash.

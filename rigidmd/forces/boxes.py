@@ -52,7 +52,7 @@ def grow(tree, clusters):
                 tree.high[k, node] = max(tree.high[k, node], tree.high[k, child])
 
 
-@kernel(fastmath=PAIR_FLAGS, counted=False)
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
     """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,); ascending.
 

@@ -151,7 +151,7 @@ def _pair_up(clusters, first, end):
         order[a + 1], order[nearest] = order[nearest], order[a + 1]
 
 
-@kernel(fastmath=PAIR_FLAGS, counted=False)
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def follow_block(clusters, position, limit2, block):
     """Bring `local` of a block to the positions (s, 3); the largest squared displacement since the sorting.
 

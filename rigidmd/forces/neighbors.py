@@ -303,17 +303,18 @@ def _scratch(pairs, room):
     )
 
 
-@kernel
+@kernel(inline=True)
 def fill_block(pairs, block):
     """Rows of one block. Entries beyond the room are counted, not stored."""
     clusters = pairs.clusters
     scratch = _scratch(pairs, 256)
     entries = masked = window = 0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        candidates = _find_candidates(pairs, c, scratch)
-        if candidates > len(scratch.entry):
-            scratch = _scratch(pairs, 256 * (candidates // 128))
+        candidates = len(scratch.entry) + 1
+        while candidates > len(scratch.entry):
             candidates = _find_candidates(pairs, c, scratch)
+            if candidates > len(scratch.entry):
+                scratch = _scratch(pairs, 256 * (candidates // 128))
         entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
         window = max(window, ahead + c - clusters.bounds[block] + 1)
     pairs.needed[block, 0] = entries
@@ -321,7 +322,7 @@ def fill_block(pairs, block):
     pairs.needed[block, 2] = min(window, len(clusters.origin) // 4)
 
 
-@kernel(fastmath=PAIR_FLAGS, counted=False)
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def _find_candidates(pairs, c, scratch):
     """Clusters and images that stand in a cluster's rows and whose box is within reach of its box; how many.
 
@@ -356,7 +357,7 @@ def _find_candidates(pairs, c, scratch):
     return candidates
 
 
-@kernel(fastmath=PAIR_FLAGS, counted=False)
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
     """Rows of a cluster from its candidates.
 

@@ -194,7 +194,7 @@ def _gather(parcel, block):
     gather_block(pairs, sums.own, sums.others, sums.force, block)
 
 
-@kernel(fastmath=PAIR_FLAGS, counted=False)
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def block_forces(law, pairs, own, others, tallies, block):
     """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
     clusters = pairs.clusters
@@ -313,7 +313,7 @@ def _act(law, i, j, between, mask, totals, tallies):
     return gx, gy, gz, (energy, xx, xy, xz, yy, yz, zz)
 
 
-@kernel(fastmath=PAIR_FLAGS, counted=False)
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def gather_block(pairs, own, others, force, block):
     """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
     clusters = pairs.clusters
