@@ -42,11 +42,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from peer_engines import DSF_ALPHA, ENGINES, Absent, busy
+from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy
 from scipy.spatial import cKDTree
 from scipy.special import erfc
 
 from rigidmd import Scene, Simulation
+from rigidmd.build.system import build
+from rigidmd.forces.ewald import in_energy_units, intramolecular_energy
 from rigidmd.jit import CACHE_FOLDER
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
@@ -152,8 +154,11 @@ class Curve:
         """How its forces end at the cut-off, in words."""
         if work.pme:
             own = f", PME for an rms error of forces of {PME_ACCURACY:g} e²/Å²"
-            theirs = ", PME with its defaults" if self.engine != "lammps" else f", PPPM {PME_ACCURACY:g}"
-            method = own if self.engine == "rigidmd" else theirs
+            theirs = {
+                "gromacs": ", PME with its defaults", "openmm": f", PME with a tolerance of {OPENMM_TOLERANCE:g}",
+                "lammps": f", PPPM {PME_ACCURACY:g}", "rigidmd": own,
+            }  # fmt: skip
+            method = theirs[self.engine]
         ending = {
             "plain": "LJ cut", "shift": "LJ potential-shift", "switch": "LJ switched over the last Å",
             "smooth_switch": "LJ smoothly switched over the last 0.4 of the cut-off",
@@ -286,12 +291,15 @@ def describe(work: Workload, folder: Path) -> Start:
         "sigma": np.where(species.epsilon > 0, species.sigma, 1.0),
         "epsilon": species.epsilon / KJ_PER_MOL,
     }
-    np.savez(folder / "sites.npz", **sites)
     potentials["RF without self"] = potentials["RF"] - own
     if work.pme:  # LAMMPS sums over k with the pairs inside molecules, and takes none of them out
-        potentials["DSF"] = potentials["RF"] - energies["coulomb_intramolecular"]
+        alpha = build(Scene.from_dict(work.scene(), folder)).terms["coulomb_real"].law.alpha
+        inside = intramolecular_energy(in_energy_units(species.charges), species.positions_body, alpha)
+        potentials["DSF"] = potentials["RF"] - inside / KJ_PER_MOL
+        sites["alpha"] = np.array(alpha)
     elif work.charged:
         potentials["DSF"] = damped_shifted(sites, work.cutoff) / work.count
+    np.savez(folder / "sites.npz", **sites)
     return Start(folder / "sites.npz", seen.kinetic / KJ_PER_MOL / work.count, potentials)
 
 
