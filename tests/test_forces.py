@@ -70,7 +70,7 @@ SLANTED = [[60.0, 60.0, 60.0], [70.0, 100.0, 50.0], [120.0, 110.0, 95.0], [35.0,
 @pytest.mark.parametrize("skin", [0.3, 3.0])
 @pytest.mark.parametrize("angles", SLANTED)
 def test_slanted_boxes(angles, skin):
-    """Energies are the oracle's, forces the slope of its energy, whole cells of any kind away; c leans by boxes."""
+    """Energies are the oracle's, forces the slope of its energy, and molecules may be whole cells away."""
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
     forces = ended("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
     system = build(small_scene({"spce": 20, "nitrogen": 15}, None, box=box, forces=forces))
