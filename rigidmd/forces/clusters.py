@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.lanes import bits, lane_count, largest, load, width_of, zeros
+from rigidmd.forces.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
 from rigidmd.jit import PAIR_FLAGS, kernel
 
 BLOCKS = 16  # enough for 16 threads
@@ -26,8 +26,10 @@ class Clusters(NamedTuple):
     anchor: np.ndarray  # (slots, 3) what to subtract from positions: origin and image, Å
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 in the box, Å
     local: np.ndarray  # (3 slots,) positions relative to the origins, Å
+    square: np.ndarray  # (slots,) squared distances from the origins when last sorted, Å²
     reference: np.ndarray  # (3 slots,) `local` when last sorted
-    moved2: np.ndarray  # (blocks,) largest squared displacement since, Å²
+    moved: np.ndarray  # (slots,) how far each has gone since, Å
+    farthest: np.ndarray  # (blocks,) the largest of them; infinite where that is too far for a list, Å
     wrapped: np.ndarray  # (s, 3) positions in the box when last sorted
 
 
@@ -44,8 +46,10 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
         anchor=np.zeros((slots, 3)),
         origin=zeros(4 * count, np.float64),
         local=zeros(3 * slots, dtype),
+        square=zeros(slots, dtype),
         reference=zeros(3 * slots, dtype),
-        moved2=np.zeros(blocks),
+        moved=zeros(slots, dtype),
+        farthest=np.zeros(blocks),
         wrapped=np.zeros((sites, 3)),
     )
 
@@ -115,6 +119,7 @@ def _bin(x, extent, count):
 def settle_block(clusters, position, group, block):
     """Origins, anchors and places of newly sorted clusters; their origin is the middle of their box."""
     width = width_of(clusters.local)
+    clusters.farthest[block] = 0.0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         _pair_up(clusters, width * c, min(width * (c + 1), len(clusters.wrapped)))
         for k in range(3):
@@ -127,11 +132,14 @@ def settle_block(clusters, position, group, block):
         for slot in range(width * c, width * (c + 1)):
             i = clusters.order[slot]
             clusters.group[slot] = group[i]
+            clusters.moved[slot] = 0.0
+            clusters.square[slot] = 0.0
             for k in range(3):
                 at = slot + 2 * width * c + k * width
                 clusters.anchor[slot, k] = position[i, k] - (clusters.wrapped[i, k] - clusters.origin[4 * c + k])
                 clusters.local[at] = position[i, k] - clusters.anchor[slot, k]
                 clusters.reference[at] = clusters.local[at]
+                clusters.square[slot] += clusters.local[at] ** 2
 
 
 @kernel(inline=True)
@@ -152,11 +160,8 @@ def _pair_up(clusters, first, end):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
-def follow_block(clusters, position, limit2, block):
-    """Bring `local` of a block to the positions (s, 3); the largest squared displacement since the sorting.
-
-    Infinite if it is beyond limit2 or not a number.
-    """
+def follow_block(clusters, position, limit, block):
+    """Bring `local` of a block to the positions (s, 3), and `moved` and `farthest`, for which the limit holds."""
     width = width_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1
@@ -172,6 +177,7 @@ def follow_block(clusters, position, limit2, block):
         dx = load(local, at) - load(reference, at)
         dy = load(local, at + width) - load(reference, at + width)
         dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
-        d2 = dx * dx + dy * dy + dz * dz
-        worst = max(worst, largest(d2)) if bits(d2 <= limit2) == full else inf
-    return worst
+        moved = root(dx * dx + dy * dy + dz * dz)
+        store(clusters.moved, width * c, moved)
+        worst = max(worst, largest(moved)) if bits(moved <= limit) == full else inf
+    clusters.farthest[block] = worst

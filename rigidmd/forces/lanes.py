@@ -191,6 +191,20 @@ def load_eight(typing, array, index):
 
 
 @intrinsic
+def spread(typing, array, index):
+    """A vector with array[index] in every lane."""
+    if not _is_row(array):
+        return None
+    lanes = Lanes(array.dtype, COUNT[array.dtype])
+
+    def emit(context, builder, signature, arguments):
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        return _filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
+
+    return lanes(array, types.intp), emit
+
+
+@intrinsic
 def store(typing, array, index, lanes):
     """Write a vector to array[index], array[index + 1], ..."""
 
@@ -219,7 +233,9 @@ def _suffix(kind) -> str:
 
 
 @intrinsic
-def _root(typing, x):
+def root(typing, x):
+    """Square roots of a vector, to about the last digit."""
+
     def emit(context, builder, signature, arguments):
         kind = arguments[0].type
         return _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
@@ -278,6 +294,19 @@ def _inverse_root(x):
         return y + y * e * (0.5 + 0.375 * e)
 
     return refined
+
+
+@intrinsic
+def smaller_of_two(typing, x):
+    """In lanes 2 k and 2 k + 1 the smaller of both."""
+
+    def emit(context, builder, signature, arguments):
+        value, count = arguments[0], x.count
+        order = ir.Constant(ir.VectorType(ir.IntType(32), count), [k ^ 1 for k in range(count)])
+        beside = builder.shuffle_vector(value, value, order)
+        return builder.select(builder.fcmp_ordered("<", value, beside), value, beside)
+
+    return x(x), emit
 
 
 def _chosen(sign):
@@ -348,12 +377,6 @@ def lowest_bit(typing, word):
         return builder.cttz(arguments[0], ir.IntType(1)(1))
 
     return types.int64(types.int64), emit
-
-
-@intrinsic
-def count_bits(typing, word):
-    """How many bits of an integer are set."""
-    return types.int64(types.int64), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])
 
 
 @intrinsic

@@ -12,21 +12,34 @@ list is cut into blocks of rows, filled by whichever thread takes them, so the l
 the same bits for any number of threads.
 """
 
-from math import ceil, floor, inf, nan, pi, sqrt
+from math import ceil, floor, inf, pi
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
 from rigidmd.forces.clusters import Clusters, clusters_of, follow_block, settle_block, sort_into_clusters
-from rigidmd.forces.lanes import bits, count_bits, fill, load, load_beside, lowest_bit, smaller, store, width_of, zeros
+from rigidmd.forces.lanes import (
+    bits,
+    fill,
+    larger,
+    load,
+    load_beside,
+    root,
+    smaller,
+    smaller_of_two,
+    spread,
+    store,
+    width_of,
+    zeros,
+)  # fmt: skip
 from rigidmd.forces.space import Space, cell_of
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
 from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, work
 
 IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
-SHELLS = 5  # the first holds what is inside the cut-off when the list is built, the others a quarter of the skin each
+SHELLS = 15  # the first holds what is inside the cut-off when the list is built, the others parts of the skin
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
@@ -49,6 +62,7 @@ class PairList(NamedTuple):
 
     cutoff: float  # Å
     skin: float  # Å
+    shells_per_A: float  # beyond the cut-off
     reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
     group: np.ndarray  # (s,) pairs inside one group are left out
     position: np.ndarray  # (s, 3) where the sites are now, lab frame, Å
@@ -61,7 +75,7 @@ class PairList(NamedTuple):
     special: np.ndarray  # (rows, 2) entries with a mask: masked[b, special[r, 0]:special[r, 1]]
     masked: np.ndarray  # (blocks, capacity, 3) entry, and as bits the lanes that count for either site of the row
     needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
-    counters: np.ndarray  # (5,) usable (0 or 1); builds; shells that matter now; status of the preparation; images
+    counters: np.ndarray  # (4,) usable (0 or 1); builds; status of the preparation; images
     parts: Parts
 
 
@@ -83,17 +97,19 @@ def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, ski
     reach : how far apart sites of one group can be, Å, infinite if nobody knows
     """
     clusters = clusters_of(len(group), dtype)
-    blocks, slots = len(clusters.moved2), len(clusters.order)
+    blocks, slots = len(clusters.farthest), len(clusters.order)
     rows = slots // 2
     count = len(clusters.origin) // 4
     room = ceil(_clusters_met(space, count, cutoff + skin) * rows / blocks)
     needed = np.zeros((blocks, 3), np.int64)
     needed[:, 2] = _clusters_ahead(space, count, blocks, cutoff + skin)
+    # longer, second images could come near between builds, and IMAGES would be too few
+    skin = min(skin, 0.45 * min(space.edges)) if cutoff < inf else inf
     return PairList(
         cutoff=cutoff,
+        skin=skin,
+        shells_per_A=(SHELLS - 1) / skin,
         reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
-        # longer, second images could come near between builds, and IMAGES would be too few
-        skin=min(skin, 0.45 * min(space.edges)) if cutoff < inf else inf,
         group=group,
         position=np.zeros((len(group), 3)),
         cell=cell_of(space),
@@ -105,7 +121,7 @@ def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, ski
         special=np.zeros((rows, 2), np.int32),
         masked=np.empty((blocks, ceil(1.5 * rows / blocks), 3), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
         needed=needed,
-        counters=np.zeros(5, np.int64),
+        counters=np.zeros(4, np.int64),
         parts=Parts(),
     )
 
@@ -153,12 +169,12 @@ def update_list(pairs):
         return LIST_FULL
     if pairs.counters[0] == 1:
         call_blocks(pairs.parts.follow, parcel, blocks)
-        if still_good(pairs):
+        if farthest(pairs) < inf:
             return OK
     pairs.counters[0] = 0
     call(pairs.parts.prepare, parcel, 0)
-    if pairs.counters[3] != OK:
-        return pairs.counters[3]
+    if pairs.counters[2] != OK:
+        return pairs.counters[2]
     call_blocks(pairs.parts.settle, parcel, blocks)
     call(pairs.parts.grow, parcel, 0)
     call_blocks(pairs.parts.fill, parcel, blocks)
@@ -166,7 +182,6 @@ def update_list(pairs):
         return LIST_FULL
     pairs.counters[0] = 1
     pairs.counters[1] += 1
-    pairs.counters[2] = 1
     return OK
 
 
@@ -179,36 +194,39 @@ def most_needed(pairs, k):
     return most
 
 
-@kernel
-def still_good(pairs):
-    """Whether the list is good for sites that have moved as `clusters.moved2` says, and which shells matter then."""
-    moved2 = 0.0
+@kernel(inline=True)
+def farthest(pairs):
+    """How far the site that went farthest has gone since the list was built, Å; infinite if the list is not good."""
+    found = 0.0
     for block in range(len(pairs.needed)):
-        moved2 = max(moved2, pairs.clusters.moved2[block])
-    if not moved2 < inf:
-        return False
-    pairs.counters[2] = 1 + ceil(2 * sqrt(moved2) * (SHELLS - 1) / pairs.skin)
-    return True
+        found = max(found, pairs.clusters.farthest[block])
+    return found
+
+
+@kernel(inline=True)
+def shells_within(pairs, i, farthest):
+    """How many shells of the row of slots i, i + 1 can hold a site inside the cut-off when none has gone farther."""
+    moved = max(pairs.clusters.moved[i], pairs.clusters.moved[i + 1])
+    return min(SHELLS, 1 + ceil((moved + farthest) * pairs.shells_per_A))
 
 
 @work(counted=False)
 def _follow(parcel, block):
     pairs = opened(parcel)
-    moved2 = follow_block(pairs.clusters, pairs.position, (0.5 * pairs.skin) ** 2, block)
-    pairs.clusters.moved2[block] = moved2
+    follow_block(pairs.clusters, pairs.position, 0.5 * pairs.skin, block)
 
 
 @work()
 def _prepare(parcel, block):
-    """Sort the sites for a new list; a status code into counters[3]."""
+    """Sort the sites for a new list; a status code into counters[2]."""
     pairs = opened(parcel)
-    pairs.counters[3] = OK
+    pairs.counters[2] = OK
     for x in pairs.position.flat:
         if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
-            pairs.counters[3] = NOT_FINITE
+            pairs.counters[2] = NOT_FINITE
             return
     sort_into_clusters(pairs.clusters, pairs.cell, pairs.position)
-    pairs.counters[4] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+    pairs.counters[3] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
 
 
 @kernel
@@ -270,36 +288,32 @@ def _fill(parcel, block):
 class Scratch(NamedTuple):
     """What the rows of one cluster are made with."""
 
-    bounds2: np.ndarray  # (SHELLS,) squared outer radii of the shells, Å², in the precision of near2
-    cursor: np.ndarray  # (SHELLS,) where the next entry of a shell goes
     stack: np.ndarray  # (levels, 2) for within_reach
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     entry: np.ndarray  # (room,) candidates
-    each2: np.ndarray  # (lanes,) squared distances of the cluster's sites from a candidate
-    near2: np.ndarray  # (rows of a cluster, room) squared distance of a row from a candidate; no number with a mask
-    special: np.ndarray  # (rows of a cluster, room) candidates that need a mask with a row
-    specials: np.ndarray  # (rows of a cluster,) how many
+    shell: np.ndarray  # (room * lanes,) where candidate n is for the row of site i, at n * lanes + i: up to which shell
+    end: np.ndarray  # (SHELLS,) of each shell of a row
+    inner: np.ndarray  # (rows of a cluster, room) entries in the first shell of a row
+    outer: np.ndarray  # (rows of a cluster, room) candidates in the others
+    special: np.ndarray  # (rows of a cluster, room) entries that need a mask with a row
+    count: np.ndarray  # (3, rows of a cluster) how many are in inner, outer, special of each row
 
 
 @kernel
 def _scratch(pairs, room):
     width = width_of(pairs.clusters.local)
-    bounds2 = np.empty(SHELLS, pairs.clusters.local.dtype)
-    for k in range(SHELLS):
-        beyond = k * pairs.skin / (SHELLS - 1) if k > 0 else 0.0
-        bounds2[k] = ((pairs.cutoff + beyond) * (1 + ROUNDING)) ** 2
     return Scratch(
-        bounds2,
-        np.empty(SHELLS, np.int64),
         np.empty((len(pairs.tree.level), 2), np.int64),
         np.empty(3),
         np.empty(3),
         np.empty(room, np.int64),
-        np.empty(width, pairs.clusters.local.dtype),
-        np.empty((width // 2, room), pairs.clusters.local.dtype),
-        np.empty((width // 2, room), np.int64),
-        np.empty(width // 2, np.int64),
+        np.empty(room * width, pairs.clusters.local.dtype),
+        np.empty(SHELLS, np.int64),
+        np.empty((width // 2, room), np.int32),
+        np.empty((width // 2, room), np.int32),
+        np.empty((width // 2, room), np.int32),
+        np.empty((3, width // 2), np.int64),
     )
 
 
@@ -333,7 +347,7 @@ def _find_candidates(pairs, c, scratch):
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
     entry = scratch.entry
     candidates = 0
-    for image in range(pairs.counters[4]):
+    for image in range(pairs.counters[3]):
         reaches = True
         for k in range(3):
             shift = pairs.shift[4 * image + k]
@@ -367,43 +381,21 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
     rows = width // 2
     count = len(pairs.clusters.origin) // 4
     entries, masked = pairs.entries[block], pairs.masked[block]
+    radius2 = ((pairs.cutoff + pairs.skin) * (1 + ROUNDING)) ** 2
     farthest = 0
-    for own in range(rows):
-        scratch.specials[own] = 0
+    scratch.count[:] = 0
     for n in range(candidates):
         _measure(pairs, c, scratch, n)
         ahead = cluster_of(scratch.entry[n]) - c
         farthest = max(farthest, ahead + count if ahead < 0 else ahead)
     for own in range(rows):
-        near2 = scratch.near2[own]
-        for n in range(candidates, candidates + -candidates % width):
-            near2[n] = nan
         r = rows * c + own
-        begin = filled
-        for k in range(SHELLS):
-            scratch.cursor[k] = filled
-            pairs.row[r, k] = min(filled, len(entries))
-            filled = begin
-            for n in range(0, candidates, width):
-                filled += count_bits(bits(load(near2, n) <= scratch.bounds2[k]))
-        pairs.row[r, SHELLS] = min(filled, len(entries))
-        if filled <= len(entries):
-            # One loop over all shells: with one for each, soon over, the processor guessed wrong half the time.
-            for first in range(0, candidates, width):
-                inside = bits(load(near2, first) <= scratch.bounds2[SHELLS - 1])
-                while inside != 0:
-                    n = first + lowest_bit(inside)
-                    inside &= inside - 1
-                    shell = 0
-                    for k in range(SHELLS - 1):
-                        shell += near2[n] > scratch.bounds2[k]
-                    entries[scratch.cursor[shell]] = scratch.entry[n]
-                    scratch.cursor[shell] += 1
+        filled = _fill_row(pairs.row[r], entries, filled, scratch, own, width)
         pairs.special[r, 0] = min(filled_masked, len(masked))
-        for n in range(scratch.specials[own]):
+        for n in range(scratch.count[2, own]):
             entry = scratch.special[own, n]
-            first_of_row = _mask_of_lanes(pairs, 2 * r, entry, scratch.bounds2[SHELLS - 1])
-            second = _mask_of_lanes(pairs, 2 * r + 1, entry, scratch.bounds2[SHELLS - 1])
+            first_of_row = _mask_of_lanes(pairs, 2 * r, entry, radius2)
+            second = _mask_of_lanes(pairs, 2 * r + 1, entry, radius2)
             if first_of_row | second:
                 if filled_masked < len(masked):
                     masked[filled_masked, 0] = entry
@@ -414,9 +406,36 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
     return filled, filled_masked, farthest
 
 
+@kernel(inline=True)
+def _fill_row(row, entries, filled, scratch, own, width):
+    """Write the entries of a row, shell by shell; how many there are now in the block."""
+    inner, outer, end = scratch.inner[own], scratch.outer[own], scratch.end
+    inners, outers = scratch.count[0, own], scratch.count[1, own]
+    for k in range(SHELLS):
+        end[k] = 0
+    for n in range(outers):
+        end[ceil(scratch.shell[width * outer[n] + 2 * own])] += 1
+    row[0] = min(filled, len(entries))
+    last = filled + inners
+    row[1] = min(last, len(entries))
+    for k in range(1, SHELLS):
+        size = end[k]
+        end[k] = last
+        last += size
+        row[k + 1] = min(last, len(entries))
+    if last <= len(entries):
+        for n in range(inners):
+            entries[filled + n] = inner[n]
+        for n in range(outers):
+            k = ceil(scratch.shell[width * outer[n] + 2 * own])
+            entries[end[k]] = scratch.entry[outer[n]]
+            end[k] += 1
+    return last
+
+
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _measure(pairs, c, scratch, n):
-    """How near each row of a cluster is to candidate n, or that they need a mask.
+    """In which shell of each row of a cluster candidate n is, or that they need a mask.
 
     The sites are the lanes here, and the candidate's sites come one after the other: no sums across lanes, no guesses.
     """
@@ -430,30 +449,44 @@ def _measure(pairs, c, scratch, n):
     x = load(local, at) + apart(pairs, c, other, image, 0)
     y = load(local, at + width) + apart(pairs, c, other, image, 1)
     z = load(local, at + 2 * width) + apart(pairs, c, other, image, 2)
+    # |x|² - 2 x y + |y|²: three multiply-adds for each y. What that rounds, a few digits of |x|² + |y|², is taken off.
+    x2 = x * x + y * y + z * z
+    x, y, z = -2.0 * x, -2.0 * y, -2.0 * z
     nearest2 = fill(inf, local)
     for lane in range(width):
         at = 3 * width * other + lane
-        dx = x - local[at]
-        dy = y - local[at + width]
-        dz = z - local[at + 2 * width]
-        nearest2 = smaller(nearest2, dx * dx + dy * dy + dz * dz)
+        product = spread(clusters.square, width * other + lane) + z * spread(local, at + 2 * width)
+        nearest2 = smaller(nearest2, product + y * spread(local, at + width) + x * spread(local, at))
+    nearest2 = nearest2 + x2 * (1 - 0.1 * ROUNDING)
+    everyone = (1 << width) - 1
     special = 0
     if other == c or c == count - 1 or other == count - 1:
-        special = (1 << width) - 1
+        special = everyone
     elif bits(nearest2 <= pairs.reach2) != 0:
         group = load_beside(clusters.group, width * c, local)
         mates = group < group
         for lane in range(width):
             mates = mates | (group == clusters.group[width * other + lane])
         special = bits(mates)
-    store(scratch.each2, 0, nearest2)
+        special = 3 * ((special | special >> 1) & everyone // 3)  # both sites of the row
+    nearest = root(larger(smaller_of_two(nearest2), 0.0)) * (1 - ROUNDING)
+    cutoff = pairs.cutoff if pairs.cutoff < inf else 0.0
+    shell = (nearest - cutoff) * pairs.shells_per_A
+    store(scratch.shell, width * n, shell)
+    inner = bits(shell <= 0.0) & ~special
+    outer = bits(shell <= SHELLS - 1) & ~inner & ~special
+    _append(scratch.inner, scratch.count, 0, entry, inner, width)
+    _append(scratch.outer, scratch.count, 1, n, outer, width)
+    if special != 0:
+        _append(scratch.special, scratch.count, 2, entry, special, width)
+
+
+@kernel(inline=True)
+def _append(rows, count, k, value, which, width):
+    """Add a value to the lists of some rows of a cluster without branches: half of them would be guessed wrong."""
     for own in range(width // 2):
-        if special >> 2 * own & 3:
-            scratch.near2[own, n] = nan  # inside no radius, not even an infinite one
-            scratch.special[own, scratch.specials[own]] = entry
-            scratch.specials[own] += 1
-        else:
-            scratch.near2[own, n] = min(scratch.each2[2 * own], scratch.each2[2 * own + 1])
+        rows[own, count[k, own]] = value
+        count[k, own] += which >> 2 * own & 1
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)

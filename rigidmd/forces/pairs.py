@@ -27,7 +27,16 @@ from rigidmd.forces.lanes import (
     width_of,
     zeros,
 )  # fmt: skip
-from rigidmd.forces.neighbors import PairList, cluster_of, empty_list, image_of, most_needed, update_list
+from rigidmd.forces.neighbors import (
+    PairList,
+    cluster_of,
+    empty_list,
+    farthest,
+    image_of,
+    most_needed,
+    shells_within,
+    update_list,
+)  # fmt: skip
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
@@ -206,6 +215,7 @@ def block_forces(law, pairs, own, others, tallies, block):
     entries = pairs.entries[block]
     masked = pairs.masked[block]
     zero = fill(0.0, clusters.local)
+    moved = farthest(pairs)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
@@ -221,7 +231,7 @@ def block_forces(law, pairs, own, others, tallies, block):
                 sums = _meet(law, pairs, block, i, masked[n, 0], between, masks, others, sums, tallies)
             # Displacements one entry ahead: what waits for them would fill the processor's queues before the next
             # entry's could enter.
-            last = pairs.row[i // 2, pairs.counters[2]] - 1
+            last = pairs.row[i // 2, shells_within(pairs, i, moved)] - 1
             entry = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
             if pairs.row[i // 2, 0] <= last:

@@ -197,7 +197,7 @@ class Forces(Section):
     """Of pme: order of the B-splines, 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
     """Of pme: grid points along each edge"""
-    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.3
+    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.6
     """Extra radius of the neighbour list; speed only, never the result"""
 
     @model_validator(mode="after")
