@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from rigidmd.jit import kernel
+from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.inertia import kind_of_body, principal_frame
 from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations
 from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
@@ -16,6 +17,53 @@ from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
 def spin(rotor, rotation, angular_momentum, h, steps):
     for _ in range(steps):
         turn(rotor, 0, rotation, angular_momentum, 0, h)
+
+
+@kernel
+def turn_all(rotor, species, rotation, angular_momentum, h, size):
+    if size == 1:
+        for m in range(len(rotation)):
+            turn(rotor, species[m], rotation, angular_momentum, m, h)
+    else:
+        for first in range(0, len(rotation), size):
+            turn_group(rotor, species, rotation, angular_momentum, first, min(first + size, len(rotation)), h)
+
+
+@pytest.mark.parametrize("moments", ["of every kind", "of two axes", "round"])
+@pytest.mark.parametrize("longest", [0.2, 3.0])
+def test_many_bodies_turn_together_as_one_by_one(moments, longest):
+    """All six orders of axes, symmetric, linear and spherical bodies; short turns, and some too long for the series."""
+    rng = np.random.default_rng(4)
+    inertia = {
+        "of every kind": [[1, 2, 2.5], [1, 2.5, 2], [2, 1, 2.5], [2, 2.5, 1], [2.5, 1, 2], [2.5, 2, 1],
+                          [1, 1, 1.5], [2, 2, 2], [0, 1, 1], [1.5, 1, 1], [0.5, 1.4, 1.5], [1.4, 0.5, 1.5]],
+        "of two axes": [[1, 1, 1.5], [1.5, 1, 1]],
+        "round": [[2, 2, 2], [0, 1, 1]],
+    }[moments]  # fmt: skip
+    rotor = split_rotor(np.array(inertia, float))
+    n = GROUP + 37
+    species = rng.integers(0, len(inertia), n)
+    rotation = random_rotations(rng, n)
+    momentum = rng.standard_normal((n, 3)) * (rotor.inverse_inertia[species] > 0)
+    momentum *= longest * rng.random((n, 1)) / np.linalg.norm(momentum, axis=1, keepdims=True)
+    found = []
+    for size in (1, GROUP):
+        q, momenta = rotation.copy(), momentum.copy()
+        turn_all(rotor, species, q, momenta, 0.7, size)
+        turn_all(rotor, species, q, momenta, -0.3, size)
+        found.append((q, momenta))
+    assert found[1][0] == pytest.approx(found[0][0], abs=2e-15)
+    assert found[1][1] == pytest.approx(found[0][1], abs=2e-15 * longest)
+    assert np.abs(found[0][0] - rotation).max() > 0.02
+
+
+def test_one_body_that_is_no_number_leaves_its_group_alone():
+    rng = np.random.default_rng(5)
+    rotor, species = split_rotor(np.array([[1.0, 2.0, 2.5]])), np.zeros(20, int)
+    rotation, momentum = random_rotations(rng, 20), rng.standard_normal((20, 3))
+    momentum[7, 1] = np.nan
+    turn_all(rotor, species, rotation, momentum, 0.01, GROUP)
+    assert np.array_equal(np.isnan(rotation).any(axis=(1, 2)), np.arange(20) == 7)
 
 
 def test_rotations_agree_with_scipy():

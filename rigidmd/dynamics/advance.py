@@ -10,7 +10,8 @@ from rigidmd.dynamics.thermostats import apply
 from rigidmd.forces.sites import SERIAL
 from rigidmd.forces.terms import OK, load_bodies
 from rigidmd.jit import implements, is_a, kernel
-from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn, turn_along
+from rigidmd.mechanics.groups import GROUP, turn_group
+from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
 
 class Model(NamedTuple):
@@ -116,8 +117,8 @@ def _drift_molecules(model, state, h):
 
     def drift_molecules(model, state, h):
         if len(state.position) <= SERIAL:
-            for m in range(len(state.position)):
-                _drift_molecule(model.rotor, model.species[m], state, m, h)
+            for first in range(0, len(state.position), GROUP):
+                _drift_group(model.rotor, model.species, state, first, h)
         else:
             _drift_threaded(model.rotor, model.species, state, h)
 
@@ -170,8 +171,8 @@ def _kick_threaded(species, inverse_mass, inverse_inertia, state, load, h):
 
 @kernel(parallel=True)
 def _drift_threaded(rotor, species, state, h):
-    for m in prange(len(state.position)):
-        _drift_molecule(rotor, species[m], state, m, h)
+    for group in prange((len(state.position) + GROUP - 1) // GROUP):
+        _drift_group(rotor, species, state, GROUP * group, h)
 
 
 @kernel(inline=True)
@@ -186,7 +187,9 @@ def _kick_molecule(species, inverse_mass, inverse_inertia, state, load, m, h):
 
 
 @kernel(inline=True)
-def _drift_molecule(rotor, species, state, m, h):
-    for k in range(3):
-        state.position[m, k] += h * state.velocity[m, k]
-    turn(rotor, species, state.rotation, state.angular_momentum_body, m, h)
+def _drift_group(rotor, species, state, first, h):
+    end = min(first + GROUP, len(state.position))
+    for m in range(first, end):
+        for k in range(3):
+            state.position[m, k] += h * state.velocity[m, k]
+    turn_group(rotor, species, state.rotation, state.angular_momentum_body, first, end, h)
