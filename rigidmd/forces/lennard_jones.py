@@ -7,7 +7,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from rigidmd.forces import pairs
-from rigidmd.forces.lanes import inverse_root, load, zeros
+from rigidmd.forces.lanes import inverse, inverse_root, load, zeros
 from rigidmd.forces.truncation import (
     POLYNOMIALS,
     Bent,
@@ -121,13 +121,29 @@ def _pair(law, i, j, r2):
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def energy_and_force(law, c12, c6, r2):
     """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
-    inverse = inverse_root(r2)
-    inverse2 = inverse * inverse
+    inverse2, inverse1 = inverses(law.shape, r2)
     six = inverse2 * inverse2 * inverse2
     end = mixed(law.end12, law.end6, c12, c6)
     u = (c12 * six - c6) * six + end[0]
     w = (12 * c12 * six - 6 * c6) * six * inverse2
-    return ended(law.shape, end, r2 * inverse, inverse, u, w)
+    return ended(law.shape, end, r2 * inverse1, inverse1, u, w)
+
+
+def inverses(shape, r2):
+    """(1/r², 1/r) at squared distances r2; the second is for endings, and no root is taken where there is none."""
+    raise TypeError("compiled code only")
+
+
+@implements(inverses, PAIR_FLAGS, inline=True)
+def _inverses(shape, r2):
+    if is_a(shape, Plain):
+        return lambda shape, r2: (inverse(r2), 0.0)
+
+    def with_root(shape, r2):
+        inverse1 = inverse_root(r2)
+        return inverse1 * inverse1, inverse1
+
+    return with_root
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
