@@ -2,7 +2,8 @@
 
     python tests/benchmarks/peer_engines.py FOLDER
 
-reads FOLDER/job.json, and FOLDER/result.json is what came of it. `peers.py` writes the jobs. A job is: engine, cores,
+reads FOLDER/job.json, and FOLDER/result.json is what came of it; a job with `forces` true also leaves the forces on
+molecules at its start, (n, 3) in kJ/mol/Å, in FOLDER/forces.npy. `peers.py` writes the jobs. A job is: engine, cores,
 cpus (their numbers), timestep_fs, steps, every (steps between looks at the energy; 0 for none), options (of the curve),
 workload (cut-off and so on), sites (file of the start) and, for rigidmd, its scene.
 """
@@ -89,6 +90,8 @@ class Rigidmd:
             looks.append([x / KJ_PER_MOL for x in (seen.energy, seen.potential, seen.kinetic)])
 
         look()
+        if job["forces"]:
+            np.save(folder / "forces.npy", observe(system, engine, state).load.force / KJ_PER_MOL)
         for now in pieces(job):
             began = time.perf_counter()
             engine.advance(state, scheme, dt, now, NoThermostat(), done)
@@ -166,6 +169,9 @@ class OpenMM:
             looks.append([potential + kinetic, potential, kinetic])
 
         look()
+        if job["forces"]:
+            on_sites = context.getState(getForces=True).getForces(asNumpy=True)._value / 10
+            np.save(folder / "forces.npy", on_sites.reshape(n, s, 3).sum(axis=1))
         for now in pieces(job):
             began = time.perf_counter()
             integrator.step(now)
@@ -199,6 +205,8 @@ class Gromacs:
             "rvdw": work["cutoff"] / 10, "rcoulomb": work["cutoff"] / 10, "vdw-modifier": "potential-shift",
             "lincs-iter": 2, "nstenergy": every, "nstcalcenergy": every, "nstlog": 0,
         }  # fmt: skip
+        if job["forces"]:
+            options |= {"nstfout": job["steps"]}
         if work["pme"]:
             options |= {"coulombtype": "PME"}
         else:
@@ -210,6 +218,12 @@ class Gromacs:
         call([*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr"], folder)
         threads = ["-ntmpi", 1, "-ntomp", job["cores"], "-pin", "on", "-pinoffset", job["cpus"][0]]
         call([*gmx, "mdrun", "-deffnm", "run", "-notunepme", "-noconfout", *threads], folder)
+        if job["forces"]:
+            from MDAnalysis.coordinates.TRR import TRRReader
+
+            with TRRReader(str(folder / "run.trr")) as frames:  # its forces are in kJ/mol/Å
+                on_sites = frames[0].forces.astype(float)
+            np.save(folder / "forces.npy", on_sites.reshape(*sites["position"].shape).sum(axis=1))
         log = (folder / "run.log").read_text()
         ns_per_day = float(re.search(r"^Performance:\s+(\S+)", log, re.M).group(1))
         seconds = job["steps"] * job["timestep_fs"] * 1e-6 / ns_per_day * 86400
@@ -252,12 +266,19 @@ class Lammps:
             *([f"kspace_style pppm {work['accuracy']:g}", f"kspace_modify gewald {sites['alpha']}"] if work["pme"] else []),
             "fix 1 all rigid/nve/small molecule", f"timestep {job['timestep_fs']}",
             "thermo_style custom step pe ke etotal", "thermo_modify norm no format float %.15g",
-            f"thermo {job['every'] or job['steps']}", f"run {job['steps']}",
+            f"thermo {job['every'] or job['steps']}",
+            *([f"dump 1 all custom {job['steps']} run.forces id fx fy fz", "dump_modify 1 sort id format float %.15g"]
+              if job["forces"] else []),
+            f"run {job['steps']}",
         ]  # fmt: skip
         (folder / "run.in").write_text("\n".join(script) + "\n")
         lmp = program("lmp")
+        shape = sites["position"].shape
         several = [program("mpiexec", beside=lmp), "-n", job["cores"]] if job["cores"] > 1 else []
         said = call([*several, lmp, "-in", "run.in", "-log", "none"], folder)
+        if job["forces"]:
+            on_sites = np.loadtxt(folder / "run.forces", skiprows=9, max_rows=shape[0] * shape[1], usecols=(1, 2, 3))
+            np.save(folder / "forces.npy", KCAL * on_sites.reshape(shape).sum(axis=1))
         loop = re.search(r"Loop time of (\S+) on (\d+) procs for (\d+) steps", said)
         if int(loop.group(2)) != job["cores"]:
             raise Failed("this lmp has no MPI")

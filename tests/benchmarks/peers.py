@@ -17,7 +17,7 @@ undisturbed ones). On several cores threads wait for one another and no such cor
 machine; --patience waits for quiet, --tries repeats what was disturbed, and what still was is marked.
 
 The potential energy of the start, as each engine computes it, is held against this engine's own with the same
-treatment of the cut-off. The treatments differ where an engine cannot do what the workload says: OpenMM has no
+treatment of the cut-off; with PME, the forces on molecules too, against an Ewald sum. The treatments differ where an engine cannot do what the workload says: OpenMM has no
 potential-shift (it truncates Lennard-Jones, or switches it), LAMMPS no reaction field (damped shifted Coulomb instead,
 checked against its formula). Leap-frog engines (GROMACS, OpenMM) are given the velocities of half a step before.
 """
@@ -72,6 +72,7 @@ PRECISIONS = {"mixed": "pairs float32, sums and state float64"}  # of rigidmd, o
 #: Of PME: rms error of forces on sites, in e²/Å². By this engine's estimate GROMACS's defaults (ewald-rtol 1e-5, spacing
 #: 1.2 Å, order 4), which every engine with the same keys gets, make 8e-5, nearly all of it on the grid.
 PME_ACCURACY = 5e-5
+EWALD_ACCURACY = 1e-7  # e²/Å², of the forces that those of PME are held against
 COPIES = 2  # the start is grown from this many copies along each edge of a small box that has come to rest
 
 NITROGEN_14 = {  # two centres of 14 u
@@ -197,6 +198,7 @@ class Start:
     sites_file: Path  # what the others read; beside it start.npz, a state of rigidmd
     kinetic: float  # kJ/mol per molecule
     potentials: dict[str, float]  # kJ/mol per molecule, by `Curve.lennard_jones` and `Curve.coulomb`
+    force: np.ndarray | None  # (n, 3) on molecules, kJ/mol/Å, by an Ewald sum; where there is PME
 
     def expected(self, curve: Curve) -> float:
         """What an engine should find with its treatment of the cut-off."""
@@ -300,7 +302,16 @@ def describe(work: Workload, folder: Path) -> Start:
     elif work.charged:
         potentials["DSF"] = damped_shifted(sites, work.cutoff) / work.count
     np.savez(folder / "sites.npz", **sites)
-    return Start(folder / "sites.npz", seen.kinetic / KJ_PER_MOL / work.count, potentials)
+    force = ewald_forces(work, folder) if work.pme else None
+    return Start(folder / "sites.npz", seen.kinetic / KJ_PER_MOL / work.count, potentials, force)
+
+
+def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
+    """Forces on molecules (n, 3), kJ/mol/Å, all of them by an Ewald sum that is good to EWALD_ACCURACY."""
+    scene = work.scene()
+    scene["forces"] |= {"electrostatics": "ewald", "ewald_accuracy": EWALD_ACCURACY}
+    simulation = Simulation(Scene.from_dict(scene, folder))
+    return simulation.engine.evaluate(simulation.state)[0].force / KJ_PER_MOL
 
 
 def damped_shifted(sites: dict, cutoff: float) -> float:
@@ -352,8 +363,13 @@ class Bench:
                 self.check(name, curve, best)
         return best
 
-    def once(self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int) -> dict | None:
-        """As `run`, a single time, when the cores are free or patience is at its end."""
+    def once(
+        self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int, forces: bool = False
+    ) -> dict | None:
+        """As `run`, a single time, when the cores are free or patience is at its end.
+
+        forces : the result has `force`, (n, 3) on molecules at the start, kJ/mol/Å
+        """
         while cores > 1 and self.patience > 0:
             worked = busy(self.cpus[:cores])
             time.sleep(1.0)
@@ -367,7 +383,7 @@ class Bench:
             "engine": curve.engine, "options": curve.options, "cores": cores, "cpus": self.cpus[:cores],
             "timestep_fs": timestep, "steps": steps, "every": every, "sites": str(self.starts[name].sites_file),
             "workload": asdict(work) | {"charged": work.charged, "accuracy": PME_ACCURACY},
-            "scene": scene,
+            "scene": scene, "forces": forces,
         }  # fmt: skip
         environment = os.environ | {"NUMBA_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "ACTIVE"}
         if curve.engine != "rigidmd":
@@ -387,6 +403,8 @@ class Bench:
                 print(f"{what}: failed: {fault[-600:]}", flush=True)
                 return None
             result = json.loads((Path(folder) / "result.json").read_text())
+            if forces:
+                result["force"] = np.load(Path(folder) / "forces.npy")
         if cores == 1:
             result["seconds"] *= 1 - result["others"]
         return result
@@ -411,11 +429,16 @@ class Bench:
             "same": abs(found - expected) < SAME_ENERGY,
             "kinetic": result["kinetic"][0] / count, "kinetic_expected": self.starts[name].kinetic,
         }  # fmt: skip
+        said = ""
+        exact = self.starts[name].force
+        if exact is not None and (again := self.once(name, curve, 1, SPEED_STEP, PILOT_STEPS, 0, forces=True)):
+            row["force_error"] = float(np.linalg.norm(again["force"] - exact) / np.linalg.norm(exact))
+            said = f"; forces on molecules off by {row['force_error']:.2g} of their rms"
         self.checks.append(row)
         verdict = "agrees" if row["same"] else "DIFFERS: not the same physics"
         print(
             f"{name} start, {curve.name}: potential {found:.5f}, expected {expected:.5f}: {verdict}; "
-            f"kinetic {row['kinetic']:.5f}, expected {row['kinetic_expected']:.5f} kJ/mol a molecule",
+            f"kinetic {row['kinetic']:.5f}, expected {row['kinetic_expected']:.5f} kJ/mol a molecule{said}",
             flush=True,
         )
 
