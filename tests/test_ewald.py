@@ -74,6 +74,18 @@ def test_polynomials_are_erfc(alpha, cutoff, dtype, error):
         assert np.abs(value / at_zero - exact).max() < error
 
 
+@pytest.mark.parametrize("error", [1e-5, 1e-6])
+def test_fewer_terms_where_single_precision_may_leave_an_error(error):
+    alpha, cutoff = 0.31, 9.0
+    whole, cut = screening(alpha, cutoff, np.float32), screening(alpha, cutoff, np.float32, error)
+    assert len(cut.force) <= len(whole.force) - 4
+    assert cut.energy == whole.energy
+    r = np.linspace(0.5, cutoff, 500)
+    t = cut.scale * r**2 - 1
+    off = (r * np.abs(np.polyval(cut.force[::-1], t) - np.polyval(whole.force[::-1], t))).max()
+    assert 0.003 * error < off < error
+
+
 def test_damped_shifted_force_is_fennell_and_gezelter():
     alpha, cutoff = 0.2, 6.0
     forces = {"cutoff_A": cutoff, "electrostatics": "damped_shifted_force", "damping_per_A": alpha}

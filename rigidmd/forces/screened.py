@@ -18,8 +18,7 @@ from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
 
 #: Largest error of a polynomial, relative to the function at r = 0, by the precision of the lanes: less than rounding
-#: in its evaluation makes, 1.5e-7 and 5e-15 for alpha times the cut-off up to 4. Fewer terms are faster: 12 for 16 took
-#: 4.4 for 4.9 ms of a step of 4096 waters.
+#: in its evaluation makes, 1.5e-7 and 5e-15 for alpha times the cut-off up to 4.
 FIT_ERROR = {np.dtype(np.float64): 2e-16, np.dtype(np.float32): 3e-8}
 STEP = {np.dtype(np.float64): 4, np.dtype(np.float32): 2}
 
@@ -32,24 +31,29 @@ class Screening(NamedTuple):
     force: tuple[float, ...]  # coefficients of -(d/dr erf(alpha r)/r)/r, 1/Å³
 
 
-def screening(alpha: float, cutoff: float, dtype: type = np.float64) -> Screening:
+def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: float = 0.0) -> Screening:
     """The polynomials for screening by alpha (1/Å) up to a cut-off (Å), for lanes of a NumPy dtype.
 
-    Series are cut where what is left is below FIT_ERROR of the value at r = 0. Both have as many terms, a multiple of
-    STEP, so that small changes of alpha meet the same compiled code.
+    Series are cut where what is left is below FIT_ERROR of the value at r = 0, or where no force between unit charges
+    is off by more than an `error` (1/Å²); each has a multiple of STEP terms, so that small changes of alpha meet the
+    same compiled code.
     """
     kind = np.dtype(dtype)
-    series = [_series(alpha * cutoff, power) for power in (0, 2)]
-    left = [np.cumsum(np.abs(s[::-1]))[::-1] for s in series]
-    needed = max(int(np.sum(rest > FIT_ERROR[kind] * rest[0])) for rest in left)
-    terms = -(-max(needed, 1) // STEP[kind]) * STEP[kind]
     strength = 2 / sqrt(pi) * alpha
-    energy, force = (np.polynomial.chebyshev.cheb2poly(s[:terms]) for s in series)
+    energy = _cut(_series(alpha * cutoff, 0), 0.0, kind)
+    force = _cut(_series(alpha * cutoff, 2), error / (strength * 2 * alpha**2 * cutoff), kind)
     return Screening(
         kind.type(2 / cutoff**2),
         tuple(map(kind.type, strength * energy)),
         tuple(map(kind.type, strength * 2 * alpha**2 * force)),
     )
+
+
+def _cut(series: np.ndarray, error: float, kind: np.dtype) -> np.ndarray:
+    """Coefficients of powers of t for as much of a Chebyshev series as its error asks for."""
+    left = np.cumsum(np.abs(series[::-1]))[::-1]
+    needed = int(np.sum(left > max(error, FIT_ERROR[kind] * left[0])))
+    return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // STEP[kind]) * STEP[kind]])
 
 
 def _series(x: float, power: int) -> np.ndarray:
@@ -71,17 +75,23 @@ class ScreenedCoulomb(NamedTuple):
 
     cutoff: float  # Å
     alpha: float  # 1/Å
+    error: float  # of forces between unit charges that single precision may leave, 1/Å²
     screening: Screening
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
     def room(self, slots: int, dtype: type) -> "ScreenedCoulomb":
         """The law with room for the charges in slots, in the precision of lanes."""
-        return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype))
+        error = self.error if dtype == np.float32 else 0.0
+        return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype, error))
 
 
-def screened_coulomb(charge_e: np.ndarray, cutoff: float, alpha: float) -> ScreenedCoulomb:
-    """The law for sites with charges (s,) in e."""
-    return ScreenedCoulomb(cutoff, alpha, screening(alpha, cutoff), charge_e * sqrt(COULOMB))
+def screened_coulomb(charge_e: np.ndarray, cutoff: float, alpha: float, error: float = 0.0) -> ScreenedCoulomb:
+    """The law for sites with charges (s,) in e.
+
+    error : of forces between unit charges that may be left in single precision, where more terms of the polynomials
+    would only take time; 1/Å²
+    """
+    return ScreenedCoulomb(cutoff, alpha, error, screening(alpha, cutoff), charge_e * sqrt(COULOMB))
 
 
 class DampedShiftedForce(NamedTuple):
