@@ -21,7 +21,7 @@ import numpy as np
 
 KCAL = 4.184  # kJ
 WARM_UP = 2  # steps before the clock starts, where the engine does not time its own loop
-OPENMM_TOLERANCE = 1e-4  # of PME; with the default of 5e-4 its energy is off by 0.01 kJ/mol a molecule
+OPENMM_TOLERANCE = 2.5e-4  # of PME; the default is 5e-4. Forces are then about as good as those of the others
 DSF_ALPHA = 0.2  # 1/Å, damping of LAMMPS's coul/dsf
 
 
