@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from rigidmd.build.system import build
 from rigidmd.dynamics.advance import Model
@@ -55,6 +56,20 @@ def test_nist_lennard_jones(reference, config):
         assert tally.virial.trace() == five_digits(row["W_pair"])
         if not shifted:
             assert tail(law, table["L"] ** 3)[0] == five_digits(row["U_LRC"])
+
+
+def test_a_cutoff_that_reaches_hundreds_of_clusters():
+    """More than the lists have room for at first."""
+    n, edge, cutoff = 23, 26.0, 11.0
+    rng = np.random.default_rng(8)
+    lattice = np.stack(np.meshgrid(*[np.arange(n)] * 3), axis=-1).reshape(-1, 3)
+    positions = (lattice + 0.3 * rng.random(lattice.shape)) * (edge / n)
+    _, engine, state = points(positions, edge, cutoff=cutoff, name="plain")
+    found = cKDTree(positions % edge, boxsize=edge).sparse_distance_matrix(
+        cKDTree(positions % edge, boxsize=edge), cutoff, output_type="ndarray"
+    )
+    r = found["v"][found["i"] < found["j"]]
+    assert engine.evaluate(state)[1]["lj"].energy == pytest.approx(4 * (r**-12.0 - r**-6.0).sum(), rel=1e-11)
 
 
 def co2_scene(reference):

@@ -282,7 +282,10 @@ def _grow(parcel, block):
 
 @work()
 def _fill(parcel, block):
-    fill_block(opened(parcel), block)
+    pairs = opened(parcel)
+    room = 256
+    while room > 0:
+        room = fill_block(pairs, block, room)
 
 
 class Scratch(NamedTuple):
@@ -318,22 +321,24 @@ def _scratch(pairs, room):
 
 
 @kernel(inline=True)
-def fill_block(pairs, block):
-    """Rows of one block. Entries beyond the room are counted, not stored."""
+def fill_block(pairs, block, room):
+    """Rows of one block. Entries beyond the room are counted, not stored.
+
+    Returns 0, or how much room is needed for candidates; then nothing has been done.
+    """
     clusters = pairs.clusters
-    scratch = _scratch(pairs, 256)
+    scratch = _scratch(pairs, room)
     entries = masked = window = 0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        candidates = len(scratch.entry) + 1
-        while candidates > len(scratch.entry):
-            candidates = _find_candidates(pairs, c, scratch)
-            if candidates > len(scratch.entry):
-                scratch = _scratch(pairs, 256 * (candidates // 128))
+        candidates = _find_candidates(pairs, c, scratch)
+        if candidates > room:
+            return 2 * candidates
         entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
         window = max(window, ahead + c - clusters.bounds[block] + 1)
     pairs.needed[block, 0] = entries
     pairs.needed[block, 1] = masked
     pairs.needed[block, 2] = min(window, len(clusters.origin) // 4)
+    return 0
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
