@@ -117,8 +117,8 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False, count
     from the cache.
     counted: False for a loop that takes views of arrays in passing but neither allocates nor returns any, and all it
     calls: the references are then not counted. Counting, atomic, made 47 ns of the 7 that a vector of pairs takes.
-    Such a loop takes elements by their index: iterating over a view ended in a crash. And its caller never assigns anew,
-    in a loop of its own, arrays that it passes: the new ones were freed while they were in use.
+    Such a loop takes elements by their index: iterating over a view ended in a crash. Its caller never assigns anew, in
+    a loop of its own, arrays that it passes: the new ones were freed while they were in use.
     """
     if function is None:
         return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted)
