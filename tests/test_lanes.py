@@ -194,3 +194,16 @@ def test_no_pair_is_missed_in_a_long_run():
         if round % 15 == 14:
             assert sum(t.energy for t in tallies.values()) == pytest.approx(all_pairs(system, state), rel=1e-11)
     assert min(term.pairs.counters[1] for term in engine.terms.values()) > 5
+
+
+@pytest.mark.skipif(SIMD_BITS == 128, reason="this is what all tests run with here")
+def test_the_narrowest_vectors():
+    """Two lanes of float64, as on machines without AVX2: every operation, and lists of very many clusters."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
+    chosen = "compute_as_arrays or no_pair_is_missed"
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", __file__, "-k", chosen]
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment | {"RIGIDMD_SIMD_BITS": "128"}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"\b[3-9] passed", done.stdout)

@@ -11,8 +11,7 @@ from conftest import small_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigidmd.build.cells import standard_rotation
-from rigidmd.build.matching import _close_pairs
+from rigidmd.build.cells import pairs_within, standard_rotation
 from rigidmd.build.structure import read_structure
 from rigidmd.build.structure_files import element_of, read_geometry
 from rigidmd.build.system import build
@@ -527,7 +526,7 @@ def test_hydrogen_bonds_are_none_of_the_bonds_of_larger_atoms(tmp_path):
     assert found.species.tolist() == [0, 0, 1]
 
 
-def test_close_pairs_in_any_cell():
+def test_pairs_within_a_radius_in_any_cell():
     rng = np.random.default_rng(0)
     for _ in range(20):
         cell = np.tril(rng.uniform(-10, 10, (3, 3)), -1) + np.diag(rng.uniform(6, 12, 3))
@@ -539,7 +538,7 @@ def test_close_pairs_in_any_cell():
             (i, j) for i in range(15) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
         }
         assert 0 < len(wanted) < 105
-        i, j, distance = _close_pairs(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
+        i, j, distance = pairs_within(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
         assert {(max(a, b), min(a, b)) for a, b in zip(i, j, strict=True) if a != b} == wanted
         assert distance.max(initial=0.0) <= radius
 

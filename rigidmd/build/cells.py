@@ -1,5 +1,7 @@
 """Periodic cells as files give them: any lattice vectors, oriented in any way. Rows a, b, c, lab frame, Å."""
 
+from itertools import product
+
 import numpy as np
 
 #: Cosine up to which two edges count as at right angles: files print angles to 0.01 degrees, vectors to 1e-5 or better.
@@ -57,3 +59,24 @@ def angles_deg(cell: np.ndarray) -> np.ndarray:
     """alpha, beta, gamma (3,) of a cell (3, 3), degrees."""
     unit = cell / np.linalg.norm(cell, axis=1)[:, None]
     return np.degrees(np.arccos([unit[1] @ unit[2], unit[2] @ unit[0], unit[0] @ unit[1]]))
+
+
+def pairs_within(
+    position: np.ndarray, cell: np.ndarray | None, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs i, j of points (n, 3) within a radius, images in any cell (3, 3) included, and their distances."""
+    from scipy.spatial import cKDTree
+
+    points, owner = position, np.arange(len(position))
+    if cell is not None:
+        inverse = np.linalg.inv(cell)
+        inside = position @ inverse
+        inside -= np.floor(inside)
+        margin = radius * np.linalg.norm(inverse, axis=0)  # in fractions of the distances between opposite faces
+        shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
+        images = [inside + shift for shift in shifts]
+        near = [((image >= -margin) & (image <= 1 + margin)).all(axis=1) for image in images]
+        owner = np.concatenate([np.flatnonzero(chosen) for chosen in near])
+        points = np.concatenate([image[chosen] for image, chosen in zip(images, near, strict=True)]) @ cell
+    i, j = cKDTree(points).query_pairs(radius, output_type="ndarray").T
+    return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)

@@ -1,5 +1,6 @@
 """A system in words: what would happen if it ran, and what was left out."""
 
+from collections.abc import Iterator
 from math import inf
 from typing import NamedTuple
 
@@ -126,11 +127,18 @@ def _stage(stage: Stage) -> str:
 
 
 def array_bytes(value) -> int:
-    """Bytes of all arrays in nested tuples."""
+    """Bytes of all arrays in nested tuples, each array once."""
     if isinstance(value, System):
         # The state four times: the start, the one that moves, the last good one, forces and torques.
         fixed = (tuple(value.terms.values()), value.model, value.sites)
         return 4 * array_bytes(value.state) + array_bytes(fixed)
+    return sum({id(array): array.nbytes for array in _arrays(value)}.values())
+
+
+def _arrays(value) -> Iterator[np.ndarray]:
+    """All arrays in nested tuples."""
     if isinstance(value, np.ndarray):
-        return value.nbytes
-    return sum(array_bytes(part) for part in value) if isinstance(value, tuple) else 0
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from _arrays(part)

@@ -1,12 +1,13 @@
 """Which atoms are which molecule: by residues where a file has them, else by bonding distance; fitted by templates."""
 
 from collections import Counter
-from itertools import groupby, product
+from itertools import groupby
 from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.build.cells import pairs_within
 from rigidmd.build.structure_files import Atoms, element_of
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
@@ -149,7 +150,7 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
     chosen = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
     number = np.array([numbers[kinds[i]] for i in chosen], int)
-    i, j, distance = _close_pairs(atoms.position[chosen], cell, reach.max())
+    i, j, distance = pairs_within(atoms.position[chosen], cell, reach.max())
     i, j = np.array([i, j])[:, distance <= reach[number[i], number[j]]]
     shape = (len(chosen), len(chosen))
     count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
@@ -157,27 +158,6 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
     for atom, component in zip(chosen, label, strict=True):
         runs[component].append(atom)
     return sorted(runs)
-
-
-def _close_pairs(
-    position: np.ndarray, cell: np.ndarray | None, radius: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs i, j of points (n, 3) within a radius, images in any cell (3, 3) included, and their distances."""
-    from scipy.spatial import cKDTree
-
-    points, owner = position, np.arange(len(position))
-    if cell is not None:
-        inverse = np.linalg.inv(cell)
-        inside = position @ inverse
-        inside -= np.floor(inside)
-        margin = radius * np.linalg.norm(inverse, axis=0)  # in fractions of the distances between opposite faces
-        shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
-        images = [inside + shift for shift in shifts]
-        near = [((image >= -margin) & (image <= 1 + margin)).all(axis=1) for image in images]
-        owner = np.concatenate([np.flatnonzero(chosen) for chosen in near])
-        points = np.concatenate([image[chosen] for image, chosen in zip(images, near, strict=True)]) @ cell
-    i, j = cKDTree(points).query_pairs(radius, output_type="ndarray").T
-    return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)
 
 
 class _Candidate(NamedTuple):

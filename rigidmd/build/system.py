@@ -11,6 +11,7 @@ from rigidmd.build.cells import reduced
 from rigidmd.build.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
+from rigidmd.build.overlaps import overlaps
 from rigidmd.build.structure import Arrangement, read_structure
 from rigidmd.build.structure_files import read_geometry
 from rigidmd.dynamics.advance import Model
@@ -18,7 +19,7 @@ from rigidmd.errors import Faults, SceneError, StructureError
 from rigidmd.forces.lennard_jones import lennard_jones, tail
 from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.sites import BodySites, CentralSites
-from rigidmd.forces.space import Space, Triclinic, cell_of, fractions, heights, space_of, wrap
+from rigidmd.forces.space import Space, Triclinic, space_of, wrap
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
@@ -38,11 +39,6 @@ from rigidmd.scene.molecules import Molecules
 from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 DEFAULT_CUTOFF = 9.0  # Å
-#: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
-#: is 1750 epsilon, which no liquid visits.
-OVERLAP = 0.6
-#: Sites of different molecules closer than this fraction of the smaller molecule's radius stand inside one another.
-INSIDE = 0.2
 
 # Each random purpose has its own stream, so that one more draw here changes nothing there.
 STREAM_LATTICE, STREAM_MOMENTA = 1, 2
@@ -169,7 +165,7 @@ def build(scene: MolecularScene) -> System:
             f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
         )
         system.notes += [f"{scene.structure.file}: {note}" for note in arrangement.notes]
-        if faults := _overlaps(system):
+        if faults := overlaps(system):
             raise StructureError(str(scene.path(scene.structure.file)), faults)
     return system
 
@@ -450,48 +446,3 @@ def _set_momenta(system: System, arrangement: Arrangement) -> None:
     if temperature is None:
         temperature = scene.stages[0].temperature_K
     draw_momenta(system.model, state, temperature, np.random.default_rng([scene.seed, STREAM_MOMENTA]))
-
-
-def _overlaps(system: System) -> list[str]:
-    """Molecules of a structure that stand in one another: at most five named."""
-    inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
-    sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
-    faults = []
-    for i, j, distance in close_pairs(system, system.state, max(OVERLAP * sigma.max(), inside)):
-        a, b = system.sites.molecule[[i, j]]
-        both = sigma[i] > 0 and sigma[j] > 0
-        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
-            faults.append(
-                f"molecules {a + 1} and {b + 1} overlap: {system.sites.name[i]} and {system.sites.name[j]} "
-                f"are {distance:.3f} Å apart"
-            )
-    return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
-
-
-def close_pairs(system: System, state: State, radius: float) -> list[tuple[int, int, float]]:
-    """Sites (i, j) of different molecules, not both frozen, no further apart than `radius`; their distances, Å."""
-    from scipy.spatial import cKDTree
-
-    positions = system.site_positions(state)
-    images, source = positions, np.arange(len(positions))
-    if system.space.volume < inf:
-        positions = wrap(system.space, positions)
-        images, source = _images(system.space, positions, radius)
-    found = cKDTree(positions).sparse_distance_matrix(cKDTree(images), radius, output_type="ndarray")
-    i, j = found["i"], source[found["j"]]
-    a, b, free = system.sites.molecule[i], system.sites.molecule[j], mobile(system.model)
-    kept = (i < j) & (a != b) & (free[a] | free[b])
-    return sorted(zip(i[kept].tolist(), j[kept].tolist(), found["v"][kept].tolist(), strict=True))
-
-
-def _images(space: Space, positions: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Images (m, 3) of positions (s, 3) in the cell within a radius of it, and which position (m,) each is of."""
-    margin = radius / heights(space)
-    part = fractions(space, positions)
-    found, source = [], []
-    for image in np.ndindex(3, 3, 3):
-        there = part + np.array(image) - 1
-        near = np.flatnonzero(((there > -margin) & (there < 1 + margin)).all(axis=1))
-        found.append(positions[near] + (np.array(image) - 1) @ cell_of(space))
-        source.append(near)
-    return np.concatenate(found), np.concatenate(source)

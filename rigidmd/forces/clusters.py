@@ -21,7 +21,7 @@ class Clusters(NamedTuple):
     """The sites of one law in clusters. The last cluster is filled up with copies of the last site."""
 
     bounds: np.ndarray  # (blocks + 1,) block b holds clusters bounds[b] ... bounds[b + 1] - 1
-    order: np.ndarray  # (slots,) the site in each slot
+    order: np.ndarray  # (slots,) int32 the site in each slot
     group: np.ndarray  # (slots,) int32 group of the site in each slot
     anchor: np.ndarray  # (slots, 3) what to subtract from positions: origin and image, Å
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 in the box, Å
@@ -30,7 +30,7 @@ class Clusters(NamedTuple):
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved: np.ndarray  # (slots,) how far each has gone since, Å
     farthest: np.ndarray  # (blocks,) the largest of them; infinite where that is too far for a list, Å
-    wrapped: np.ndarray  # (s, 3) positions in the box when last sorted
+    wrapped: np.ndarray  # (s, 3) positions in the box while sites are sorted; then for others to use
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
@@ -41,7 +41,7 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
     slots = count * width
     return Clusters(
         bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
-        order=np.zeros(slots, np.int64),
+        order=np.zeros(slots, np.int32),
         group=zeros(slots, np.int32),
         anchor=np.zeros((slots, 3)),
         origin=zeros(4 * count, np.float64),

@@ -73,7 +73,7 @@ class PairList(NamedTuple):
     row: np.ndarray  # (rows, SHELLS + 1) shell k of slots 2 r, 2 r + 1: entries[b, row[r, k]:row[r, k + 1]]
     entries: np.ndarray  # (blocks, capacity) int32
     special: np.ndarray  # (rows, 2) entries with a mask: masked[b, special[r, 0]:special[r, 1]]
-    masked: np.ndarray  # (blocks, capacity, 3) entry, and as bits the lanes that count for either site of the row
+    masked: np.ndarray  # (blocks, capacity, 3) int32 entry, and as bits the lanes that count for either site of the row
     needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
     counters: np.ndarray  # (4,) usable (0 or 1); builds; status of the preparation; images
     parts: Parts
@@ -475,8 +475,9 @@ def _measure(pairs, c, scratch, n):
         special = bits(mates)
         special = 3 * ((special | special >> 1) & everyone // 3)  # both sites of the row
     nearest = root(larger(smaller_of_two(nearest2), 0.0)) * (1 - ROUNDING)
-    cutoff = pairs.cutoff if pairs.cutoff < inf else 0.0
-    shell = (nearest - cutoff) * pairs.shells_per_A
+    shell = fill(0.0, local)
+    if pairs.cutoff < inf:
+        shell = (nearest - pairs.cutoff) * pairs.shells_per_A
     store(scratch.shell, width * n, shell)
     inner = bits(shell <= 0.0) & ~special
     outer = bits(shell <= SHELLS - 1) & ~inner & ~special

@@ -116,7 +116,7 @@ def pair_forces(
     pairs = empty_list(space, group, reach, law.cutoff, skin, dtype)
     blocks, slots = len(pairs.needed), len(pairs.clusters.order)
     sums = Sums(
-        force=np.zeros((len(sites.molecule), 3)),
+        force=pairs.clusters.wrapped,  # nobody sorts while forces are summed
         own=zeros(3 * slots, np.float64),
         others=zeros((blocks, 3 * lane_count(dtype) * int(pairs.needed[:, 2].max())), dtype),
         tallies=np.zeros((blocks, TALLY_SIZE)),

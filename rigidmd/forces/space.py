@@ -91,11 +91,6 @@ def fractions(space: Space, position: np.ndarray) -> np.ndarray:
     return np.stack([a, b, c], axis=1)
 
 
-def heights(space: Space) -> np.ndarray:
-    """Distances (3,) between opposite faces of the cell, Å."""
-    return 1 / np.linalg.norm(np.linalg.inv(cell_of(space)), axis=0)
-
-
 def fill_cell(space, cell):
     """Write the cell matrix (3, 3), rows the edges a, b, c, into an array; whether it has changed."""
     raise TypeError("compiled code only")

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.body import BodySystem
+from rigidmd.build.overlaps import OVERLAP, close_pairs
 from rigidmd.build.relief import kicks
-from rigidmd.build.system import OVERLAP, System, close_pairs
+from rigidmd.build.system import System
 from rigidmd.dynamics.engine import NotFiniteError
 from rigidmd.dynamics.odes import Solver
 from rigidmd.dynamics.schemes import Scheme

@@ -27,6 +27,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -580,7 +581,7 @@ def drift_seen(row: dict) -> bool:
 
 def label(curve: Curve, rows: list[dict], name: str) -> str:
     """Name, precision, cut-off and list of a curve, as the legend has it."""
-    settings = list(dict.fromkeys(row["settings"].partition(", constraint")[0] for row in rows))
+    settings = list(dict.fromkeys(re.split(", constraint|; pme", row["settings"])[0] for row in rows))
     if len(settings) > 1:  # the list depends on the step
         settings = [f"{settings[0]} ... {settings[-1].removeprefix('list ')}"]
     return "\n".join([curve.name, curve.precision, curve.treatment(WORKLOADS[name]), *settings])
