@@ -275,6 +275,7 @@ def test_madelung_constant_of_rock_salt(reference, method, asked, error, tmp_pat
 @pytest.mark.parametrize("limit", [{"ewald_k_max": [5, 4, 7]}, {"ewald_k_max": 6, "ewald_k2_max": 30}])
 def test_ewald_is_the_oracle_term_by_term(limit, box):
     forces = {"cutoff_A": 6.0, "electrostatics": "ewald", "ewald_alpha_per_A": 0.4, "ewald_surface_permittivity": 4.0}
+    forces |= {"truncation": "plain"}
     scene = small_scene({"tip4p2005": 8, "nitrogen": 3, "spce": 5}, None, box=box, forces=forces | limit)
     system, engine, state = shaken(build(scene), 4)
     most = np.array(limit["ewald_k_max"]) * np.ones(3)
@@ -290,6 +291,29 @@ def test_ewald_is_the_oracle_term_by_term(limit, box):
     assert found["coulomb_intramolecular"] == pytest.approx(oracle.intramolecular, rel=1e-11)
     assert found["coulomb_surface"] == pytest.approx(oracle.surface(4.0), rel=1e-11)
     assert "coulomb_background" not in found
+
+
+def test_only_the_energy_is_shifted_where_real_space_ends():
+    cutoff, alpha = 6.0, 0.4
+    found = {}
+    for truncation in ("plain", "shift"):
+        forces = {"cutoff_A": cutoff, "electrostatics": "ewald", "ewald_alpha_per_A": alpha, "truncation": truncation}
+        scene = small_scene({}, None, molecules=SALT, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=forces)
+        system, engine, state = shaken(build(scene), 8)
+        found[truncation] = observe(system, engine, state)
+    assert found["shift"].load.force == pytest.approx(found["plain"].load.force, rel=1e-11)
+    x, q, owner = charged_sites(system, state)
+    step = x[:, None] - x
+    step -= np.round(step / [13.0, 14.0, 15.0]) * [13.0, 14.0, 15.0]
+    near = (np.linalg.norm(step, axis=2) < cutoff) & (owner[:, None] > owner)
+    shift = KE * erfc(alpha * cutoff) / cutoff
+    changes = {
+        name: found["shift"].components[name] - found["plain"].components[name] for name in found["plain"].components
+    }
+    assert changes["coulomb_real"] == pytest.approx(-shift * (np.outer(q, q) * near).sum(), rel=1e-9)
+    net = np.bincount(owner, q)
+    assert changes["coulomb_self"] == pytest.approx(-0.5 * shift * (net**2).sum(), rel=1e-9)
+    assert net.any() and all(changes[name] == 0 for name in changes if name.startswith("coulomb_i"))
 
 
 def salty(edges, method, **more):

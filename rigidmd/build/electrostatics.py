@@ -181,7 +181,9 @@ def _ewald(
     settings = _settings(scene, charged, space, cutoff)
     forces, alpha = scene.forces, settings.alpha
     charge = ewald.in_energy_units(charged.charge_e)
-    law = screened_coulomb(charged.charge_e, cutoff, alpha, FIT_SHARE * settings.real_error)
+    law = screened_coulomb(
+        charged.charge_e, cutoff, alpha, forces.truncation != "plain", FIT_SHARE * settings.real_error
+    )
     if settings.grid is None:
         over = ewald.ewald_sum(charge, alpha, space, charged.sites, settings.waves)
         most = " ".join(map(str, settings.waves.most))
@@ -194,12 +196,15 @@ def _ewald(
         how = f"grid {' x '.join(map(str, settings.grid))}, splines of order {settings.order}"
     terms = {"coulomb_real": between_pairs(law), "coulomb_reciprocal": over}
     constants = {
-        "coulomb_self": charged.each(lambda q, x: ewald.self_energy(q, alpha)),
+        # A shift takes from each charge what all charges inside its cut-off do there, itself and its molecule among
+        # them: about nothing, because they are neutral together. These two are constants.
+        "coulomb_self": charged.each(lambda q, x: ewald.self_energy(q, alpha) - 0.5 * law.shift * q.sum() ** 2),
         "coulomb_intramolecular": charged.each(lambda q, x: ewald.intramolecular_energy(q, x, alpha)),
     }
     error = float(np.hypot(settings.real_error, settings.wave_error))
     notes = [
-        f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cut-off {cutoff:g} Å, {how}",
+        f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cut-off {cutoff:g} Å, {how}"
+        + ("" if law.shift == 0 else "; energies of real space shifted to 0 at the cut-off"),
         f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
         f"kJ/(mol Å); {settings.real_error:.2g} beyond the cut-off, {settings.wave_error:.2g} in the reciprocal part",
     ]

@@ -71,10 +71,15 @@ def _series(x: float, power: int) -> np.ndarray:
 
 
 class ScreenedCoulomb(NamedTuple):
-    """q_i q_j erfc(alpha r)/r, ending plainly at the cut-off: what Ewald sums leave to pairs of sites."""
+    """q_i q_j [erfc(alpha r)/r - shift], ending plainly at the cut-off R: what Ewald sums leave to pairs of sites.
+
+    With shift = erfc(alpha R)/R the energy is what the forces conserve: without it, it jumps where pairs cross the
+    cut-off, and that is all of its noise at small steps. Forces are the same.
+    """
 
     cutoff: float  # Å
     alpha: float  # 1/Å
+    shift: float  # 1/Å
     error: float  # of forces between unit charges that single precision may leave, 1/Å²
     screening: Screening
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
@@ -85,13 +90,17 @@ class ScreenedCoulomb(NamedTuple):
         return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype, error))
 
 
-def screened_coulomb(charge_e: np.ndarray, cutoff: float, alpha: float, error: float = 0.0) -> ScreenedCoulomb:
+def screened_coulomb(
+    charge_e: np.ndarray, cutoff: float, alpha: float, shifted: bool = False, error: float = 0.0
+) -> ScreenedCoulomb:
     """The law for sites with charges (s,) in e.
 
+    shifted : whether the energy is 0 at the cut-off
     error : of forces between unit charges that may be left in single precision, where more terms of the polynomials
     would only take time; 1/Å²
     """
-    return ScreenedCoulomb(cutoff, alpha, error, screening(alpha, cutoff), charge_e * sqrt(COULOMB))
+    shift = float(erfc(alpha * cutoff)) / cutoff if shifted else 0.0
+    return ScreenedCoulomb(cutoff, alpha, shift, error, screening(alpha, cutoff), charge_e * sqrt(COULOMB))
 
 
 class DampedShiftedForce(NamedTuple):
@@ -137,7 +146,7 @@ def _pair(law, i, j, r2):
         def ewald_pair(law, i, j, r2):
             qq = law.charge[i] * load(law.charge, j)
             u, w = screened(law.screening, inverse_root(r2), r2)
-            return qq * u, qq * w
+            return qq * (u - law.shift), qq * w
 
         return ewald_pair
     if not is_a(law, DampedShiftedForce):

@@ -165,7 +165,8 @@ class Forces(Section):
     cutoff_A: Positive | None = None
     """Cut-off between sites; 9 Å in a periodic box, none without one"""
     truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
-    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order"""
+    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. What
+    ewald and pme leave to pairs only has its energy shifted to 0 there, unless plain"""
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
     and smooth_switch, at 0.6 of the cut-off"""
