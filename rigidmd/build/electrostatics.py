@@ -198,7 +198,7 @@ def _ewald(
     constants = {
         # A shift takes from each charge what all charges inside its cut-off do there, itself and its molecule among
         # them: about nothing, because they are neutral together. These two are constants.
-        "coulomb_self": charged.each(lambda q, x: ewald.self_energy(q, alpha) - 0.5 * law.shift * q.sum() ** 2),
+        "coulomb_self": charged.each(lambda q, x: ewald.self_energy(q, alpha) - 0.5 * law.shift * float(q.sum()) ** 2),
         "coulomb_intramolecular": charged.each(lambda q, x: ewald.intramolecular_energy(q, x, alpha)),
     }
     error = float(np.hypot(settings.real_error, settings.wave_error))
