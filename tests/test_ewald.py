@@ -586,7 +586,7 @@ def test_liquid_spce_is_the_published_one():
     energy = np.array([row.potential for row in rows if row.time > 30]) / 512 / KJ_PER_MOL
     blocks = energy[: len(energy) // 10 * 10].reshape(10, -1).mean(axis=1)
     error = blocks.std(ddof=1) / np.sqrt(10)
-    assert error < 0.06
+    assert error < 0.05
     assert abs(energy.mean() + 46.82) < 0.05 + 2 * error
 
     bins = np.arange(2.0, 6.0, 0.05)

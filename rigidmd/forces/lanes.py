@@ -266,17 +266,6 @@ def _quick_quotient(typing, x):
     return x(x), emit
 
 
-@intrinsic
-def _quick_quotient(typing, x):
-    """1/x in float32, likewise."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        return builder.fdiv(ir.Constant(kind, [1.0] * kind.count), arguments[0], flags=(*FLAGS, "afn"))
-
-    return x(x), emit
-
-
 def _converted(dtype):
     def converted(typing, x):
         lanes = Lanes(dtype, x.count)
@@ -329,26 +318,6 @@ def smaller_of_two(typing, x):
         return builder.select(builder.fcmp_ordered("<", value, beside), value, beside)
 
     return x(x), emit
-
-
-def inverse(x):
-    """1/x, to about the last digit."""
-    raise TypeError("compiled code only")
-
-
-@implements(inverse, PAIR_FLAGS, inline=True)
-def _inverse(x):
-    if not isinstance(x, Lanes):
-        return lambda x: 1 / x
-    if x.dtype == types.float32:
-        return lambda x: _quick_quotient(x)
-
-    def refined(x):
-        y = double(_quick_quotient(single(x)))
-        e = 1.0 - x * y
-        return y + y * e * (1.0 + e)
-
-    return refined
 
 
 def inverse(x):

@@ -74,7 +74,7 @@ class ScreenedCoulomb(NamedTuple):
     """q_i q_j [erfc(alpha r)/r - shift], ending plainly at the cut-off R: what Ewald sums leave to pairs of sites.
 
     With shift = erfc(alpha R)/R the energy is what the forces conserve: without it, it jumps where pairs cross the
-    cut-off, and that is all of its noise at small steps. Forces are the same.
+    cut-off, which is most of its noise at small steps. Forces are the same.
     """
 
     cutoff: float  # Å

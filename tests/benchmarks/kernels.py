@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 from rigidmd import Scene, Simulation
 from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.forces.neighbors import farthest, shells_within
 from rigidmd.forces.pairs import PRECISIONS, PairForces
 from rigidmd.forces.sites import load_from_sites, place_sites
 from rigidmd.forces.terms import no_load
@@ -44,6 +45,15 @@ def run_blocks(address, content, blocks):
 def run_once(address, content):
     """A work that has one block."""
     call(address, packed(content), 0)
+
+
+@njit
+def entries_that_matter(pairs):
+    """Entries of the rows' shells that can hold a site inside the cut-off."""
+    found, moved = 0, farthest(pairs)
+    for r in range(len(pairs.row)):
+        found += pairs.row[r, shells_within(pairs, 2 * r, moved)] - pairs.row[r, 0]
+    return found
 
 
 def milliseconds(function, *arguments) -> float:
@@ -68,7 +78,7 @@ def useful_pairs(term: PairForces) -> int:
 def lanes_of(term: PairForces) -> int:
     """Lanes that the loop works on with the list as it is."""
     pairs = term.pairs
-    rows = np.sum(pairs.row[:, pairs.counters[2]] - pairs.row[:, 0]) + np.sum(pairs.special[:, 1] - pairs.special[:, 0])
+    rows = entries_that_matter(pairs) + np.sum(pairs.special[:, 1] - pairs.special[:, 0])
     return int(rows) * 2 * 4 * len(pairs.clusters.order) // len(pairs.clusters.origin)
 
 
