@@ -29,11 +29,13 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.codegen import get_host_cpu_features
 from numba.core.imputils import impl_ret_borrowed
+from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic, models, overload, register_model
 
 PACKAGE = Path(__file__).parent
 ADDRESS = ir.IntType(8).as_pointer()
 UNUSED_AFTER_DAYS = 30.0
+BLOCKS = 16  # that threads share: enough for 16 of them
 
 # Reassociation and contraction let LLVM keep sums in registers and use FMA. The flags that assume away NaN and
 # infinity are left out: a bad number must stay visible.
@@ -107,7 +109,17 @@ class Index(IndexDataCacheFile):
             return {}
 
 
-def kernel(function=None, *, parallel=False, fastmath=False, inline=False, counted=True):
+class Inner(CPUDispatcher):
+    """A kernel that only compiled code calls: without the wrapper for Python, which takes apart every array of every term.
+
+    That took a third of the time of compiling a scene.
+    """
+
+    def __call__(self, *arguments):
+        raise TypeError(f"{self.py_func.__name__} is for compiled code; for Python it has to be a kernel(outer=True)")
+
+
+def kernel(function=None, *, parallel=False, fastmath=False, inline=False, counted=True, outer=False):
     """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder.
 
     inline: make LLVM inline it wherever it is called, for what runs in an inner loop. Terms are passed as their fields,
@@ -119,13 +131,17 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False, count
     calls: the references are then not counted. Counting, atomic, made 47 ns of the 7 that a vector of pairs takes.
     Such a loop takes elements by their index: iterating over a view ended in a crash. Its caller never assigns anew, in
     a loop of its own, arrays that it passes: the new ones were freed while they were in use.
+    outer: whether Python calls it.
     """
     if function is None:
-        return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted)
+        return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted, outer=outer)
     options = _options(fastmath, inline) | ({"parallel": True, "_nrt": True} if parallel else _counting(counted))
+    options |= {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer}
     with _own_cache():
         compiled = numba.njit(cache=True, **options)(function)
     compiled._cache._cache_file.__class__ = Index
+    if not outer:
+        compiled.__class__ = Inner
     return compiled
 
 

@@ -241,8 +241,8 @@ def _of_frozen(
     """
     sites, volume = charged.sites, space.volume
     arms = np.zeros((len(charge), 3))
-    if isinstance(sites, BodySites):
-        arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offset_body)
+    if len(state.rotation):
+        arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
     position = state.position[sites.molecule] + arms
     energy, force, virial = ewald.sum_of(charge, position, cell_of(space), settings.alpha, settings.waves)
     dipole = charge @ position

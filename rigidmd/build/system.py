@@ -321,18 +321,21 @@ def _sites(species: list[Molecule], index: np.ndarray) -> Sites:
 
 def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
     """Sites of a law: chosen[k] lists the sites of species k that take part."""
-    counts = np.array([len(c) for c in chosen])[index]
-    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    member = np.repeat(np.arange(len(index)), counts)
-    offset = np.concatenate([species[k].positions_body[chosen[k]] for k in index])
+    counts = np.array([len(c) for c in chosen])
+    first = np.concatenate([[0], np.cumsum(counts[index])]).astype(np.int32)
+    member = np.repeat(np.arange(len(index), dtype=np.int32), counts[index])
+    offset = np.concatenate([m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
     if not offset.any():
         return CentralSites(first, member)
-    return BodySites(first, member, np.ascontiguousarray(offset))
+    kind = (np.cumsum(counts) - counts)[index].astype(np.int32)
+    return BodySites(first, member, kind, np.ascontiguousarray(offset))
 
 
 def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
     """Sites (s,) by what they do not act on: their own molecule, and frozen ones on all that is frozen."""
-    return np.where(frozen[sites.molecule], len(frozen), sites.molecule)
+    if not frozen.any():
+        return sites.molecule
+    return np.where(frozen[sites.molecule], len(frozen), sites.molecule).astype(np.int32)
 
 
 def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:

@@ -3,15 +3,21 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.dynamics.thermostats import apply
 from rigidmd.forces.sites import SERIAL
-from rigidmd.forces.terms import OK, load_bodies
-from rigidmd.jit import implements, is_a, kernel
+from rigidmd.forces.terms import EXAMPLE, OK, load_bodies
+from rigidmd.jit import BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, work
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
+
+
+class Parts(NamedTuple):
+    """Addresses of the works that move molecules; 0 until they are needed."""
+
+    kick: int = 0
+    drift: int = 0
 
 
 class Model(NamedTuple):
@@ -23,6 +29,13 @@ class Model(NamedTuple):
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
+    parts: Parts = Parts()
+
+    def with_code(self) -> "Model":
+        """The model with the machine code that moves its molecules."""
+        state, load = EXAMPLE
+        kicked = (self.species, self.inverse_mass, self.inverse_inertia, state, load, 0.0)
+        return self._replace(parts=Parts(_kick.address(kicked), _drift.address((self.rotor, self.species, state, 0.0))))
 
 
 class Progress(NamedTuple):
@@ -37,7 +50,7 @@ def new_progress(steps: int, fresh: bool) -> Progress:
     return Progress(np.array([steps, 0, fresh], np.int64))
 
 
-@kernel
+@kernel(outer=True)
 def advance(model, state, load, terms, thermostat, scheme, probe, dt, origin, steps, progress):
     """Step until `steps` steps of dt have been taken since time `origin`, counted in progress.cursor[0].
 
@@ -101,11 +114,8 @@ def _kick_molecules(model, state, load, h):
         return None
 
     def kick_molecules(model, state, load, h):
-        if len(state.position) <= SERIAL:
-            for m in range(len(state.position)):
-                _kick_molecule(model.species[m], model.inverse_mass, model.inverse_inertia, state, load, m, h)
-        else:
-            _kick_threaded(model.species, model.inverse_mass, model.inverse_inertia, state, load, h)
+        parcel = packed((model.species, model.inverse_mass, model.inverse_inertia, state, load, h))
+        call_blocks(model.parts.kick, parcel, _blocks(state))
 
     return kick_molecules
 
@@ -116,11 +126,7 @@ def _drift_molecules(model, state, h):
         return None
 
     def drift_molecules(model, state, h):
-        if len(state.position) <= SERIAL:
-            for first in range(0, len(state.position), GROUP):
-                _drift_group(model.rotor, model.species, state, first, h)
-        else:
-            _drift_threaded(model.rotor, model.species, state, h)
+        call_blocks(model.parts.drift, packed((model.rotor, model.species, state, h)), _blocks(state))
 
     return drift_molecules
 
@@ -163,33 +169,42 @@ def _pay_nothing(model, terms, state, h):
         return lambda model, terms, state, h: None
 
 
-@kernel(parallel=True)
-def _kick_threaded(species, inverse_mass, inverse_inertia, state, load, h):
-    for m in prange(len(state.position)):
-        _kick_molecule(species[m], inverse_mass, inverse_inertia, state, load, m, h)
-
-
-@kernel(parallel=True)
-def _drift_threaded(rotor, species, state, h):
-    for group in prange((len(state.position) + GROUP - 1) // GROUP):
-        _drift_group(rotor, species, state, GROUP * group, h)
+@kernel
+def _blocks(state):
+    """Blocks that molecules are moved in: one, on this thread, where there are few."""
+    return BLOCKS if len(state.position) > SERIAL else 1
 
 
 @kernel(inline=True)
-def _kick_molecule(species, inverse_mass, inverse_inertia, state, load, m, h):
-    share = h * inverse_mass[species]
-    for k in range(3):
-        state.velocity[m, k] += share * load.force[m, k]
-    if m < len(state.angular_momentum_body):
-        for k in range(3):
-            if inverse_inertia[species, k] > 0:  # no momentum gathers on an axis without inertia
-                state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
+def _groups_of(state, block):
+    """The first molecule of a block, and the first that is no more in it; whole groups."""
+    n, blocks = len(state.position), _blocks(state)
+    groups = (n + GROUP - 1) // GROUP
+    return GROUP * (groups * block // blocks), min(n, GROUP * (groups * (block + 1) // blocks))
 
 
-@kernel(inline=True)
-def _drift_group(rotor, species, state, first, h):
-    end = min(first + GROUP, len(state.position))
+@work()
+def _kick(parcel, block):
+    species, inverse_mass, inverse_inertia, state, load, h = opened(parcel)
+    first, end = _groups_of(state, block)
     for m in range(first, end):
+        kind = species[m]
+        share = h * inverse_mass[kind]
         for k in range(3):
-            state.position[m, k] += h * state.velocity[m, k]
-    turn_group(rotor, species, state.rotation, state.angular_momentum_body, first, end, h)
+            state.velocity[m, k] += share * load.force[m, k]
+        if m < len(state.angular_momentum_body):
+            for k in range(3):
+                if inverse_inertia[kind, k] > 0:  # no momentum gathers on an axis without inertia
+                    state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
+
+
+@work()
+def _drift(parcel, block):
+    rotor, species, state, h = opened(parcel)
+    first, end = _groups_of(state, block)
+    for start in range(first, end, GROUP):
+        stop = min(start + GROUP, end)
+        for m in range(start, stop):
+            for k in range(3):
+                state.position[m, k] += h * state.velocity[m, k]
+        turn_group(rotor, species, state.rotation, state.angular_momentum_body, start, stop, h)

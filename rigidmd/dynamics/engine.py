@@ -96,6 +96,8 @@ class Engine:
             self._probe = probe_for(state)
         probe = self._probe if scheme.gradients else None
         model = self.model_for(scheme)
+        if isinstance(model, Model):
+            model = model.with_code()
         while status := advance(
             model, state, self.load, self._terms, thermostat, rows, probe, dt, origin, done + steps, progress
         ):

@@ -54,13 +54,13 @@ class Solver(NamedTuple):
     absolute_tolerance: float = 1e-12  # the same, in parts of the sizes that the variables have in this run
 
 
-@kernel
+@kernel(outer=True)
 def moment_rates_of(rotor, time, k):
     """`moment_rates`, to be called from Python."""
     return moment_rates(rotor, time, k)
 
 
-@kernel
+@kernel(outer=True)
 def read(form, model, state, time, y):
     """The variables as a state, in place."""
     n = form.variables
@@ -78,7 +78,7 @@ def read(form, model, state, time, y):
     state.work[0] = y[-1]
 
 
-@kernel
+@kernel(outer=True)
 def slopes(form, model, terms, state, load, time, y, dy):
     """Rates of all variables, in place; a status code. Frame axes; quantities are relative to the frame where so named.
 
@@ -119,7 +119,7 @@ def slopes(form, model, terms, state, load, time, y, dy):
     return OK
 
 
-@kernel
+@kernel(outer=True)
 def singular(form, y, dy, dt):
     """Whether theta is within a step of dt of 0 or pi, or so near that phi and psi have lost half of their digits."""
     if form.variables != 3:
@@ -128,7 +128,7 @@ def singular(form, y, dy, dt):
     return s <= SMALLEST_SINE or (s < NEAR_A_POLE and s <= dt * hypot(dy[1], dy[0] * s))
 
 
-@kernel
+@kernel(outer=True)
 def rk4(form, model, terms, state, load, y, stages, dt, origin, steps, cursor):
     """Classical Runge-Kutta until cursor[0] = steps; cursor[1]: stages done in a step; stages (5, variables)."""
     shift = (0.0, 0.5, 0.5, 1.0)

@@ -61,8 +61,12 @@ def _apply_rescaling(thermostat, model, state, h):
         scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
         thermostat.heat[0] += (scale2 - 1) * kinetic
         scale = sqrt(scale2)
-        state.velocity[:] *= scale
-        state.angular_momentum_body[:] *= scale
+        for m in range(len(state.velocity)):
+            for k in range(3):
+                state.velocity[m, k] *= scale
+        for m in range(len(state.angular_momentum_body)):
+            for k in range(3):
+                state.angular_momentum_body[m, k] *= scale
 
     return rescale
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.forces.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
-from rigidmd.jit import PAIR_FLAGS, kernel
+from rigidmd.jit import BLOCKS, PAIR_FLAGS, kernel
 
-BLOCKS = 16  # enough for 16 threads
 SERIAL_SITES = 1000  # up to this many there is one block, and no thread is started
 
 
@@ -30,7 +29,6 @@ class Clusters(NamedTuple):
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved: np.ndarray  # (slots,) how far each has gone since, Å
     farthest: np.ndarray  # (blocks,) the largest of them; infinite where that is too far for a list, Å
-    wrapped: np.ndarray  # (s, 3) positions in the box while sites are sorted; then for others to use
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
@@ -50,7 +48,6 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
         reference=zeros(3 * slots, dtype),
         moved=zeros(slots, dtype),
         farthest=np.zeros(blocks),
-        wrapped=np.zeros((sites, 3)),
     )
 
 
@@ -67,47 +64,60 @@ def sort_into_clusters(clusters, cell, position):
     width = width_of(clusters.local)
     low = np.full(3, inf)
     high = np.full(3, -inf)
-    wrapped = clusters.wrapped
     for i in range(s):
-        wrapped[i] = position[i]
-        for k in range(2, -1, -1):
-            boxes = floor(wrapped[i, k] / cell[k, k]) if cell[k, k] < inf else 0.0
-            if boxes != 0.0:
-                for j in range(k + 1):
-                    wrapped[i, j] -= boxes * cell[k, j]
-            low[k] = min(low[k], wrapped[i, k])
-            high[k] = max(high[k], wrapped[i, k])
+        wrapped = _in_brick(cell, position, i)
+        for k in range(3):
+            low[k] = min(low[k], wrapped[k])
+            high[k] = max(high[k], wrapped[k])
     extent = high - low
     edge = (extent[0] * extent[1] * extent[2] * width / s) ** (1 / 3)
     nx = max(1, min(s, round(extent[0] / edge))) if edge > 0 else 1
     ny = max(1, min(s // nx, round(extent[1] / edge))) if edge > 0 else 1
     nz = max(1, s // (nx * ny))
-    cell = np.empty(s, np.int64)
+    place = np.empty(s, np.int64)
     height = np.empty(s)
     start = np.zeros(nx * ny * nz + 1, np.int64)
     for i in range(s):
-        x = _bin(wrapped[i, 0] - low[0], extent[0], nx)
-        y = _bin(wrapped[i, 1] - low[1], extent[1], ny)
-        z = _bin(wrapped[i, 2] - low[2], extent[2], nz)
+        wrapped = _in_brick(cell, position, i)
+        x = _bin(wrapped[0] - low[0], extent[0], nx)
+        y = _bin(wrapped[1] - low[1], extent[1], ny)
+        z = _bin(wrapped[2] - low[2], extent[2], nz)
         column = x * ny + (y if x % 2 == 0 else ny - 1 - y)
         up = column % 2 == 0
-        height[i] = wrapped[i, 2] if up else -wrapped[i, 2]
-        cell[i] = column * nz + (z if up else nz - 1 - z)
-        start[cell[i] + 1] += 1
-    start[:] = np.cumsum(start)
+        height[i] = wrapped[2] if up else -wrapped[2]
+        place[i] = column * nz + (z if up else nz - 1 - z)
+        start[place[i] + 1] += 1
+    for p in range(1, len(start)):
+        start[p] += start[p - 1]
     order = clusters.order
     for i in range(s):
-        order[start[cell[i]]] = i
-        start[cell[i]] += 1
-    # now start[c] is where cell c ends; sites of a cell are in the order of their indices and few
+        order[start[place[i]]] = i
+        start[place[i]] += 1
+    # now start[p] is where place p ends; sites of a place are in the order of their indices and few
     for a in range(1, s):
         i = order[a]
         b = a
-        while b > 0 and cell[order[b - 1]] == cell[i] and height[order[b - 1]] > height[i]:
+        while b > 0 and place[order[b - 1]] == place[i] and height[order[b - 1]] > height[i]:
             order[b] = order[b - 1]
             b -= 1
         order[b] = i
     order[s:] = order[s - 1]
+
+
+@kernel(inline=True)
+def _in_brick(cell, position, i):
+    """Where site i is once it has been brought into the brick, (x, y, z) in Å."""
+    x, y, z = position[i, 0], position[i, 1], position[i, 2]
+    boxes = floor(z / cell[2, 2]) if cell[2, 2] < inf else 0.0
+    if boxes != 0.0:
+        x, y, z = x - boxes * cell[2, 0], y - boxes * cell[2, 1], z - boxes * cell[2, 2]
+    boxes = floor(y / cell[1, 1]) if cell[1, 1] < inf else 0.0
+    if boxes != 0.0:
+        x, y = x - boxes * cell[1, 0], y - boxes * cell[1, 1]
+    boxes = floor(x / cell[0, 0]) if cell[0, 0] < inf else 0.0
+    if boxes != 0.0:
+        x -= boxes * cell[0, 0]
+    return x, y, z
 
 
 @kernel(inline=True)
@@ -116,16 +126,20 @@ def _bin(x, extent, count):
 
 
 @kernel(counted=False)
-def settle_block(clusters, position, group, block):
+def settle_block(clusters, cell, position, group, block):
     """Origins, anchors and places of newly sorted clusters; their origin is the middle of their box."""
     width = width_of(clusters.local)
     clusters.farthest[block] = 0.0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        _pair_up(clusters, width * c, min(width * (c + 1), len(clusters.wrapped)))
+        for slot in range(width * c, width * (c + 1)):
+            wrapped = _in_brick(cell, position, clusters.order[slot])
+            for k in range(3):
+                clusters.anchor[slot, k] = wrapped[k]  # for now
+        _pair_up(clusters, width * c, min(width * (c + 1), len(position)))
         for k in range(3):
             low, high = inf, -inf
             for slot in range(width * c, width * (c + 1)):
-                x = clusters.wrapped[clusters.order[slot], k]
+                x = clusters.anchor[slot, k]
                 low = min(low, x)
                 high = max(high, x)
             clusters.origin[4 * c + k] = 0.5 * (low + high)
@@ -136,7 +150,7 @@ def settle_block(clusters, position, group, block):
             clusters.square[slot] = 0.0
             for k in range(3):
                 at = slot + 2 * width * c + k * width
-                clusters.anchor[slot, k] = position[i, k] - (clusters.wrapped[i, k] - clusters.origin[4 * c + k])
+                clusters.anchor[slot, k] = position[i, k] - (clusters.anchor[slot, k] - clusters.origin[4 * c + k])
                 clusters.local[at] = position[i, k] - clusters.anchor[slot, k]
                 clusters.reference[at] = clusters.local[at]
                 clusters.square[slot] += clusters.local[at] ** 2
@@ -144,19 +158,22 @@ def settle_block(clusters, position, group, block):
 
 @kernel(inline=True)
 def _pair_up(clusters, first, end):
-    """Change the order of slots first ... end - 1 so that the two sites of each row are near one another."""
-    order, wrapped = clusters.order, clusters.wrapped
+    """Change the order of slots first ... end - 1 so that the two sites of each row are near one another.
+
+    Their places in the brick stand in `anchor`, and follow them.
+    """
+    order, place = clusters.order, clusters.anchor
     for a in range(first, end - 2, 2):
-        i = order[a]
         nearest, nearest2 = a + 1, inf
         for b in range(a + 1, end):
-            j = order[b]
             d2 = 0.0
             for k in range(3):
-                d2 += (wrapped[i, k] - wrapped[j, k]) ** 2
+                d2 += (place[a, k] - place[b, k]) ** 2
             if d2 < nearest2:
                 nearest, nearest2 = b, d2
         order[a + 1], order[nearest] = order[nearest], order[a + 1]
+        for k in range(3):
+            place[a + 1, k], place[nearest, k] = place[nearest, k], place[a + 1, k]
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)

@@ -47,7 +47,7 @@ def reaction_field(
     return ReactionField(cutoff, shape, end, field, charge_e * sqrt(COULOMB))
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
     inverse = inverse_root(r2)

@@ -26,10 +26,9 @@ from rigidmd.forces.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.jit import BLOCKS, PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
 from rigidmd.units import COULOMB
 
-BLOCKS = 16
 WIDTH = lane_count(np.float64)
 
 
@@ -197,7 +196,7 @@ def _add_ewald_sum(term, state, load, tally):
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += own.tallies[block, k]
-            virial_of_offsets(term.sites, state, own.position, own.force, tally)
+            virial_of_offsets(term.sites, state, own.force, tally)
         load_from_sites(term.sites, state, load, own.force)
         return OK
 
@@ -447,7 +446,7 @@ def _add_surface_dipole(term, state, load, tally):
                 for row in range(3):
                     for k in range(3):
                         tally[1 + 3 * row + k] += term.force[i, row] * term.position[i, k]
-            virial_of_offsets(term.sites, state, term.position, term.force, tally)
+            virial_of_offsets(term.sites, state, term.force, tally)
         load_from_sites(term.sites, state, load, term.force)
         return OK
 

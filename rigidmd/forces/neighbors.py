@@ -39,7 +39,9 @@ from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, w
 
 IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
+MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first holds what is inside the cut-off when the list is built, the others parts of the skin
+MOST_BEYOND = 2**16 - 1
 LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
@@ -65,17 +67,18 @@ class PairList(NamedTuple):
     shells_per_A: float  # beyond the cut-off
     reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
     group: np.ndarray  # (s,) pairs inside one group are left out
-    position: np.ndarray  # (s, 3) where the sites are now, lab frame, Å
+    position: np.ndarray  # (s, 3) where the sites are, lab frame, Å; for others to use when the list is up to date
     cell: np.ndarray  # (3, 3) of the box, rows a, b, c, Å
     clusters: Clusters
     tree: BoxTree
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
-    row: np.ndarray  # (rows, SHELLS + 1) shell k of slots 2 r, 2 r + 1: entries[b, row[r, k]:row[r, k + 1]]
+    row: np.ndarray  # (rows,) int32 row r, of slots 2 r and 2 r + 1, ends in entries[b] at row[r], where r + 1 begins
+    beyond: np.ndarray  # (rows, SHELLS) uint16 so many of its entries, at its end, are beyond shell k
     entries: np.ndarray  # (blocks, capacity) int32
-    special: np.ndarray  # (rows, 2) entries with a mask: masked[b, special[r, 0]:special[r, 1]]
-    masked: np.ndarray  # (blocks, capacity, 3) int32 entry, and as bits the lanes that count for either site of the row
+    special: np.ndarray  # (rows,) int32 as `row`, in masked[b]
+    masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and as bits the lanes that count for each site of the row
     needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
-    counters: np.ndarray  # (4,) usable (0 or 1); builds; status of the preparation; images
+    counters: np.ndarray  # (4,) usable (0 or 1); builds; status of the last update; images
     parts: Parts
 
 
@@ -116,10 +119,11 @@ def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, ski
         clusters=clusters,
         tree=box_tree(count),
         shift=zeros(4 * IMAGES, np.float64),
-        row=np.zeros((rows, SHELLS + 1), np.int32),
+        row=np.zeros(rows, np.int32),
+        beyond=np.zeros((rows, SHELLS), np.uint16),
         entries=np.empty((blocks, room), np.int32),
-        special=np.zeros((rows, 2), np.int32),
-        masked=np.empty((blocks, ceil(1.5 * rows / blocks), 3), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
+        special=np.zeros(rows, np.int32),
+        masked=np.empty((blocks, ceil(1.5 * rows / blocks), 2), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
         needed=needed,
         counters=np.zeros(4, np.int64),
         parts=Parts(),
@@ -156,7 +160,7 @@ def with_room(pairs: PairList) -> PairList:
     if entries > pairs.entries.shape[1]:
         pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.int32))
     if masked > pairs.masked.shape[1]:
-        pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 3), np.int32))
+        pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
     return pairs
 
 
@@ -204,10 +208,23 @@ def farthest(pairs):
 
 
 @kernel(inline=True)
-def shells_within(pairs, i, farthest):
-    """How many shells of the row of slots i, i + 1 can hold a site inside the cut-off when none has gone farther."""
-    moved = max(pairs.clusters.moved[i], pairs.clusters.moved[i + 1])
-    return min(SHELLS, 1 + ceil((moved + farthest) * pairs.shells_per_A))
+def end_of_row(pairs, r, farthest):
+    """Where those entries of a row end that can hold a site inside the cut-off when none has gone farther."""
+    moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
+    shell = min(SHELLS - 1, ceil((moved + farthest) * pairs.shells_per_A))
+    return pairs.row[r] - pairs.beyond[r, shell]
+
+
+@kernel(inline=True)
+def lanes_of_first(bits):
+    """The lanes of a masked entry that count for the first site of the row."""
+    return bits & ((1 << MASK_BITS) - 1)
+
+
+@kernel(inline=True)
+def lanes_of_second(bits):
+    """Those that count for the second."""
+    return bits >> MASK_BITS
 
 
 @work(counted=False)
@@ -271,7 +288,7 @@ def _images_along(cell, k, offset, radius):
 @work(counted=False)
 def _settle(parcel, block):
     pairs = opened(parcel)
-    settle_block(pairs.clusters, pairs.position, pairs.group, block)
+    settle_block(pairs.clusters, pairs.cell, pairs.position, pairs.group, block)
 
 
 @work(counted=False)
@@ -395,8 +412,8 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
         farthest = max(farthest, ahead + count if ahead < 0 else ahead)
     for own in range(rows):
         r = rows * c + own
-        filled = _fill_row(pairs.row[r], entries, filled, scratch, own, width)
-        pairs.special[r, 0] = min(filled_masked, len(masked))
+        filled = _fill_row(pairs.beyond[r], entries, filled, scratch, own, width)
+        pairs.row[r] = min(filled, len(entries))
         for n in range(scratch.count[2, own]):
             entry = scratch.special[own, n]
             first_of_row = _mask_of_lanes(pairs, 2 * r, entry, radius2)
@@ -404,30 +421,31 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
             if first_of_row | second:
                 if filled_masked < len(masked):
                     masked[filled_masked, 0] = entry
-                    masked[filled_masked, 1] = first_of_row
-                    masked[filled_masked, 2] = second
+                    masked[filled_masked, 1] = first_of_row | second << MASK_BITS
                 filled_masked += 1
-        pairs.special[r, 1] = min(filled_masked, len(masked))
+        pairs.special[r] = min(filled_masked, len(masked))
     return filled, filled_masked, farthest
 
 
 @kernel(inline=True)
-def _fill_row(row, entries, filled, scratch, own, width):
-    """Write the entries of a row, shell by shell; how many there are now in the block."""
+def _fill_row(beyond, entries, filled, scratch, own, width):
+    """Write the entries of a row, shell by shell; how many there are now in the block.
+
+    Beyond a shell are at most so many as `beyond` can hold: any more of them count as if they were inside.
+    """
     inner, outer, end = scratch.inner[own], scratch.outer[own], scratch.end
     inners, outers = scratch.count[0, own], scratch.count[1, own]
     for k in range(SHELLS):
         end[k] = 0
     for n in range(outers):
         end[ceil(scratch.shell[width * outer[n] + 2 * own])] += 1
-    row[0] = min(filled, len(entries))
     last = filled + inners
-    row[1] = min(last, len(entries))
+    beyond[0] = min(outers, MOST_BEYOND)
     for k in range(1, SHELLS):
         size = end[k]
         end[k] = last
         last += size
-        row[k + 1] = min(last, len(entries))
+        beyond[k] = min(filled + inners + outers - last, MOST_BEYOND)
     if last <= len(entries):
         for n in range(inners):
             entries[filled + n] = inner[n]

@@ -8,6 +8,7 @@ images, sums energies, virial and forces, and hands the forces to the bodies.
 from math import inf
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from rigidmd.forces import neighbors, terms
@@ -17,7 +18,6 @@ from rigidmd.forces.lanes import (
     lane,
     lane_count,
     load,
-    load_beside,
     load_four,
     mask_of,
     narrowed,
@@ -31,16 +31,18 @@ from rigidmd.forces.neighbors import (
     PairList,
     cluster_of,
     empty_list,
+    end_of_row,
     farthest,
     image_of,
+    lanes_of_first,
+    lanes_of_second,
     most_needed,
-    shells_within,
     update_list,
 )  # fmt: skip
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
 
@@ -48,16 +50,18 @@ PRECISIONS = {"double": np.float64, "mixed": np.float32}
 class Parts(NamedTuple):
     """Addresses of the works that evaluate a law; 0 until they are needed."""
 
+    find: int = 0
     forces: int = 0
     forces_and_energies: int = 0
     gather: int = 0
+    hand_over: int = 0
 
 
 class Sums(NamedTuple):
     """Where forces and energies are added up."""
 
     force: np.ndarray  # (s, 3) lab frame
-    own: np.ndarray  # (3 slots,) what its own row does to each site, stored as Clusters.local
+    own: np.ndarray  # (3 slots,) what its own row does to each site, then all rows; stored as Clusters.local
     others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
 
@@ -86,9 +90,18 @@ class PairForces(NamedTuple):
             others = zeros((len(term.sums.others), int(1.1 * room / lanes + 1) * lanes), dtype)
             term = term._replace(sums=term.sums._replace(others=others))
         if term.parts.forces == 0:
+            state, load = terms.EXAMPLE
+            lists = (term.law, term.arranged, term.space, term.sites, term.pairs, term.sums, state)
             content = (term.arranged, term.pairs, term.sums)
-            parts = (part.address(content) for part in (_forces, _forces_and_energies, _gather))
-            term = term._replace(parts=Parts(*parts))
+            term = term._replace(
+                parts=Parts(
+                    find=_find.address(lists),
+                    forces=_forces.address(content),
+                    forces_and_energies=_forces_and_energies.address(content),
+                    gather=_gather.address(content),
+                    hand_over=_hand_over.address((term.sites, term.sums.force, state, load)),
+                )
+            )
         return term
 
     def with_own_work(self) -> "PairForces":
@@ -116,8 +129,8 @@ def pair_forces(
     pairs = empty_list(space, group, reach, law.cutoff, skin, dtype)
     blocks, slots = len(pairs.needed), len(pairs.clusters.order)
     sums = Sums(
-        force=pairs.clusters.wrapped,  # nobody sorts while forces are summed
-        own=zeros(3 * slots, np.float64),
+        force=pairs.position,  # while forces are summed nobody asks where the sites are in the lab
+        own=zeros(3 * slots, dtype),
         others=zeros((blocks, 3 * lane_count(dtype) * int(pairs.needed[:, 2].max())), dtype),
         tallies=np.zeros((blocks, TALLY_SIZE)),
     )
@@ -126,10 +139,10 @@ def pair_forces(
 
 def _diameter(sites: BodySites | CentralSites) -> float:
     """A bound on how far apart the sites of a molecule are, Å."""
-    return 2 * float(np.linalg.norm(sites.offset_body, axis=1).max()) if isinstance(sites, BodySites) else 0.0
+    return 2 * float(np.linalg.norm(sites.offsets(), axis=1).max()) if isinstance(sites, BodySites) else 0.0
 
 
-@kernel
+@kernel(outer=True)
 def _room(pairs):
     """Room that a block needs for forces on the sites of others."""
     return 3 * width_of(pairs.clusters.local) * most_needed(pairs, 2)
@@ -152,37 +165,51 @@ def arrange(law, arranged, order):
 def _add_pair_forces(term, state, load, tally):
     if not is_a(term, PairForces):
         return None
+    if (state, load) != tuple(map(numba.typeof, terms.EXAMPLE)):
+        raise TypeError(f"forces between pairs are compiled for states like terms.EXAMPLE, not for {state}, {load}")
 
     def add_pair_forces(term, state, load, tally):
-        pairs = term.pairs
-        sums = term.sums
-        place_sites(term.sites, state, pairs.position)
-        builds = pairs.counters[1]
-        fill_cell(term.space, pairs.cell)
-        status = update_list(pairs)
-        if status != OK:
-            return status
-        if pairs.counters[1] != builds:
-            if _room(pairs) > sums.others.shape[1]:
-                pairs.counters[0] = 0
-                return LIST_FULL
-            arrange(term.law, term.arranged, pairs.clusters.order)
-        blocks = len(sums.tallies)
+        parts, pairs, sums = term.parts, term.pairs, term.sums
+        if parts.find == 0:
+            return LIST_FULL
+        call(parts.find, packed((term.law, term.arranged, term.space, term.sites, pairs, sums, state)), 0)
+        if pairs.counters[2] != OK:
+            return pairs.counters[2]
         parcel = packed((term.arranged, pairs, sums))
-        if tally is None:
-            call_blocks(term.parts.forces, parcel, blocks)
-            call_blocks(term.parts.gather, parcel, blocks)
-        else:
-            call_blocks(term.parts.forces_and_energies, parcel, blocks)
-            call_blocks(term.parts.gather, parcel, blocks)
+        blocks = len(sums.tallies)
+        call_blocks(parts.forces if tally is None else parts.forces_and_energies, parcel, blocks)
+        call_blocks(parts.gather, parcel, blocks)
+        call(parts.hand_over, packed((term.sites, sums.force, state, load)), 0)
+        if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += sums.tallies[block, k]
-            virial_of_offsets(term.sites, state, pairs.position, sums.force, tally)
-        load_from_sites(term.sites, state, load, sums.force)
+            virial_of_offsets(term.sites, state, sums.force, tally)
         return OK
 
     return add_pair_forces
+
+
+@work()
+def _find(parcel, block):
+    """Bring sites, and what the loop reads of them, to where the bodies are; a status code into counters[2]."""
+    law, arranged, space, sites, pairs, sums, state = opened(parcel)
+    place_sites(sites, state, pairs.position)
+    builds = pairs.counters[1]
+    fill_cell(space, pairs.cell)
+    status = update_list(pairs)
+    if pairs.counters[1] != builds:
+        arrange(law, arranged, pairs.clusters.order)
+        if _room(pairs) > sums.others.shape[1]:
+            pairs.counters[0] = 0
+            status = LIST_FULL
+    pairs.counters[2] = status
+
+
+@work()
+def _hand_over(parcel, block):
+    sites, force, state, load = opened(parcel)
+    load_from_sites(sites, state, load, force)
 
 
 @work(fastmath=PAIR_FLAGS, counted=False)
@@ -216,6 +243,7 @@ def block_forces(law, pairs, own, others, tallies, block):
     masked = pairs.masked[block]
     zero = fill(0.0, clusters.local)
     moved = farthest(pairs)
+    first_entry = first_special = 0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
@@ -225,23 +253,24 @@ def block_forces(law, pairs, own, others, tallies, block):
             )
             still = (zero, zero, zero)
             sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
-            for n in range(pairs.special[i // 2, 0], pairs.special[i // 2, 1]):
+            for n in range(first_special, pairs.special[i // 2]):
                 between = _displacements(pairs, c, here, masked[n, 0])
-                masks = (masked[n, 1], masked[n, 2])
+                masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
                 sums = _meet(law, pairs, block, i, masked[n, 0], between, masks, others, sums, tallies)
             # Displacements one entry ahead: what waits for them would fill the processor's queues before the next
             # entry's could enter.
-            last = pairs.row[i // 2, shells_within(pairs, i, moved)] - 1
+            last = end_of_row(pairs, i // 2, moved) - 1
             entry = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
-            if pairs.row[i // 2, 0] <= last:
-                entry = entries[pairs.row[i // 2, 0]]
+            if first_entry <= last:
+                entry = entries[first_entry]
                 between = _displacements(pairs, c, here, entry)
-            for n in range(pairs.row[i // 2, 0], last + 1):
+            for n in range(first_entry, last + 1):
                 ahead = entries[min(n + 1, last)]
                 after = _displacements(pairs, c, here, ahead)
                 sums = _meet(law, pairs, block, i, entry, between, (None, None), others, sums, tallies)
                 entry, between = ahead, after
+            first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
             first, second, totals = sums
             for k in range(3):
                 own[at + k * width] = total(first[k])
@@ -331,13 +360,13 @@ def gather_block(pairs, own, others, force, block):
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         for k in range(3):
             at = 3 * width * c + k * width
-            on_cluster = load_beside(own, at, clusters.local)
+            on_cluster = double(load(own, at))
             for b in range(len(others)):
                 ahead = c - clusters.bounds[b]
                 if ahead < 0:
                     ahead += len(clusters.origin) // 4
                 if ahead < pairs.needed[b, 2]:
                     on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
-            store(own, at, on_cluster)
+            store(own, at, narrowed(on_cluster, own))
             for slot in range(width * c, min(width * (c + 1), len(force))):
                 force[clusters.order[slot], k] = own[at + slot - width * c]

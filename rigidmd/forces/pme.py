@@ -29,9 +29,8 @@ from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place
 from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.splines import aliases, weights
 from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.jit import BLOCKS, PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
 
-BLOCKS = 16
 SERIAL_POINTS = 16**3  # up to this many grid points there is one block, and no thread is started
 
 
@@ -194,7 +193,7 @@ def _add_pme(term, state, load, tally):
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += mesh.tallies[block, k]
-            virial_of_offsets(term.sites, state, mesh.position, mesh.force, tally)
+            virial_of_offsets(term.sites, state, mesh.force, tally)
         load_from_sites(term.sites, state, load, mesh.force)
         return OK
 

@@ -19,9 +19,14 @@ SERIAL = 512
 class BodySites(NamedTuple):
     """Sites fixed in bodies."""
 
-    first: np.ndarray  # (n + 1,) sites of molecule m are first[m] ... first[m + 1] - 1
-    molecule: np.ndarray  # (s,)
-    offset_body: np.ndarray  # (s, 3) from the centre of mass, body frame, Å
+    first: np.ndarray  # (n + 1,) int32 sites of molecule m are first[m] ... first[m + 1] - 1
+    molecule: np.ndarray  # (s,) int32
+    kind: np.ndarray  # (n,) int32 offsets of molecule m are offset_body[kind[m]], offset_body[kind[m] + 1] ...
+    offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; once for all molecules of a species
+
+    def offsets(self) -> np.ndarray:
+        """Offsets (s, 3) of all sites, body frame, Å."""
+        return self.offset_body[(self.kind - self.first[:-1])[self.molecule] + np.arange(len(self.molecule))]
 
 
 class CentralSites(NamedTuple):
@@ -29,6 +34,10 @@ class CentralSites(NamedTuple):
 
     first: np.ndarray
     molecule: np.ndarray
+
+    def offsets(self) -> np.ndarray:
+        """Offsets (s, 3) of all sites: none."""
+        return np.zeros((len(self.molecule), 3))
 
 
 def place_molecule(sites, state, m, site_position):
@@ -48,10 +57,11 @@ def _place_molecule(sites, state, m, site_position):
         return place_central
 
     def place(sites, state, m, site_position):
+        begin = sites.kind[m] - sites.first[m]
         for i in range(sites.first[m], sites.first[m + 1]):
-            x = sites.offset_body[i, 0]
-            y = sites.offset_body[i, 1]
-            z = sites.offset_body[i, 2]
+            x = sites.offset_body[begin + i, 0]
+            y = sites.offset_body[begin + i, 1]
+            z = sites.offset_body[begin + i, 2]
             for k in range(3):
                 site_position[i, k] = state.position[m, k] + (
                     state.rotation[m, k, 0] * x + state.rotation[m, k, 1] * y + state.rotation[m, k, 2] * z
@@ -78,6 +88,7 @@ def _load_molecule(sites, state, load, m, site_force):
 
     def load_body(sites, state, load, m, site_force):
         q = state.rotation[m]
+        begin = sites.kind[m] - sites.first[m]
         for i in range(sites.first[m], sites.first[m + 1]):
             fx = site_force[i, 0]
             fy = site_force[i, 1]
@@ -89,9 +100,9 @@ def _load_molecule(sites, state, load, m, site_force):
             bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
             by = q[0, 1] * fx + q[1, 1] * fy + q[2, 1] * fz
             bz = q[0, 2] * fx + q[1, 2] * fy + q[2, 2] * fz
-            x = sites.offset_body[i, 0]
-            y = sites.offset_body[i, 1]
-            z = sites.offset_body[i, 2]
+            x = sites.offset_body[begin + i, 0]
+            y = sites.offset_body[begin + i, 1]
+            z = sites.offset_body[begin + i, 2]
             load.torque_body[m, 0] += y * bz - z * by
             load.torque_body[m, 1] += z * bx - x * bz
             load.torque_body[m, 2] += x * by - y * bx
@@ -111,7 +122,7 @@ def _load_threaded(sites, state, load, site_force):
         load_molecule(sites, state, load, m, site_force)
 
 
-@kernel
+@kernel(outer=True)
 def place_sites(sites, state, site_position):
     """Positions of all sites (s, 3) in the lab frame, molecules whole."""
     if len(state.position) <= SERIAL:
@@ -131,11 +142,25 @@ def load_from_sites(sites, state, load, site_force):
         _load_threaded(sites, state, load, site_force)
 
 
-@kernel
-def virial_of_offsets(sites, state, site_position, site_force, tally):
+def virial_of_offsets(sites, state, site_force, tally):
     """Turn the site virial in `tally` into the molecular one: subtract sum f (x) (x_site - X_molecule)."""
-    for i in range(len(site_position)):
-        for k in range(3):
-            offset = site_position[i, k] - state.position[sites.molecule[i], k]
-            for row in range(3):
-                tally[1 + 3 * row + k] -= site_force[i, row] * offset
+    raise TypeError("compiled code only")
+
+
+@implements(virial_of_offsets)
+def _virial_of_offsets(sites, state, site_force, tally):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, site_force, tally: None
+
+    def virial_of_offsets(sites, state, site_force, tally):
+        for i in range(len(site_force)):
+            m = sites.molecule[i]
+            at = sites.kind[m] - sites.first[m] + i
+            for k in range(3):
+                offset = 0.0
+                for axis in range(3):
+                    offset += state.rotation[m, k, axis] * sites.offset_body[at, axis]
+                for row in range(3):
+                    tally[1 + 3 * row + k] -= site_force[i, row] * offset
+
+    return virial_of_offsets

@@ -45,6 +45,13 @@ class Load(NamedTuple):
     torque_body: np.ndarray  # (n, 3) body frame; (0, 3) for points
 
 
+#: What states and loads of molecules are: works are compiled for these types of arrays.
+EXAMPLE = (
+    State(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(1), np.zeros(1)),
+    Load(np.zeros((0, 3)), np.zeros((0, 3))),
+)
+
+
 def no_load(state: State) -> Load:
     """Zero forces and torques for the bodies of a state."""
     return Load(np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body))
@@ -94,7 +101,7 @@ def with_own_work(term: NamedTuple) -> NamedTuple:
     return term.with_own_work() if hasattr(term, "with_own_work") else term
 
 
-@kernel
+@kernel(outer=True)
 def add_term(term, state, load, tally):
     """`add_forces` of one term, to be called from Python."""
     return add_forces(term, state, load, tally)

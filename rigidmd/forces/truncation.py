@@ -121,7 +121,7 @@ def _ended(shape, end, r, inverse, u, w):
     return smoothly_switched
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def added(end, x):
     """(energy, force) that an ending adds at x = r - start >= 0, its constant not counted."""
     linear = end[1]
@@ -131,7 +131,7 @@ def added(end, x):
     return -1.0 * x * (linear + x2 * (quadratic / 3 + x * (cubic / 4))), linear + x2 * (quadratic + x * cubic)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def quintic(shape, r):
     """(S, dS/dr) of 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start), and 1 before the start."""
     per_width = 1 / (shape.cutoff - shape.start)
@@ -140,7 +140,7 @@ def quintic(shape, r):
     return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), t * t * left * left * (-30.0 * per_width)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def nonic(shape, r):
     """The same of 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹."""
     per_width = 1 / (shape.cutoff - shape.start)

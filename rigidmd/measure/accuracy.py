@@ -10,6 +10,7 @@ from rigidmd.build.momenta import mobile
 from rigidmd.build.system import System, build
 from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SceneError
+from rigidmd.forces.sites import place_sites
 from rigidmd.forces.terms import State
 from rigidmd.units import COULOMB
 
@@ -88,7 +89,9 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     terms = engine.terms
     force = sum(term.site_force for term in terms.values() if hasattr(term, "site_force"))
     real = terms["coulomb_real"]
-    force = force + _inside(real.law.charge, real.pairs.position, real.sites.first, real.law.alpha)
+    position = np.empty_like(force)
+    place_sites(real.sites, state, position)
+    force = force + _inside(real.law.charge, position, real.sites.first, real.law.alpha)
     constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
     return force, sum(tally.energy for tally in tallies.values()) + constants
 
