@@ -75,7 +75,7 @@ def _cache_folder() -> str:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
         with tempfile.TemporaryFile(dir=folder):
-            pass
+            numba.get_num_threads()
     except OSError:
         own = tempfile.mkdtemp(prefix="rigidmd-cache-")  # a read-only home: compile, keep it for this process only
         atexit.register(shutil.rmtree, own, ignore_errors=True)
@@ -110,9 +110,9 @@ class Index(IndexDataCacheFile):
 
 
 class Inner(CPUDispatcher):
-    """A kernel that only compiled code calls: without the wrapper for Python, which takes apart every array of every term.
+    """A kernel that only compiled code calls. It has no wrapper for Python, which would take every term apart.
 
-    That took a third of the time of compiling a scene.
+    Wrappers took a third of the time of compiling a scene; to call a kernel that has none ends in a crash.
     """
 
     def __call__(self, *arguments):
@@ -224,6 +224,9 @@ class Work:
         """Where the machine code for a parcel of this value is; compiled, or taken from the cache."""
         parcel = Parcel(numba.typeof(content))
         if parcel not in self.compiled:
+            # Code from the cache that starts threads needs them to be there. Numba sees to that, but loses sight of it
+            # where what was compiled called something that itself came from the cache; that ended in a crash.
+            numba.get_num_threads()
             with _own_cache():
                 code = CFunc(self.function, ((parcel, types.intp), types.void), locals={}, options=self.options)
                 code.enable_caching()

@@ -418,7 +418,7 @@ def turned_alone(inertia, momentum, dt, steps, scheme):
     return state.angular_momentum_body[0]
 
 
-@kernel
+@kernel(outer=True)
 def path(rotor, rotation, momentum, h, steps):
     """Let every body turn, all of species 0: L (steps, n, 3) after each step."""
     seen = np.empty((steps, *momentum.shape))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import njit
 from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
 
@@ -11,8 +12,8 @@ from rigidmd.dynamics.engine import Engine
 from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.forces import resistance
 from rigidmd.forces.fields import SteadyForce
-from rigidmd.forces.resistance import pushed
 from rigidmd.forces.terms import State
 from rigidmd.mechanics.course import integral, is_steady, steady, table, total, value_at, window
 from rigidmd.mechanics.flight import Pinned
@@ -268,6 +269,11 @@ def test_euler_angles_are_singular_only_near_their_poles():
             tilted | {"body": body}, run__integrator=solver, run__formulation="euler_angles", run__timestep_s=0.05
         )
         assert results["theta"] == pytest.approx(np.full(11, np.pi / 3), abs=0.2)
+
+
+@njit
+def pushed(*arguments):
+    return resistance.pushed(*arguments)
 
 
 @pytest.mark.parametrize("dry", [0.0, 0.3])

@@ -24,7 +24,7 @@ PRECISIONS = {"double": np.float64, "mixed": np.float32}
 W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}
 
 
-@kernel
+@kernel(outer=True)
 def every_operation(a, b, out, sums):
     width = lanes.width_of(a)
     x, y = lanes.load(a, 0), lanes.load(b, 0)

@@ -13,13 +13,13 @@ from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orth
 from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
 
 
-@kernel
+@kernel(outer=True)
 def spin(rotor, rotation, angular_momentum, h, steps):
     for _ in range(steps):
         turn(rotor, 0, rotation, angular_momentum, 0, h)
 
 
-@kernel
+@kernel(outer=True)
 def turn_all(rotor, species, rotation, angular_momentum, h, size):
     if size == 1:
         for m in range(len(rotation)):

@@ -77,7 +77,7 @@ def test_any_masses_have_a_principal_frame(positions, data):
     assert frame.inertia[2] <= (frame.inertia[0] + frame.inertia[1]) * (1 + 3e-8)
 
 
-@kernel
+@kernel(outer=True)
 def spin(rotor, rotation, momentum, h, steps):
     for _ in range(steps):
         turn(rotor, 0, rotation, momentum, 0, h)

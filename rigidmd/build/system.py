@@ -295,7 +295,7 @@ def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Mo
     rotor = split_rotor(inertia)
     mass = np.array([m.mass for m in species])
     return Model(
-        index.astype(np.int64),
+        index.astype(np.int32),
         mass,
         np.where(frozen, 0.0, 1 / mass),
         inertia,

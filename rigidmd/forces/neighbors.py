@@ -18,7 +18,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
-from rigidmd.forces.clusters import Clusters, clusters_of, follow_block, settle_block, sort_into_clusters
+from rigidmd.forces.clusters import (
+    Clusters,
+    bin_block,
+    clusters_of,
+    follow_block,
+    place_block,
+    settle_block,
+    sort_into_clusters,
+    wrap_block,
+)
 from rigidmd.forces.lanes import (
     bits,
     fill,
@@ -33,8 +42,9 @@ from rigidmd.forces.lanes import (
     width_of,
     zeros,
 )  # fmt: skip
+from rigidmd.forces.sites import BodySites, CentralSites
 from rigidmd.forces.space import Space, cell_of
-from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK
+from rigidmd.forces.terms import EXAMPLE, LIST_FULL, NOT_FINITE, OK
 from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, work
 
 IMAGE_BITS = 6
@@ -42,14 +52,17 @@ IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first holds what is inside the cut-off when the list is built, the others parts of the skin
 MOST_BEYOND = 2**16 - 1
-LOST = 1e12  # list radii from the origin: there a float64 has no digits left for where in its box a site is
+LOST = 5e8  # list radii from the origin, no longer than a box: so many boxes can be counted in 32 bits
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
 
 class Parts(NamedTuple):
     """Addresses of the works that keep a list; 0 until they are needed."""
 
+    place: int = 0
     follow: int = 0
+    wrap: int = 0
+    bin: int = 0
     prepare: int = 0
     settle: int = 0
     grow: int = 0
@@ -67,7 +80,6 @@ class PairList(NamedTuple):
     shells_per_A: float  # beyond the cut-off
     reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
     group: np.ndarray  # (s,) pairs inside one group are left out
-    position: np.ndarray  # (s, 3) where the sites are, lab frame, Å; for others to use when the list is up to date
     cell: np.ndarray  # (3, 3) of the box, rows a, b, c, Å
     clusters: Clusters
     tree: BoxTree
@@ -114,7 +126,6 @@ def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, ski
         shells_per_A=(SHELLS - 1) / skin,
         reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
         group=group,
-        position=np.zeros((len(group), 3)),
         cell=cell_of(space),
         clusters=clusters,
         tree=box_tree(count),
@@ -149,11 +160,21 @@ def _clusters_ahead(space: Space, count: int, blocks: int, radius: float) -> int
     return min(count, ceil(count * (min(layers, 0.5) + 1 / blocks)))
 
 
-def with_room(pairs: PairList) -> PairList:
-    """The same list with its machine code and, with a tenth to spare, the room its last build asked for."""
+def with_room(pairs: PairList, sites: BodySites | CentralSites) -> PairList:
+    """The list of sites with its machine code and, with a tenth to spare, the room its last build asked for."""
     if pairs.parts.fill == 0:
+        placed = (pairs, sites, EXAMPLE[0])
         pairs = pairs._replace(
-            parts=Parts(*(part.address(pairs) for part in (_follow, _prepare, _settle, _grow, _fill)))
+            parts=Parts(
+                place=_place.address(placed),
+                follow=_follow.address(pairs),
+                wrap=_wrap.address(placed),
+                bin=_bin.address(placed),
+                prepare=_prepare.address(pairs),
+                settle=_settle.address(placed),
+                grow=_grow.address(pairs),
+                fill=_fill.address(pairs),
+            )
         )
     blocks = len(pairs.needed)
     entries, masked, _ = pairs.needed.max(axis=0)
@@ -165,21 +186,23 @@ def with_room(pairs: PairList) -> PairList:
 
 
 @kernel(counted=False)
-def update_list(pairs):
-    """Bring clusters to the site positions, and build the list anew if it is no longer good. A status code."""
+def update_list(pairs, sites, state):
+    """Bring clusters to where the molecules are, and build the list anew if it is no longer good. A status code."""
     blocks = len(pairs.needed)
     parcel = packed(pairs)
-    if pairs.parts.fill == 0:
-        return LIST_FULL
+    placed = packed((pairs, sites, state))
     if pairs.counters[0] == 1:
+        call_blocks(pairs.parts.place, placed, blocks)
         call_blocks(pairs.parts.follow, parcel, blocks)
         if farthest(pairs) < inf:
             return OK
     pairs.counters[0] = 0
+    call_blocks(pairs.parts.wrap, placed, blocks)
+    call_blocks(pairs.parts.bin, placed, blocks)
     call(pairs.parts.prepare, parcel, 0)
     if pairs.counters[2] != OK:
         return pairs.counters[2]
-    call_blocks(pairs.parts.settle, parcel, blocks)
+    call_blocks(pairs.parts.settle, placed, blocks)
     call(pairs.parts.grow, parcel, 0)
     call_blocks(pairs.parts.fill, parcel, blocks)
     if most_needed(pairs, 0) > pairs.entries.shape[1] or most_needed(pairs, 1) > pairs.masked.shape[1]:
@@ -228,21 +251,34 @@ def lanes_of_second(bits):
 
 
 @work(counted=False)
+def _place(parcel, block):
+    pairs, sites, state = opened(parcel)
+    place_block(pairs.clusters, pairs.cell, sites, state, block)
+
+
+@work(counted=False)
 def _follow(parcel, block):
     pairs = opened(parcel)
-    follow_block(pairs.clusters, pairs.position, 0.5 * pairs.skin, block)
+    follow_block(pairs.clusters, 0.5 * pairs.skin, block)
+
+
+@work(counted=False)
+def _wrap(parcel, block):
+    pairs, sites, state = opened(parcel)
+    wrap_block(pairs.clusters, pairs.cell, sites, state, LOST * (pairs.cutoff + pairs.skin), block)
+
+
+@work(counted=False)
+def _bin(parcel, block):
+    pairs, sites, state = opened(parcel)
+    bin_block(pairs.clusters, pairs.cell, sites, state, block)
 
 
 @work()
 def _prepare(parcel, block):
     """Sort the sites for a new list; a status code into counters[2]."""
     pairs = opened(parcel)
-    pairs.counters[2] = OK
-    for x in pairs.position.flat:
-        if not abs(x) < LOST * (pairs.cutoff + pairs.skin):
-            pairs.counters[2] = NOT_FINITE
-            return
-    sort_into_clusters(pairs.clusters, pairs.cell, pairs.position)
+    pairs.counters[2] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
     pairs.counters[3] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
 
 
@@ -287,8 +323,8 @@ def _images_along(cell, k, offset, radius):
 
 @work(counted=False)
 def _settle(parcel, block):
-    pairs = opened(parcel)
-    settle_block(pairs.clusters, pairs.cell, pairs.position, pairs.group, block)
+    pairs, sites, state = opened(parcel)
+    settle_block(pairs.clusters, pairs.cell, sites, state, pairs.group, block)
 
 
 @work(counted=False)

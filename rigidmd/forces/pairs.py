@@ -39,7 +39,7 @@ from rigidmd.forces.neighbors import (
     most_needed,
     update_list,
 )  # fmt: skip
-from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
+from rigidmd.forces.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
 from rigidmd.forces.space import Space, fill_cell
 from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
 from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
@@ -60,7 +60,6 @@ class Parts(NamedTuple):
 class Sums(NamedTuple):
     """Where forces and energies are added up."""
 
-    force: np.ndarray  # (s, 3) lab frame
     own: np.ndarray  # (3 slots,) what its own row does to each site, then all rows; stored as Clusters.local
     others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
@@ -80,11 +79,16 @@ class PairForces(NamedTuple):
     @property
     def site_force(self) -> np.ndarray:
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
-        return self.sums.force
+        return self.forces_in_slots.of_sites()
+
+    @property
+    def forces_in_slots(self) -> InSlots:
+        """The same in the order of the lists."""
+        return InSlots(self.sums.own, self.pairs.clusters.slot)
 
     def with_room(self) -> "PairForces":
         """The term with its machine code and as much room as its last list asked for."""
-        term = self._replace(pairs=neighbors.with_room(self.pairs))
+        term = self._replace(pairs=neighbors.with_room(self.pairs, self.sites))
         if (room := _room(term.pairs)) > term.sums.others.shape[1]:
             lanes = lane_count(dtype := term.sums.others.dtype)
             others = zeros((len(term.sums.others), int(1.1 * room / lanes + 1) * lanes), dtype)
@@ -99,7 +103,7 @@ class PairForces(NamedTuple):
                     forces=_forces.address(content),
                     forces_and_energies=_forces_and_energies.address(content),
                     gather=_gather.address(content),
-                    hand_over=_hand_over.address((term.sites, term.sums.force, state, load)),
+                    hand_over=_hand_over.address((term.sites, term.forces_in_slots, state, load)),
                 )
             )
         return term
@@ -129,8 +133,7 @@ def pair_forces(
     pairs = empty_list(space, group, reach, law.cutoff, skin, dtype)
     blocks, slots = len(pairs.needed), len(pairs.clusters.order)
     sums = Sums(
-        force=pairs.position,  # while forces are summed nobody asks where the sites are in the lab
-        own=zeros(3 * slots, dtype),
+        own=pairs.clusters.square,  # while forces are summed nobody builds a list
         others=zeros((blocks, 3 * lane_count(dtype) * int(pairs.needed[:, 2].max())), dtype),
         tallies=np.zeros((blocks, TALLY_SIZE)),
     )
@@ -179,12 +182,13 @@ def _add_pair_forces(term, state, load, tally):
         blocks = len(sums.tallies)
         call_blocks(parts.forces if tally is None else parts.forces_and_energies, parcel, blocks)
         call_blocks(parts.gather, parcel, blocks)
-        call(parts.hand_over, packed((term.sites, sums.force, state, load)), 0)
+        force = InSlots(sums.own, pairs.clusters.slot)
+        call(parts.hand_over, packed((term.sites, force, state, load)), 0)
         if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += sums.tallies[block, k]
-            virial_of_offsets(term.sites, state, sums.force, tally)
+            virial_of_offsets(term.sites, state, force, tally)
         return OK
 
     return add_pair_forces
@@ -194,10 +198,9 @@ def _add_pair_forces(term, state, load, tally):
 def _find(parcel, block):
     """Bring sites, and what the loop reads of them, to where the bodies are; a status code into counters[2]."""
     law, arranged, space, sites, pairs, sums, state = opened(parcel)
-    place_sites(sites, state, pairs.position)
     builds = pairs.counters[1]
     fill_cell(space, pairs.cell)
-    status = update_list(pairs)
+    status = update_list(pairs, sites, state)
     if pairs.counters[1] != builds:
         arrange(law, arranged, pairs.clusters.order)
         if _room(pairs) > sums.others.shape[1]:
@@ -227,7 +230,7 @@ def _forces_and_energies(parcel, block):
 @work(fastmath=PAIR_FLAGS, counted=False)
 def _gather(parcel, block):
     _, pairs, sums = opened(parcel)
-    gather_block(pairs, sums.own, sums.others, sums.force, block)
+    gather_block(pairs, sums.own, sums.others, block)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
@@ -353,7 +356,7 @@ def _act(law, i, j, between, mask, totals, tallies):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
-def gather_block(pairs, own, others, force, block):
+def gather_block(pairs, own, others, block):
     """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
@@ -368,5 +371,3 @@ def gather_block(pairs, own, others, force, block):
                 if ahead < pairs.needed[b, 2]:
                     on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
             store(own, at, narrowed(on_cluster, own))
-            for slot in range(width * c, min(width * (c + 1), len(force))):
-                force[clusters.order[slot], k] = own[at + slot - width * c]

@@ -6,8 +6,9 @@ Each law has its own sites, only those that take part in it. Sites of one molecu
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from numba import prange, types
 
+from rigidmd.forces.lanes import lane_count, width_of
 from rigidmd.jit import implements, is_a, kernel
 
 # Up to this many molecules loops over molecules stay on one thread. Measured, two threads: starting them costs about
@@ -40,38 +41,70 @@ class CentralSites(NamedTuple):
         return np.zeros((len(self.molecule), 3))
 
 
-def place_molecule(sites, state, m, site_position):
-    """Positions (lab) of molecule m's sites into site_position (s, 3)."""
+class InSlots(NamedTuple):
+    """Vectors of sites in the order in which `clusters` keeps them."""
+
+    value: np.ndarray  # (3 slots,) x, y, z of a cluster as three vectors one after the other
+    slot: np.ndarray  # (s,) where each site is
+
+    def of_sites(self) -> np.ndarray:
+        """The vectors (s, 3) in the order of the sites, float64."""
+        width = lane_count(self.value.dtype)
+        at = self.slot + 2 * width * (self.slot // width)
+        return np.stack([self.value[at + k * width] for k in range(3)], axis=1).astype(np.float64)
+
+
+def of_site(vectors, i):
+    """(x, y, z) of site i, from an array (s, 3) or from slots."""
     raise TypeError("compiled code only")
 
 
-@implements(place_molecule, inline=True)
-def _place_molecule(sites, state, m, site_position):
+@implements(of_site, inline=True)
+def _of_site(vectors, i):
+    if isinstance(vectors, types.Array):
+        return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
+
+    def from_slot(vectors, i):
+        width = width_of(vectors.value)
+        slot = vectors.slot[i]
+        at = slot + 2 * width * (slot // width)
+        return vectors.value[at], vectors.value[at + width], vectors.value[at + 2 * width]
+
+    return from_slot
+
+
+def place(sites, state, m, i):
+    """Where site i, of molecule m, is: (x, y, z) in the lab frame, Å."""
+    raise TypeError("compiled code only")
+
+
+@implements(place, inline=True)
+def _place(sites, state, m, i):
     if is_a(sites, CentralSites):
+        return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
 
-        def place_central(sites, state, m, site_position):
-            for i in range(sites.first[m], sites.first[m + 1]):
-                for k in range(3):
-                    site_position[i, k] = state.position[m, k]
-
-        return place_central
-
-    def place(sites, state, m, site_position):
-        begin = sites.kind[m] - sites.first[m]
-        for i in range(sites.first[m], sites.first[m + 1]):
-            x = sites.offset_body[begin + i, 0]
-            y = sites.offset_body[begin + i, 1]
-            z = sites.offset_body[begin + i, 2]
-            for k in range(3):
-                site_position[i, k] = state.position[m, k] + (
-                    state.rotation[m, k, 0] * x + state.rotation[m, k, 1] * y + state.rotation[m, k, 2] * z
-                )
+    def place(sites, state, m, i):
+        x, y, z = turned(sites, state, m, i)
+        return state.position[m, 0] + x, state.position[m, 1] + y, state.position[m, 2] + z
 
     return place
 
 
+@kernel(inline=True)
+def turned(sites, state, m, i):
+    """From the centre of molecule m to its site i: (x, y, z) in the lab frame, Å."""
+    at = sites.kind[m] - sites.first[m] + i
+    q = state.rotation[m]
+    x, y, z = sites.offset_body[at, 0], sites.offset_body[at, 1], sites.offset_body[at, 2]
+    return (
+        q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
+        q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
+        q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
+    )
+
+
 def load_molecule(sites, state, load, m, site_force):
-    """Add the sum of molecule m's site forces (s, 3), and their torque about its centre, to its load."""
+    """Add the sum of molecule m's site forces, and their torque about its centre, to its load."""
     raise TypeError("compiled code only")
 
 
@@ -81,8 +114,10 @@ def _load_molecule(sites, state, load, m, site_force):
 
         def load_central(sites, state, load, m, site_force):
             for i in range(sites.first[m], sites.first[m + 1]):
-                for k in range(3):
-                    load.force[m, k] += site_force[i, k]
+                fx, fy, fz = of_site(site_force, i)
+                load.force[m, 0] += fx
+                load.force[m, 1] += fy
+                load.force[m, 2] += fz
 
         return load_central
 
@@ -90,9 +125,7 @@ def _load_molecule(sites, state, load, m, site_force):
         q = state.rotation[m]
         begin = sites.kind[m] - sites.first[m]
         for i in range(sites.first[m], sites.first[m + 1]):
-            fx = site_force[i, 0]
-            fy = site_force[i, 1]
-            fz = site_force[i, 2]
+            fx, fy, fz = of_site(site_force, i)
             load.force[m, 0] += fx
             load.force[m, 1] += fy
             load.force[m, 2] += fz
@@ -108,6 +141,13 @@ def _load_molecule(sites, state, load, m, site_force):
             load.torque_body[m, 2] += x * by - y * bx
 
     return load_body
+
+
+@kernel(inline=True)
+def place_molecule(sites, state, m, site_position):
+    """Positions (lab) of molecule m's sites into site_position (s, 3)."""
+    for i in range(sites.first[m], sites.first[m + 1]):
+        site_position[i, 0], site_position[i, 1], site_position[i, 2] = place(sites, state, m, i)
 
 
 @kernel(parallel=True)
@@ -134,7 +174,7 @@ def place_sites(sites, state, site_position):
 
 @kernel
 def load_from_sites(sites, state, load, site_force):
-    """Add the site forces (s, 3) to the bodies' forces and torques."""
+    """Add the site forces, an array (s, 3) or in slots, to the bodies' forces and torques."""
     if len(state.position) <= SERIAL:
         for m in range(len(state.position)):
             load_molecule(sites, state, load, m, site_force)
@@ -153,14 +193,11 @@ def _virial_of_offsets(sites, state, site_force, tally):
         return lambda sites, state, site_force, tally: None
 
     def virial_of_offsets(sites, state, site_force, tally):
-        for i in range(len(site_force)):
-            m = sites.molecule[i]
-            at = sites.kind[m] - sites.first[m] + i
-            for k in range(3):
-                offset = 0.0
-                for axis in range(3):
-                    offset += state.rotation[m, k, axis] * sites.offset_body[at, axis]
-                for row in range(3):
-                    tally[1 + 3 * row + k] -= site_force[i, row] * offset
+        for i in range(len(sites.molecule)):
+            offset = turned(sites, state, sites.molecule[i], i)
+            force = of_site(site_force, i)
+            for row in range(3):
+                for k in range(3):
+                    tally[1 + 3 * row + k] -= force[row] * offset[k]
 
     return virial_of_offsets
