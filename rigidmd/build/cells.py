@@ -74,9 +74,11 @@ def pairs_within(
         inside -= np.floor(inside)
         margin = radius * np.linalg.norm(inverse, axis=0)  # in fractions of the distances between opposite faces
         shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
-        images = [inside + shift for shift in shifts]
-        near = [((image >= -margin) & (image <= 1 + margin)).all(axis=1) for image in images]
-        owner = np.concatenate([np.flatnonzero(chosen) for chosen in near])
-        points = np.concatenate([image[chosen] for image, chosen in zip(images, near, strict=True)]) @ cell
+        owners, images = [], []
+        for shift in shifts:
+            image = inside + shift
+            owners.append(np.flatnonzero(((image >= -margin) & (image <= 1 + margin)).all(axis=1)))
+            images.append(image[owners[-1]])
+        owner, points = np.concatenate(owners), np.concatenate(images) @ cell
     i, j = cKDTree(points).query_pairs(radius, output_type="ndarray").T
     return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)

@@ -23,10 +23,10 @@ from scipy.spatial import cKDTree
 from rigidmd import Scene, Simulation
 from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat
-from rigidmd.forces.neighbors import farthest, shells_within
+from rigidmd.forces.neighbors import end_of_row, farthest
 from rigidmd.forces.pairs import PRECISIONS, PairForces
-from rigidmd.forces.sites import load_from_sites, place_sites
-from rigidmd.forces.terms import no_load
+from rigidmd.forces.sites import place_sites
+from rigidmd.forces.terms import State, no_load
 from rigidmd.jit import SIMD_BITS, call, call_blocks, packed
 
 STEP = 2e-3  # ps
@@ -51,8 +51,12 @@ def run_once(address, content):
 def entries_that_matter(pairs):
     """Entries of the rows' shells that can hold a site inside the cut-off."""
     found, moved = 0, farthest(pairs)
-    for r in range(len(pairs.row)):
-        found += pairs.row[r, shells_within(pairs, 2 * r, moved)] - pairs.row[r, 0]
+    clusters, per_cluster = pairs.clusters, len(pairs.row) * 4 // len(pairs.clusters.origin)
+    for block in range(len(pairs.needed)):
+        first = 0
+        for r in range(per_cluster * clusters.bounds[block], per_cluster * clusters.bounds[block + 1]):
+            found += end_of_row(pairs, r, moved) - first
+            first = pairs.row[r]
     return found
 
 
@@ -67,9 +71,11 @@ def milliseconds(function, *arguments) -> float:
     return 1e3 * min(taken)
 
 
-def useful_pairs(term: PairForces) -> int:
+def useful_pairs(term: PairForces, state: State) -> int:
     """Pairs of sites of different molecules inside the cut-off."""
-    edges, position, group = np.array(term.space.edges), term.pairs.position, term.pairs.group
+    edges, group = np.array(term.space.edges), term.pairs.group
+    position = np.empty((len(group), 3))
+    place_sites(term.sites, state, position)
     tree = cKDTree(np.mod(position, edges) % edges, boxsize=edges)
     found = tree.query_pairs(term.law.cutoff, output_type="ndarray")
     return int((group[found[:, 0]] != group[found[:, 1]]).sum())
@@ -78,7 +84,7 @@ def useful_pairs(term: PairForces) -> int:
 def lanes_of(term: PairForces) -> int:
     """Lanes that the loop works on with the list as it is."""
     pairs = term.pairs
-    rows = entries_that_matter(pairs) + np.sum(pairs.special[:, 1] - pairs.special[:, 0])
+    rows = entries_that_matter(pairs) + pairs.needed[:, 1].sum()
     return int(rows) * 2 * 4 * len(pairs.clusters.order) // len(pairs.clusters.origin)
 
 
@@ -101,8 +107,9 @@ def measure(job: dict) -> list[dict]:
     for (name, term), before in zip(engine.terms.items(), builds, strict=True):
         pairs, blocks = term.pairs, len(term.pairs.needed)
         parts, content = pairs.parts, (term.arranged, pairs, term.sums)
+        placed, on_sites = (pairs, term.sites, state), (term.sites, term.forces_in_slots, state, load)
         every = STEPS / max(1, pairs.counters[1] - before)
-        lanes, useful = lanes_of(term), useful_pairs(term)
+        lanes, useful = lanes_of(term), useful_pairs(term, state)
         forces = milliseconds(run_blocks, term.parts.forces, content, blocks)
         found.append({
             **job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * PRECISIONS[job["precision"]]().itemsize),
@@ -112,11 +119,13 @@ def measure(job: dict) -> list[dict]:
                 "pairs": forces,
                 "gather": milliseconds(run_blocks, term.parts.gather, content, blocks),
                 "follow": milliseconds(run_blocks, parts.follow, pairs, blocks),
-                "sites": milliseconds(place_sites, term.sites, state, pairs.position)
-                + milliseconds(load_from_sites, term.sites, state, load, term.sums.force),
+                "sites": milliseconds(run_blocks, parts.place, placed, blocks)
+                + milliseconds(run_once, term.parts.hand_over, on_sites),
                 "list": (
-                    milliseconds(run_once, parts.prepare, pairs)
-                    + milliseconds(run_blocks, parts.settle, pairs, blocks)
+                    milliseconds(run_blocks, parts.wrap, placed, blocks)
+                    + milliseconds(run_blocks, parts.bin, placed, blocks)
+                    + milliseconds(run_once, parts.prepare, pairs)
+                    + milliseconds(run_blocks, parts.settle, placed, blocks)
                     + milliseconds(run_once, parts.grow, pairs)
                     + milliseconds(run_blocks, parts.fill, pairs, blocks)
                 ) / every,

@@ -1,8 +1,8 @@
-"""What a step of liquid SPC/E costs from 512 to a million molecules, on one core and on several: time and memory.
+"""What a step of liquid SPC/E costs from 216 to a million molecules, on one core and on several: time and memory.
 
-    python tests/benchmarks/scaling.py --copies 1,2,3,5,8,13 --cores 1,2 --precision mixed
+    python tests/benchmarks/scaling.py --copies 1,2,4,8,17 --cores 1,2 --precision mixed --figure scaling.png
 
-The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box of 512 waters that has
+The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box of 216 waters that has
 come to rest is copied along each edge, so every size is the same liquid. Each size runs in a process of its own, so that
 its peak of memory is its own; lists are built before the clock starts, and rebuilt while it runs.
 """
@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from matplotlib.figure import Figure
 from peers import WORKLOADS, numbers, write_start
 
 from rigidmd import Scene, Simulation
@@ -27,7 +28,7 @@ from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat
 
 WORK = WORKLOADS["W1"]
-UNIT = 512  # molecules in the box that is copied
+UNIT = 216  # molecules in the box that is copied; it is little more than twice the cut-off
 EDGE = WORK.edge * (UNIT / WORK.count) ** (1 / 3)  # Å
 STEP = 2e-3  # ps
 FEWEST_STEPS = 20
@@ -81,12 +82,33 @@ def measure(job: dict) -> dict:
     return {"molecules": UNIT * job["copies"] ** 3, "seconds": seconds, "peak": peak, "arrays": arrays}
 
 
+def draw(rows: list[dict], cores: list[int], path: Path) -> None:
+    """Time and memory of a molecule against their number."""
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    time_axis, memory_axis = figure.subplots(1, 2)
+    count = [row["molecules"] for row in rows]
+    for k, color in zip(cores, ("#1f5fa8", "#c4472b", "#4c8c4a", "#8a5aa8"), strict=False):
+        cost = [1e6 * row["seconds"][str(k)] / row["molecules"] for row in rows]
+        time_axis.plot(count, cost, "o-", color=color, label=f"{k} core{'s' * (k > 1)}")
+    time_axis.set_ylabel("µs a molecule and step")
+    time_axis.legend(frameon=False)
+    memory_axis.plot(count, [row["arrays"] / row["molecules"] / 1e3 for row in rows], "o-", color="#5c6270")
+    memory_axis.set_ylabel("kB of arrays a molecule")
+    for axis in (time_axis, memory_axis):
+        axis.set_xscale("log")
+        axis.set_ylim(0, 1.1 * axis.dataLim.ymax)
+        axis.set_xlabel("SPC/E molecules, cut-off 9 Å")
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+
+
 def main() -> None:
     """Measure every size and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--copies", type=numbers(int), default=[1, 2, 3, 5, 8], help="along each edge; 1,2,3,5,8")
+    parser.add_argument("--copies", type=numbers(int), default=[1, 2, 4, 8, 17], help="along each edge; 1,2,4,8,17")
     parser.add_argument("--cores", type=numbers(int), default=[1, 2], help="1,2")
     parser.add_argument("--precision", choices=("double", "mixed"), default="mixed")
+    parser.add_argument("--figure", type=Path, help="file for a picture")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.job:
@@ -98,6 +120,7 @@ def main() -> None:
         per_step = "".join(f" µs a molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores)
         print(f"| molecules |{per_step} steps/s | arrays, kB a molecule | peak of the process, GB |")
         print("|---" * (4 + len(asked.cores)) + "|", flush=True)
+        rows = []
         for copies in asked.copies:
             job = {"copies": copies, "cores": asked.cores, "precision": asked.precision, "folder": folder}
             command = [sys.executable, __file__, "--job", json.dumps(job)]
@@ -105,6 +128,7 @@ def main() -> None:
             if done.returncode:
                 sys.exit(done.stderr)
             found = json.loads(done.stdout)
+            rows.append(found)
             n = found["molecules"]
             costs = "".join(f" {1e6 * found['seconds'][str(k)] / n:.3f} |" for k in asked.cores)
             rate = 1 / found["seconds"][str(asked.cores[-1])]
@@ -112,6 +136,9 @@ def main() -> None:
                 f"| {n:,} |{costs} {rate:.3g} | {found['arrays'] / n / 1e3:.2f} | {found['peak'] / 1e9:.2f} |",
                 flush=True,
             )
+
+        if asked.figure:
+            draw(rows, asked.cores, asked.figure)
 
 
 if __name__ == "__main__":
