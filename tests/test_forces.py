@@ -7,6 +7,7 @@ from reference import Oracle
 
 from rigidmd.build.system import build
 from rigidmd.dynamics.engine import Engine
+from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs import PairForces
 from rigidmd.forces.space import cell_of
 from rigidmd.mechanics.rotation import from_vector
@@ -87,6 +88,23 @@ def test_slanted_boxes(angles, skin):
         down[m, k] -= h
         slope = (sum(oracle.energy(up, state.rotation)) - sum(oracle.energy(down, state.rotation))) / (2 * h)
         assert load.force[m, k] == pytest.approx(-slope, rel=1e-5, abs=1e-7 * np.abs(load.force).max())
+
+
+@pytest.mark.parametrize("angles", [[90.0, 90.0, 90.0], [70.0, 100.0, 50.0]])
+def test_molecules_millions_of_cells_away(angles):
+    """The energy to the digits that positions there have; and where boxes can no longer be counted, a clear refusal."""
+    box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
+    system = build(small_scene({"spce": 20}, None, box=box, forces=ended("force_switch")))
+    engine, state = Engine(system.model, system.terms), system.state.copy()
+    expected = sum(energies(engine, state).values())
+    away = np.random.default_rng(7).integers(-1, 2, state.position.shape) @ cell_of(system.space)
+    for cells, digits in ((1e3, 1e-9), (1e6, 1e-6), (1e8, 1e-4)):
+        moved = state.copy()
+        moved.position[:] += cells * away
+        assert sum(energies(engine, moved).values()) == pytest.approx(expected, rel=digits)
+    moved.position[3, 1] = -1e12
+    with pytest.raises(SimulationError, match=r"molecule 4 is nowhere: it is 1e\+12 Å from the origin"):
+        engine.evaluate(moved)
 
 
 def test_a_cell_and_the_same_lattice_by_another_have_the_same_energy():

@@ -133,11 +133,17 @@ class Engine:
 
 
 class NotFiniteError(SimulationError):
-    """Positions or momenta that are no numbers any more."""
+    """Positions or momenta that are no numbers any more, or positions that say nothing about forces."""
 
     def __init__(self, state: State):
         moving = [array for array in state[:4] if len(array)]
         rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in moving]
         size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
-        self.molecule = int(size.argmax())
-        super().__init__(f"molecule {self.molecule + 1} is nowhere: its position or momentum is no finite number")
+        if np.isfinite(size).all():
+            self.molecule = int(rows[0].argmax())
+            distance = rows[0][self.molecule]
+            self.fault = f"it is {distance:.3g} Å from the origin, too far to tell in which image of the box"
+        else:
+            self.molecule = int(size.argmax())
+            self.fault = "its position or momentum is no finite number"
+        super().__init__(f"molecule {self.molecule + 1} is nowhere: {self.fault}")

@@ -52,7 +52,7 @@ IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first holds what is inside the cut-off when the list is built, the others parts of the skin
 MOST_BEYOND = 2**16 - 1
-LOST = 5e8  # list radii from the origin, no longer than a box: so many boxes can be counted in 32 bits
+LOST = 1e9  # list radii from the origin, none longer than a box: so many boxes can be counted in 32 bits
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
 

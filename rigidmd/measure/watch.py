@@ -188,7 +188,7 @@ def explained(
     """
     finding = error
     if isinstance(error, NotFiniteError):
-        seen = f"{named(system, error.molecule)} is nowhere: its position or momentum is no finite number"
+        seen = f"{named(system, error.molecule)} is nowhere: {error.fault}"
         finding = Finding(seen, error.molecule)
     elif not isinstance(error, Finding):
         return str(error)
