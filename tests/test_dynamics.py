@@ -235,6 +235,22 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
     assert np.ptp(heat) < 1e-9 * thermal * freedom  # energy less heat is conserved
 
 
+def test_a_thermostat_that_rests_changes_no_bit():
+    """A stage at constant energy after one with a thermostat: the same machine code, and yet constant energy."""
+    system = build(small_scene({"spce": 8}, 14.0))
+    resting = VelocityRescaling(
+        0.0, np.inf, system.freedom.total, np.random.Generator(np.random.Philox(1)), np.zeros(1)
+    )
+    found = []
+    for thermostat in (NoThermostat(), resting):
+        state = system.state.copy()
+        Engine(system.model, system.terms).advance(state, VERLET, 1e-3, 20, thermostat)
+        found.append(state)
+    for free, rested in zip(*found, strict=True):
+        assert np.array_equal(free, rested)
+    assert resting.heat[0] == 0
+
+
 def test_a_free_body_is_carried_by_nothing_else():
     system = build(small_scene({"argon": 3}, 40.0))
     state = system.state.copy()

@@ -3,7 +3,7 @@
 `apply(thermostat, model, state, h)` acts once a time step. Everything random comes from the thermostat's own generator.
 """
 
-from math import exp, sqrt
+from math import exp, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ class VelocityRescaling(NamedTuple):
     """
 
     thermal_energy: float  # kB T, u Å²/ps²
-    time_constant: float  # ps
+    time_constant: float  # ps; if infinite it does nothing
     degrees_of_freedom: int
     generator: np.random.Generator
     heat: np.ndarray  # (1,) energy put in so far, u Å²/ps²; total energy - heat is conserved
@@ -49,6 +49,8 @@ def _apply_rescaling(thermostat, model, state, h):
         return None
 
     def rescale(thermostat, model, state, h):
+        if thermostat.time_constant == inf:
+            return
         kinetic = kinetic_energy(model, state)
         freedom = thermostat.degrees_of_freedom
         if kinetic == 0.0 or freedom == 0:

@@ -111,12 +111,14 @@ class MolecularSimulation(Simulation):
 
     def _thermostat(self, k: int) -> NamedTuple:
         stage = self.scene.stages[k]
-        if stage.ensemble == "nve":
+        idle = stage.ensemble == "nve"
+        if all(stage.ensemble == "nve" for stage in self.scene.stages):
             return NoThermostat()
+        # a stage without a thermostat among others with one has one that rests: all then run the same machine code
         seed = np.random.SeedSequence([self.scene.seed, STREAM_THERMOSTAT, k])
         return VelocityRescaling(
-            BOLTZMANN * stage.temperature_K,
-            stage.thermostat_time_ps,
+            0.0 if idle else BOLTZMANN * stage.temperature_K,
+            np.inf if idle else stage.thermostat_time_ps,
             self.system.freedom.total,
             np.random.Generator(np.random.Philox(seed)),
             np.zeros(1),
