@@ -237,7 +237,7 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
 
 def test_a_thermostat_that_rests_changes_no_bit():
     """A stage at constant energy after one with a thermostat: the same machine code, and yet constant energy."""
-    system = build(small_scene({"spce": 8}, 14.0))
+    system = build(small_scene({"spce": 8}, 20.0))
     resting = VelocityRescaling(
         0.0, np.inf, system.freedom.total, np.random.Generator(np.random.Philox(1)), np.zeros(1)
     )
