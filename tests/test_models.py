@@ -76,6 +76,14 @@ MODEL_TABLE = {
         "symmetric", 6, 78.114, (0.0, 1e-9), {("C1", "C2"): 1.4, ("C4", "H4"): 1.08},
         {("C1", "C2", "C3"): 120.0, ("C1", "C2", "H2"): 120.0},
     ),
+    "benzene_trappe": (
+        "symmetric", 6, 78.114, (0.0, 1e-9), {("C1", "C2"): 1.392, ("C4", "H4"): 1.08},
+        {("C1", "C2", "C3"): 120.0, ("C1", "C2", "H2"): 120.0},
+    ),
+    # 0.725 0.917 - 1.45 0.166
+    "hf_jorgensen": (
+        "linear", 5, 20.006, ((0.725 * 0.917 - 1.45 * 0.166) * DEBYE, 1e-6), {("F", "H"): 0.917, ("F", "M"): 0.166}, {},
+    ),
     "methanol_trappe": (
         "asymmetric", 6, 32.0424, (2.22, 5e-3), {("CH3", "O"): 1.43, ("O", "H"): 0.945}, {("CH3", "O", "H"): 108.5},
     ),
@@ -138,7 +146,7 @@ def test_geometry_mass_and_dipole_are_the_published_ones(name):
     kind, freedom, mass, (dipole, within), lengths, angles = MODEL_TABLE[name]
     m = load_model(name)
     assert (m.kind, m.degrees_of_freedom) == (kind, freedom)
-    assert m.planar == (name == "benzene_opls" or (kind == "asymmetric" and name != "tip5p"))
+    assert m.planar == (name.startswith("benzene") or (kind == "asymmetric" and name != "tip5p"))
     assert m.mass == pytest.approx(mass, abs=2e-4)
     assert m.dipole_debye == pytest.approx(dipole, abs=within)
     for (a, b), length in lengths.items():
@@ -167,6 +175,8 @@ def test_the_inertia_of_water(name):
         ("ammonia_trappe", [9.9443]),
         ("methane_opls", [5.2412]),
         ("benzene_opls", [0.18977]),
+        ("benzene_trappe", [0.18977]),
+        ("hf_jorgensen", [20.5597]),
         ("h2s_opls", [10.36, 9.016, 4.734]),
         ("tip3p", [27.88, 14.51, 9.285]),
     ],
@@ -253,6 +263,9 @@ def test_lennard_jones_parameters_in_the_units_of_their_papers():
         ("ammonia_trappe", "N", 3.42, 185.0),
         ("ccl4", "CL1", 3.25, 212.6),
         ("xenon", "XE", 3.9011, 227.55),
+        ("benzene_trappe", "C1", 3.6, 30.7),
+        ("benzene_trappe", "H1", 2.36, 25.45),
+        ("hf_jorgensen", "F", 2.984, 75.75),
     ]:
         m = load_model(name)
         assert m.sigma[m.site_names.index(site)] == sigma
