@@ -89,9 +89,10 @@ class PairForces(NamedTuple):
     def with_room(self) -> "PairForces":
         """The term with its machine code and as much room as its last list asked for."""
         term = self._replace(pairs=neighbors.with_room(self.pairs, self.sites))
-        if (room := _room(term.pairs)) > term.sums.others.shape[1]:
-            lanes = lane_count(dtype := term.sums.others.dtype)
-            others = zeros((len(term.sums.others), int(1.1 * room / lanes + 1) * lanes), dtype)
+        lanes = lane_count(dtype := term.sums.others.dtype)
+        clusters = int(term.pairs.needed[:, 2].max())
+        if 3 * lanes * clusters > term.sums.others.shape[1]:
+            others = zeros((len(term.sums.others), 3 * lanes * (int(1.1 * clusters) + 1)), dtype)
             term = term._replace(sums=term.sums._replace(others=others))
         if term.parts.forces == 0:
             state, load = terms.EXAMPLE
@@ -143,12 +144,6 @@ def pair_forces(
 def _diameter(sites: BodySites | CentralSites) -> float:
     """A bound on how far apart the sites of a molecule are, Å."""
     return 2 * float(np.linalg.norm(sites.offsets(), axis=1).max()) if isinstance(sites, BodySites) else 0.0
-
-
-@kernel(outer=True)
-def _room(pairs):
-    """Room that a block needs for forces on the sites of others."""
-    return 3 * width_of(pairs.clusters.local) * most_needed(pairs, 2)
 
 
 def pair(law, i, j, r2):
@@ -203,7 +198,7 @@ def _find(parcel, block):
     status = update_list(pairs, sites, state)
     if pairs.counters[1] != builds:
         arrange(law, arranged, pairs.clusters.order)
-        if _room(pairs) > sums.others.shape[1]:
+        if 3 * width_of(sums.others) * most_needed(pairs, 2) > sums.others.shape[1]:
             pairs.counters[0] = 0
             status = LIST_FULL
     pairs.counters[2] = status
