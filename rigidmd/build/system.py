@@ -380,7 +380,8 @@ def _terms(
             for k, (m, c) in enumerate(zip(species, chosen, strict=True))
         ]
         kinds = sorted({pair for of_species in pairs for pair in of_species})
-        kind = np.concatenate([[kinds.index(pair) for pair in pairs[k]] for k in index]).astype(np.int64)
+        of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
+        kind = np.concatenate([of_species[k] for k in index])
         sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
         special = {
             (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)

@@ -78,7 +78,7 @@ def measure(job: dict) -> dict:
             steps += FEWEST_STEPS
         seconds[cores] = spent / steps
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    arrays = array_bytes((simulation.system.state, engine.model, tuple(engine.terms.values())))
+    arrays = array_bytes((state, engine.load, engine.model, tuple(engine.terms.values())))
     return {"molecules": UNIT * job["copies"] ** 3, "seconds": seconds, "peak": peak, "arrays": arrays}
 
 
