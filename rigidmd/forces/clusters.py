@@ -30,8 +30,8 @@ class Clusters(NamedTuple):
     square: np.ndarray  # (3 slots,) squared distances from the origins when sorted, Å²; then for others to use
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved: np.ndarray  # (slots,) how far each has gone since, Å
-    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z of the sites of a share of molecules, in the brick, Å
     farthest: np.ndarray  # (blocks,) the largest of them; infinite where that is too far for a list, Å
+    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z of the sites of a share of molecules, in the brick, Å
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:

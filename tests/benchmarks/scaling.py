@@ -28,7 +28,7 @@ from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.dynamics.thermostats import NoThermostat
 
 WORK = WORKLOADS["W1"]
-UNIT = 216  # molecules in the box that is copied; it is little more than twice the cut-off
+UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cut-off
 EDGE = WORK.edge * (UNIT / WORK.count) ** (1 / 3)  # Å
 STEP = 2e-3  # ps
 FEWEST_STEPS = 20
