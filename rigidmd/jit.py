@@ -1,8 +1,8 @@
 """The door to Numba: how kernels are compiled and cached, and how an overload knows which term it was given.
 
 Numba's disk cache looks only at the file of the function itself; a change in a helper in another file would leave
-callers running old code. So the cache lives in a folder named by a digest of all sources of the package: any change of
-any file starts a new one. `RIGIDMD_CACHE` names another place for it.
+callers running old code. So the cache lives in a folder named by a digest of every source that compiled code can come
+from: any change of one of them starts a new folder. `RIGIDMD_CACHE` names another place for it.
 """
 
 import atexit
@@ -33,6 +33,8 @@ from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic, models, overload, register_model
 
 PACKAGE = Path(__file__).parent
+#: Files and folders that compiled code comes from; tests/test_rooms.py sees that no other file has a kernel.
+COMPILED = ("jit.py", "errors.py", "units.py", "mechanics", "forces", "dynamics")
 ADDRESS = ir.IntType(8).as_pointer()
 UNUSED_AFTER_DAYS = 30.0
 BLOCKS = 16  # that threads share: enough for 16 of them
@@ -54,12 +56,16 @@ SIMD_BITS = _simd_bits()
 
 
 def source_digest() -> str:
-    """Hexadecimal digest of every source file of the package, of Numba's version and of the width of vectors."""
+    """Hexadecimal digest of the sources of compiled code, of Numba's version and of the width of vectors."""
     digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS}".encode())
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted(path for name in COMPILED for path in _sources(PACKAGE / name)):
         digest.update(path.relative_to(PACKAGE).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _sources(place: Path) -> list[Path]:
+    return [place] if place.is_file() else list(place.rglob("*.py"))
 
 
 def _cache_folder() -> str:

@@ -82,6 +82,20 @@ def test_each_library_has_its_room(library):
     assert users <= LIBRARIES[library]
 
 
+def test_what_is_compiled_counts_in_the_digest_that_names_the_cache():
+    """A kernel outside of `jit.COMPILED`, or one that takes a number from outside, would run on when it changes."""
+    from rigidmd.jit import COMPILED
+
+    for path in FILES:
+        name = path.relative_to(PACKAGE).parts[0]
+        ours = {module for module in imports(path) if module.split(".")[0] == "rigidmd"}
+        if name in COMPILED:
+            strange = {m for m in ours if m != "rigidmd" and m.split(".")[1] not in COMPILED and f"{m.split('.')[1]}.py" not in COMPILED}
+            assert not strange, f"{path} is compiled and imports {strange}"
+        else:
+            assert "rigidmd.jit" not in ours, f"{path} compiles"
+
+
 def test_no_room_is_unknown():
     found = {
         p.stem if p.is_file() else p.name
