@@ -90,7 +90,11 @@ def test_what_is_compiled_counts_in_the_digest_that_names_the_cache():
         name = path.relative_to(PACKAGE).parts[0]
         ours = {module for module in imports(path) if module.split(".")[0] == "rigidmd"}
         if name in COMPILED:
-            strange = {m for m in ours if m != "rigidmd" and m.split(".")[1] not in COMPILED and f"{m.split('.')[1]}.py" not in COMPILED}
+            strange = {
+                m
+                for m in ours
+                if m != "rigidmd" and m.split(".")[1] not in COMPILED and f"{m.split('.')[1]}.py" not in COMPILED
+            }
             assert not strange, f"{path} is compiled and imports {strange}"
         else:
             assert "rigidmd.jit" not in ours, f"{path} compiles"
