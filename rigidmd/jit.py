@@ -22,19 +22,21 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.caching import IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.codegen import get_host_cpu_features
+from numba.core.errors import TypingError
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.registry import CPUDispatcher
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
 PACKAGE = Path(__file__).parent
 #: Files and folders that compiled code comes from; tests/test_rooms.py sees that no other file has a kernel.
-COMPILED = ("jit.py", "errors.py", "units.py", "mechanics", "forces", "dynamics")
+COMPILED = ("jit.py", "errors.py", "units.py", "core", "mechanics", "forces", "dynamics")
 ADDRESS = ir.IntType(8).as_pointer()
 UNUSED_AFTER_DAYS = 30.0
 BLOCKS = 16  # that threads share: enough for 16 of them
@@ -216,8 +218,8 @@ def opened(typing, parcel):
     return parcel.content(parcel), emit
 
 
-class Work:
-    """A function of (parcel, block) that compiled code calls by its address.
+class Task:
+    """A function of (parcel, block) that compiled code calls by its address, see `Code`.
 
     What is called by name is compiled again with every caller, and the callers' callers: the pair loop five times on
     its way up to the loop over steps, and that for every kind of scene. By address it is compiled once.
@@ -227,9 +229,8 @@ class Work:
         self.function, self.options = function, options
         self.compiled = {}
 
-    def address(self, content) -> int:
-        """Where the machine code for a parcel of this value is; compiled, or taken from the cache."""
-        parcel = Parcel(numba.typeof(content))
+    def address(self, parcel: Parcel) -> int:
+        """Where the machine code for a parcel of this type is; compiled, or taken from the cache."""
         if parcel not in self.compiled:
             # Code from the cache that starts threads needs them to be there. Numba sees to that, but loses sight of it
             # where what was compiled called something that itself came from the cache; that ended in a crash.
@@ -243,14 +244,78 @@ class Work:
         return self.compiled[parcel].address
 
 
-def work(*, fastmath=False, counted=True):
-    """Make a `Work` of a function, with options as those of `kernel`."""
-    return lambda function: Work(function, **_options(fastmath, False), **_counting(counted))
+def task(*, fastmath=False, counted=True):
+    """Make a `Task` of a function, with options as those of `kernel`."""
+    return lambda function: Task(function, **_options(fastmath, False), **_counting(counted))
+
+
+class Code:
+    """Machine code of tasks, by name, each for contents of one type, which `call` and `call_blocks` hold it to.
+
+    Code(fill=(_fill, pairs), place=(_place, (pairs, sites, state))) compiles the tasks, or takes them from the cache.
+    """
+
+    def __init__(self, **tasks: tuple[Task, object]):
+        parcels = {name: Parcel(numba.typeof(content)) for name, (_, content) in tasks.items()}
+        self._addresses = np.array([tasks[name][0].address(parcel) for name, parcel in parcels.items()], np.uintp)
+        self.table = self._addresses.ctypes.data
+        self.numba_type = CodeType(tuple(parcels.items()))
+
+
+class CodeType(types.Type):
+    """Numba type of a `Code`: which tasks it has, and what each may be called with."""
+
+    def __init__(self, parcels: tuple[tuple[str, Parcel], ...]):
+        self.parcels = parcels
+        # a digest: the name is part of that of every function that is compiled for it
+        super().__init__(f"code({hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]})")
+
+    def place(self, name: str, parcel: Parcel) -> int:
+        """Which of its addresses is that of a task. Raises TypeError where it was compiled for something else."""
+        names = [known for known, _ in self.parcels]
+        if name not in names:
+            raise TypingError(f"there is no machine code of {name}; there is that of {', '.join(names)}")
+        if self.parcels[names.index(name)][1] != parcel:
+            raise TypingError(f"{name} was compiled for {self.parcels[names.index(name)][1]}, not for {parcel}")
+        return names.index(name)
+
+
+@typeof_impl.register(Code)
+def _typeof_code(value, context):
+    return value.numba_type
+
+
+@register_model(CodeType)
+class _CodeModel(models.PrimitiveModel):
+    def __init__(self, manager, code):
+        super().__init__(manager, code, ir.IntType(64))
+
+
+@unbox(CodeType)
+def _unbox_code(kind, value, context):
+    table = context.pyapi.object_getattr_string(value, "table")
+    address = context.pyapi.long_as_ulonglong(table)
+    context.pyapi.decref(table)
+    return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
+
+
+@intrinsic(prefer_literal=True)
+def _address_of(typing, code, name, parcel):
+    """Where the machine code of a task is."""
+    if not isinstance(name, types.StringLiteral):
+        raise TypingError("the name of a task must be a literal")
+    place = code.place(name.literal_value, parcel)
+
+    def emit(context, builder, signature, arguments):
+        table = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.load(builder.gep(table, [ir.IntType(64)(place)]))
+
+    return types.intp(code, name, parcel), emit
 
 
 @intrinsic
-def call(typing, address, parcel, block):
-    """Call a `Work` by its address."""
+def _jump(typing, address, parcel, block):
+    """Call what is at an address."""
 
     def emit(context, builder, signature, arguments):
         kind = ir.FunctionType(ir.VoidType(), [ADDRESS, ir.IntType(64)])
@@ -261,15 +326,34 @@ def call(typing, address, parcel, block):
 
 
 @kernel(parallel=True)
-def _call_threaded(address, parcel, blocks):
+def _jump_threaded(address, parcel, blocks):
     for block in numba.prange(blocks):
-        call(address, parcel, block)
+        _jump(address, parcel, block)
 
 
 @kernel
-def call_blocks(address, parcel, blocks):
-    """Call a `Work` for every block, on all threads if there are several."""
+def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
-        call(address, parcel, 0)
+        _jump(address, parcel, 0)
     else:
-        _call_threaded(address, parcel, blocks)
+        _jump_threaded(address, parcel, blocks)
+
+
+def call(code, name, parcel):
+    """Call a task by its name, which is a literal, for block 0. What it was not compiled for does not compile."""
+    raise TypeError("compiled code only")
+
+
+def call_blocks(code, name, parcel, blocks):
+    """Call a task for every block, on all threads if there are several."""
+    raise TypeError("compiled code only")
+
+
+@overload(call, prefer_literal=True, jit_options=_options(False, True))
+def _call(code, name, parcel):
+    return lambda code, name, parcel: _jump(_address_of(code, name, parcel), parcel, 0)
+
+
+@overload(call_blocks, prefer_literal=True, jit_options=_options(False, True))
+def _call_blocks(code, name, parcel, blocks):
+    return lambda code, name, parcel, blocks: _jump_blocks(_address_of(code, name, parcel), parcel, blocks)

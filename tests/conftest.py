@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rigidmd.build.system import System, build
+from rigidmd.core.schemes import Scheme
+from rigidmd.core.state import NOW, State
 from rigidmd.dynamics.engine import Engine
-from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import BodyScene, Scene
 
@@ -45,7 +46,12 @@ def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engi
     state.position[:] += spread * rng.standard_normal(state.position.shape)
     if len(state.rotation):
         state.rotation[:] = random_rotations(rng, len(state.rotation))
-    return system, Engine(system.model, system.terms), state
+    return system, system.engine(), state
+
+
+def move(engine: Engine, state: State, scheme: Scheme, dt: float, steps: int) -> None:
+    """Take so many more steps, in place."""
+    engine.advance(state, scheme, dt, int(state.step[NOW]) + steps)
 
 
 def built(counts, edge, seed=0, spread=0.4, **sections):

@@ -6,14 +6,13 @@ from itertools import permutations
 import known
 import numpy as np
 import pytest
-from conftest import BODIES, ROOT
+from conftest import BODIES, ROOT, move
 
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.errors import SimulationError
-from rigidmd.forces.terms import State
 from rigidmd.jit import kernel
 from rigidmd.mechanics.flight import Pinned
 from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
@@ -405,16 +404,9 @@ def free_body(inertia, omega, duration, dt, integrator="kahan_li_8", **more):
 
 def turned_alone(inertia, momentum, dt, steps, scheme):
     """L in the body frame (3,) of a free body with any moments after so many steps: a scene refuses what no mass has."""
-    state = State(
-        np.zeros((0, 3)),
-        np.zeros((0, 3)),
-        np.eye(3)[None].copy(),
-        np.array([momentum], float),
-        np.zeros(1),
-        np.zeros(1),
-    )
+    state = state_of(rotation=np.eye(3)[None], angular_momentum_body=[momentum])
     engine = Engine(Body(Pinned(1.0), split_rotor(np.array([inertia], float))), {})
-    engine.advance(state, SCHEMES[scheme], dt, steps, NoThermostat())
+    move(engine, state, SCHEMES[scheme], dt, steps)
     return state.angular_momentum_body[0]
 
 

@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
+from conftest import move
 from numba import njit
 from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
 
 from rigidmd.build.body import build_body
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces import resistance
 from rigidmd.forces.fields import SteadyForce
-from rigidmd.forces.terms import State
 from rigidmd.mechanics.course import integral, is_steady, steady, table, total, value_at, window
 from rigidmd.mechanics.flight import Pinned
 from rigidmd.mechanics.rotation import from_vector, hat, random_rotations
@@ -85,10 +85,10 @@ def test_what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one():
 def test_a_top_runs_backwards(name):
     system = build_body(Scene.from_dict(PINNED))
     engine, state = system.engine(), system.state.copy()
-    engine.advance(state, SCHEMES[name], 0.01, 300, NoThermostat())
+    move(engine, state, SCHEMES[name], 0.01, 300)
     state.angular_momentum_body[:] *= -1
     engine.forget()
-    engine.advance(state, SCHEMES[name], 0.01, 300, NoThermostat())
+    move(engine, state, SCHEMES[name], 0.01, 300)
     assert state.rotation == pytest.approx(system.state.rotation, abs=1e-12)
     assert -state.angular_momentum_body == pytest.approx(system.state.angular_momentum_body, abs=1e-12)
 
@@ -598,13 +598,12 @@ def test_the_ranking_of_schemes_at_equal_cost():
         a, b, c = rng.uniform(0.1, 1.0, 3)
         body = Body(Pinned(1.0), split_rotor(np.array([[a + b, b + c, c + a]])))
         engine = Engine(body, {"weight": SteadyForce(np.array([0.0, 0.0, -3.0]), 0.5 * rng.standard_normal(3))})
-        state = State(np.zeros((0, 3)), np.zeros((0, 3)), random_rotations(rng, 1), 1.5 * rng.standard_normal((1, 3)),
-                      np.zeros(1), np.zeros(1))  # fmt: skip
+        state = state_of(rotation=random_rotations(rng, 1), angular_momentum_body=1.5 * rng.standard_normal((1, 3)))
 
         def end(name, steps, engine=engine, state=state):
             moved = state.copy()
             engine.forget()
-            engine.advance(moved, SCHEMES[name].with_rotor("exact"), 2.0 / steps, steps, NoThermostat())
+            move(engine, moved, SCHEMES[name].with_rotor("exact"), 2.0 / steps, steps)
             return moved.rotation
 
         exact = end("srkn_6", 2000)
@@ -623,9 +622,9 @@ def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
     for name, order in (("takahashi_imada", 4), ("position_verlet", 2)):
         errors = []
         for n in (16, 32):
-            state = State(np.zeros((0, 3)), np.zeros((0, 3)), start.copy(), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+            state = state_of(rotation=start)
             engine.forget()
-            engine.advance(state, SCHEMES[name], 2 * np.pi / n, swings * n, NoThermostat())
+            move(engine, state, SCHEMES[name], 2 * np.pi / n, swings * n)
             errors.append(np.abs(state.angular_momentum_body).max() / tilt)  # 0 at the end of a swing
         assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
 

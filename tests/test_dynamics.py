@@ -3,16 +3,17 @@
 import numba
 import numpy as np
 import pytest
-from conftest import built, small_scene
+from conftest import built, move, small_scene
 
 from rigidmd.build.momenta import draw_momenta
 from rigidmd.build.system import build
-from rigidmd.dynamics import thermostats
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import HEAT, State, state_of
+from rigidmd.dynamics import baths
+from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
+from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.errors import SceneError
-from rigidmd.forces.terms import State
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import random_rotations
@@ -38,7 +39,7 @@ def liquid():
 def run(engine, state, dt, steps, scheme=VERLET):
     moved = state.copy()
     engine.forget()
-    engine.advance(moved, scheme, dt, steps, NoThermostat())
+    move(engine, moved, scheme, dt, steps)
     return moved
 
 
@@ -50,7 +51,7 @@ def test_the_energy_error_is_of_order_two(liquid):
         moved, worst = state.copy(), []
         engine.forget()
         for _ in range(40):
-            engine.advance(moved, VERLET, dt, round(0.004 / dt), NoThermostat())
+            move(engine, moved, VERLET, dt, round(0.004 / dt))
             worst.append(observe(system, engine, moved).energy - start)
         errors.append(np.sqrt(np.mean(np.square(worst))))
     assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.1)
@@ -64,7 +65,7 @@ def test_a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid(liquid, na
     _, _, state = liquid
     forces = {"cutoff_A": 6.0, "truncation": "smooth_switch", "switch_start_A": 2.0}
     system = build(small_scene({"spce": 64}, 12.42, forces=forces))
-    engine = Engine(system.model, system.terms)
+    engine = system.engine()
     exact = run(engine, state, 0.03 / 60, 60, scheme=SCHEMES["srkn_6"])
     errors = [off(run(engine, state, 0.03 / n, n, scheme=SCHEMES[name]), exact) for n in (steps, 2 * steps)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(SCHEMES[name].order, abs=margin)
@@ -113,8 +114,8 @@ def test_schemes_are_palindromes_and_run_backwards(dimer, name):
     assert sum(scheme.drifts) == pytest.approx(1, abs=1e-14)
     assert scheme.kicks == scheme.kicks[::-1]
     assert scheme.drifts == scheme.drifts[::-1]
-    assert scheme.gradients == scheme.gradients[::-1]
-    assert not any(scheme.gradients[:1])  # a step leaves the plain load to the next
+    assert scheme.flows == scheme.flows[::-1]
+    assert scheme.flows[0].gradient == 0  # a step leaves the plain load to the next
     there = run(engine, state, 0.001, 100, scheme=scheme)
     there.velocity[:] *= -1
     there.angular_momentum_body[:] *= -1
@@ -155,10 +156,10 @@ def test_angular_momentum_is_kept_in_free_space():
 
 def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(liquid):
     system, _, state = liquid
-    engine = Engine(system.model, system.terms)  # with new lists: the same bits after whatever tests came before
+    engine = system.engine()  # with new lists: the same bits after whatever tests came before
     moved, times, energies = state.copy(), [], []
     for k in range(400):
-        engine.advance(moved, VERLET, 0.001, 50, NoThermostat())
+        move(engine, moved, VERLET, 0.001, 50)
         times.append(0.05 * (k + 1))
         energies.append(observe(system, engine, moved).energy / 100 / 64)
     line = slope(times, energies)
@@ -171,8 +172,8 @@ def test_splitting_a_run_changes_no_bit(liquid):
     whole = run(engine, state, 0.002, 60)
     parts = state.copy()
     engine.forget()
-    for done, steps in ((0, 1), (1, 19), (20, 40)):
-        engine.advance(parts, VERLET, 0.002, steps, NoThermostat(), done)
+    for steps in (1, 19, 40):
+        move(engine, parts, VERLET, 0.002, steps)
     for a, b in zip(whole, parts, strict=True):
         assert a.tobytes() == b.tobytes()
 
@@ -196,7 +197,7 @@ def test_same_bits_for_one_and_two_threads_and_again(counts):
 )  # fmt: skip
 def test_drawn_momenta_have_the_temperature_exactly_and_no_momentum(model, rotation):
     system = build(small_scene({model: 50}, 40.0))
-    seen = observe(system, Engine(system.model, system.terms), system.state)
+    seen = observe(system, system.engine(), system.state)
     assert system.freedom == (147, 50 * rotation)
     assert seen.temperature == pytest.approx(300, rel=1e-12)
     assert seen.temperature_translation == pytest.approx(300, rel=1e-12)
@@ -214,21 +215,21 @@ def test_maxwell_boltzmann_on_every_axis():
 
 @numba.njit
 def kinetic_energy(model, state):
-    return thermostats.kinetic_energy(model, state)
+    return baths.kinetic_energy(model, state)
 
 
 def test_the_thermostat_samples_the_canonical_kinetic_energy():
     # free flight, so the kinetic energy has nothing but the thermostat: mean and variance of a Gamma distribution
     system = build(small_scene({"nitrogen": 6}, 40.0))  # linear: its free rotation is exact
     freedom, thermal = system.freedom.total, 300 * BOLTZMANN
-    thermostat = VelocityRescaling(thermal, 0.01, freedom, np.random.Generator(np.random.Philox(1)), np.zeros(1))
+    row = VERLET.with_bath(VelocityRescaling(thermal, 0.01, freedom, key_of(1, BATH)))
     state = system.state.copy()
     engine = Engine(system.model, {})
     samples, heat = [], []
     for _ in range(6000):
-        engine.advance(state, VERLET, 0.01, 4, thermostat)
+        move(engine, state, row, 0.01, 4)
         samples.append(kinetic_energy(system.model, state))
-        heat.append(samples[-1] - thermostat.heat[0])
+        heat.append(samples[-1] - state.books[HEAT])
     samples = np.array(samples) / thermal
     assert samples.mean() == pytest.approx(freedom / 2, rel=0.01)
     assert samples.var() == pytest.approx(freedom / 2, rel=0.08)
@@ -238,23 +239,21 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
 def test_a_thermostat_that_rests_changes_no_bit():
     """A stage at constant energy after one with a thermostat: the same machine code, and yet constant energy."""
     system = build(small_scene({"spce": 8}, 20.0))
-    resting = VelocityRescaling(
-        0.0, np.inf, system.freedom.total, np.random.Generator(np.random.Philox(1)), np.zeros(1)
-    )
+    resting = VelocityRescaling(0.0, np.inf, system.freedom.total, key_of(1, BATH))
     found = []
-    for thermostat in (NoThermostat(), resting):
+    for row in (VERLET, VERLET.with_bath(resting)):
         state = system.state.copy()
-        Engine(system.model, system.terms).advance(state, VERLET, 1e-3, 20, thermostat)
+        move(system.engine(), state, row, 1e-3, 20)
         found.append(state)
     for free, rested in zip(*found, strict=True):
         assert np.array_equal(free, rested)
-    assert resting.heat[0] == 0
+    assert found[1].books[HEAT] == 0
 
 
 def test_a_free_body_is_carried_by_nothing_else():
     system = build(small_scene({"argon": 3}, 40.0))
     state = system.state.copy()
-    Engine(system.model, {}).advance(state, VERLET, 0.01, 100, NoThermostat())
+    move(Engine(system.model, {}), state, VERLET, 0.01, 100)
     assert state.position == pytest.approx(system.state.position + system.state.velocity, abs=1e-12)
     assert isinstance(state, State)
     assert state.rotation.shape == (0, 3, 3)  # points store no rotation
@@ -272,22 +271,22 @@ def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
     mass = system.model.mass[system.model.species][:, None]
 
     def pack(s):
-        return np.concatenate([a.ravel() for a in s])
+        return np.concatenate([a.ravel() for a in s[:4]])
 
     def unpack(y):
-        return State(*(part.reshape(a.shape) for part, a in zip(np.split(y, [6, 12, 30, 36, 37]), state, strict=True)))
+        return state_of(*(part.reshape(a.shape) for part, a in zip(np.split(y, [6, 12, 30]), state, strict=False)))
 
     def slopes(_, y):
         s = unpack(y)
-        load, _ = engine.evaluate(State(*(np.ascontiguousarray(a) for a in s)))
+        load, _ = engine.evaluate(s)
         w = s.angular_momentum_body * inverse
         hat = np.zeros((2, 3, 3))
         hat[:, 0, 1], hat[:, 0, 2], hat[:, 1, 2] = -w[:, 2], w[:, 1], -w[:, 0]
         hat -= np.swapaxes(hat, 1, 2).copy()
         turning = (np.cross(s.angular_momentum_body, w) + load.torque_body) * (inverse > 0)
-        return pack(State(s.velocity, load.force / mass, s.rotation @ hat, turning, np.ones(1), np.zeros(1)))
+        return pack((s.velocity, load.force / mass, s.rotation @ hat, turning))
 
     exact = unpack(solve_ivp(slopes, (0, 0.05), pack(state), method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1])
     moved = run(engine, state, 0.05 / 4000, 4000)
-    for a, b in zip(moved, exact, strict=True):
+    for a, b in zip(moved[:4], exact, strict=False):
         assert a == pytest.approx(b, abs=2e-5 * max(1, np.abs(b).max()))

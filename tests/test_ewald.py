@@ -17,7 +17,7 @@ from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import sum_of, waves
 from rigidmd.forces.screened import screening
-from rigidmd.forces.space import Triclinic, cell_of, space_of
+from rigidmd.forces.space import Triclinic, cell_of
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
@@ -181,7 +181,7 @@ def test_nist_spce_component_by_component(reference, config, tmp_path):
     system = build(
         nist_scene(file, 20 * np.eye(3), tmp_path, ewald_alpha_per_A=5.6 / 20, ewald_k_max=5, ewald_k2_max=26)
     )
-    seen = observe(system, Engine(system.model, system.terms), system.state)
+    seen = observe(system, system.engine(), system.state)
     found = in_kelvin(seen.components)
     figures = table["NIST_10A"][f"config{config}"]
     for name, printed in NIST_NAMES.items():
@@ -207,7 +207,7 @@ def test_nist_spce_in_a_triclinic_cell(reference, tmp_path):
         nist_scene(file, cell, tmp_path, ewald_alpha_per_A=0.285, ewald_k_max=7, ewald_k_radius_per_A=radius)
     )
     assert system.terms["coulomb_reciprocal"].waves.total == 2 * 755
-    seen = observe(system, Engine(system.model, system.terms), system.state)
+    seen = observe(system, system.engine(), system.state)
     found = in_kelvin(seen.components)
     for name, printed in NIST_NAMES.items():
         assert found[name] == published(figures[f"E_{printed}"]), name
@@ -235,7 +235,7 @@ def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
     }
     system = build(Scene.from_dict(data, tmp_path))
     assert cell_of(system.space) == pytest.approx(10 * np.array(given["box_nm"]))
-    seen = observe(system, Engine(system.model, system.terms), system.state)
+    seen = observe(system, system.engine(), system.state)
     assert sum(seen.components.values()) / KJ_PER_MOL == pytest.approx(given["DERIVED_converged"]["no_LRC"], rel=1e-6)
     forces = 10 * seen.load.force / KJ_PER_MOL
     assert forces == pytest.approx(np.array(given["forces_kJ_mol_nm"]), abs=given["force_rtol"] * np.abs(forces).max())
@@ -260,7 +260,7 @@ def test_madelung_constant_of_rock_salt(reference, method, asked, error, tmp_pat
         "stages": [{"duration_ps": 1.0}],
     }
     system = build(Scene.from_dict(data, tmp_path))
-    seen = observe(system, Engine(system.model, system.terms), system.state)
+    seen = observe(system, system.engine(), system.state)
     madelung = -coulomb(seen.components) / (COULOMB / 2.82 * 500)
     assert madelung == pytest.approx(1.7475645946331822, rel=error)
     given = json.loads((reference / "openmm" / "REFERENCE.json").read_text())["nacl_crystal"]["E_kJ_mol"]
@@ -346,7 +346,7 @@ def test_frozen_molecules_do_not_act_on_one_another():
             )
             for chosen in (slice(None), owner < 6)
         )
-        seen = observe(system, Engine(system.model, system.terms), system.state)
+        seen = observe(system, system.engine(), system.state)
         # of the sums that cancel, as good as the grid is; see test_total_does_not_depend_on_how_it_is_split
         error = 3e-6 if method is TIGHT_PME else 1e-10
         assert coulomb(seen.components) == pytest.approx(whole.total - alone.total, abs=error * abs(whole.self))
@@ -359,11 +359,11 @@ def test_frozen_molecules_do_not_act_on_one_another():
 def test_waves_without_compiled_code():
     system, engine, state = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
     engine.evaluate(state)
-    term = engine.terms["coulomb_reciprocal"]
-    energy, force, virial = sum_of(term.charge, term.work.position, cell_of(system.space), term.alpha, term.waves)
-    assert energy == pytest.approx(term.work.tallies[:, 0].sum(), rel=1e-11)
-    assert force == pytest.approx(term.work.force, abs=1e-11 * np.abs(force).max())
-    assert virial.ravel() == pytest.approx(term.work.tallies[:, 1:].sum(axis=0), rel=1e-9, abs=1e-9 * abs(energy))
+    term, own = system.terms["coulomb_reciprocal"], engine.workspaces["coulomb_reciprocal"].sums
+    energy, force, virial = sum_of(term.charge, own.position, cell_of(system.space), term.alpha, term.waves)
+    assert energy == pytest.approx(own.tallies[:, 0].sum(), rel=1e-11)
+    assert force == pytest.approx(own.force, abs=1e-11 * np.abs(force).max())
+    assert virial.ravel() == pytest.approx(own.tallies[:, 1:].sum(axis=0), rel=1e-9, abs=1e-9 * abs(energy))
 
 
 def test_waves_of_a_slanted_cell():
@@ -372,21 +372,22 @@ def test_waves_of_a_slanted_cell():
     found = {}
     for method in (TIGHT_EWALD, TIGHT_PME):
         system, _, state = salty([13.0, 14.0, 15.0], method)
-        term = system.terms["coulomb_reciprocal"]._replace(space=slanted)
+        term = system.terms["coulomb_reciprocal"]
         engine = Engine(system.model, {"waves": term})
+        state.cell[:] = cell_of(slanted)
         _, tallies = engine.evaluate(state)
-        term = engine.terms["waves"]
-        position = (term.work if method is TIGHT_EWALD else term.mesh).position
-        found[method["electrostatics"]] = (tallies["waves"].energy, term.site_force.copy(), tallies["waves"].virial)
+        own = engine.workspaces["waves"]
+        position = (own.sums if method is TIGHT_EWALD else own.mesh).position
+        found[method["electrostatics"]] = (tallies["waves"].energy, own.site_force.copy(), tallies["waves"].virial)
         energy, force, _ = sum_of(term.charge, position, cell_of(slanted), 0.9, waves((20, 20, 20)))
         error = 1e-11 if method is TIGHT_EWALD else 3e-6
         assert tallies["waves"].energy == pytest.approx(energy, rel=error)
-        assert term.site_force == pytest.approx(force, abs=10 * error * np.abs(force).max())
+        assert own.site_force == pytest.approx(force, abs=10 * error * np.abs(force).max())
         moved = state.copy()
         moved.position[0] += cell_of(slanted)[2]
         assert engine.evaluate(moved)[1]["waves"].energy == pytest.approx(tallies["waves"].energy, rel=1e-11)
-    other = term._replace(space=slanted._replace(xy=slanted.xy - slanted.x))
-    assert Engine(system.model, {"waves": other}).evaluate(state)[1]["waves"].energy == pytest.approx(energy, rel=3e-6)
+    state.cell[1, 0] -= slanted.x
+    assert engine.evaluate(state)[1]["waves"].energy == pytest.approx(energy, rel=3e-6)
     assert found["pme"][2] == pytest.approx(found["ewald"][2], abs=1e-4 * np.abs(found["ewald"][2]).max())
 
 
@@ -453,11 +454,10 @@ def test_virial_is_the_slope_of_the_energy_with_the_volume(method, surface, angl
     h = 1e-4
 
     def energy(stretch):
-        cell = cell_of(system.space) * stretch
-        stretched = {name: term._replace(space=space_of(cell)) for name, term in terms.items()}
         moved = state.copy()
+        moved.cell[:] *= stretch
         moved.position[:] *= stretch
-        tallies = Engine(system.model, stretched).evaluate(moved)[1]
+        tallies = Engine(system.model, terms).evaluate(moved)[1]
         return sum(tally.energy for tally in tallies.values())
 
     def change(along):
@@ -519,7 +519,7 @@ def test_same_bits_for_any_number_of_threads(method, precision):
     seen = []
     for threads in (1, 2):
         numba.set_num_threads(threads)
-        load, tallies = Engine(system.model, system.terms).evaluate(state)
+        load, tallies = system.engine().evaluate(state)
         seen.append((load.force.tobytes(), load.torque_body.tobytes(), str(tallies)))
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert seen[0] == seen[1]

@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
-from conftest import built, small_scene
+from conftest import built, move, small_scene
+from numba.core.errors import TypingError
 from reference import Oracle
 
 from rigidmd.build.system import build
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import no_load
 from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SimulationError
-from rigidmd.forces.pairs import PairForces
+from rigidmd.forces.neighbors import BUILDS, USABLE
 from rigidmd.forces.space import cell_of
+from rigidmd.forces.terms import add_term
+from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector
 
 ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
@@ -56,7 +61,7 @@ def test_a_box_with_unequal_edges_and_many_cells():
         {"nitrogen": 60, "argon": 40}, None, box={"lengths_A": [30.0, 10.0, 17.0]}, forces={"cutoff_A": 4.0}
     )
     system = build(scene)
-    engine, state = Engine(system.model, system.terms), system.state.copy()
+    engine, state = system.engine(), system.state.copy()
     rng = np.random.default_rng(5)
     state.position[:] += rng.normal(size=state.position.shape)
     expected = Oracle(system).energy(state.position, state.rotation)[0]
@@ -75,7 +80,7 @@ def test_slanted_boxes(angles, skin):
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
     forces = ended("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
     system = build(small_scene({"spce": 20, "nitrogen": 15}, None, box=box, forces=forces))
-    engine, state, oracle = Engine(system.model, system.terms), system.state.copy(), Oracle(system)
+    engine, state, oracle = system.engine(), system.state.copy(), Oracle(system)
     rng = np.random.default_rng(3)
     state.position[:] += rng.normal(size=state.position.shape)
     state.position[:] += rng.integers(-3, 4, state.position.shape) @ cell_of(system.space)
@@ -95,7 +100,7 @@ def test_molecules_millions_of_cells_away(angles):
     """The energy to the digits that positions there have; and where boxes can no longer be counted, a clear refusal."""
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
     system = build(small_scene({"spce": 20}, None, box=box, forces=ended("force_switch")))
-    engine, state = Engine(system.model, system.terms), system.state.copy()
+    engine, state = system.engine(), system.state.copy()
     expected = sum(energies(engine, state).values())
     away = np.random.default_rng(7).integers(-1, 2, state.position.shape) @ cell_of(system.space)
     for cells, digits in ((1e3, 1e-9), (1e6, 1e-6), (1e8, 1e-4)):
@@ -114,7 +119,7 @@ def test_a_cell_and_the_same_lattice_by_another_have_the_same_energy():
     cube = build(small_scene(counts, 13.0, forces=forces))
     other = build(small_scene(counts, None, box=leaning, forces=forces))
     assert cell_of(other.space) == pytest.approx(13.0 * np.eye(3))
-    found = [energies(Engine(s.model, s.terms), cube.state) for s in (cube, other)]
+    found = [energies(s.engine(), cube.state) for s in (cube, other)]
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
@@ -156,17 +161,14 @@ def test_virial_is_the_slope_of_the_energy_with_the_box(angles):
     forces = {"cutoff_A": 6.0, "truncation": "force_switch", "switch_start_A": 4.0}
     box = {"lengths_A": 14.0, "angles_deg": angles} if angles else {"lengths_A": 13.0}
     system = build(small_scene({"spce": 14}, None, box=box, forces=forces))
-    engine, state = Engine(system.model, system.terms), system.state
+    engine, state = system.engine(), system.state
     virial = sum(tally.virial for tally in engine.evaluate(state)[1].values())
 
     def energy(stretch):
-        terms = {
-            name: term._replace(space=type(term.space)(*(x * stretch for x in term.space)))
-            for name, term in system.terms.items()
-        }
         moved = state.copy()
+        moved.cell[:] *= stretch
         moved.position[:] *= stretch  # centres of mass only: the molecular virial
-        return sum(energies(Engine(system.model, terms), moved).values())
+        return sum(energies(engine, moved).values())
 
     h = 1e-5
     assert virial.trace() == pytest.approx(-(energy(1 + h) - energy(1 - h)) / (2 * h), rel=1e-6)
@@ -185,31 +187,83 @@ def test_newton_and_no_net_torque_in_free_space():
 def test_a_list_with_little_room_grows_and_misses_nothing():
     _, engine, state = built({"spce": 40}, 18.0, 4, forces={"cutoff_A": 8.0})
     expected = energies(engine, state)
-    terms = []
-    for term in engine.terms.values():
-        blocks = len(term.pairs.entries)
-        cramped = term.pairs._replace(
-            entries=np.empty((blocks, 3), np.int32), masked=np.empty((blocks, 1, 3), np.int32)
-        )
-        cramped.counters[0] = 0
-        terms.append(term._replace(pairs=cramped, sums=term.sums._replace(others=term.sums.others[:, :8].copy())))
-    engine._terms = tuple(terms)
+    cramped = []
+    for own in engine.workspaces.values():
+        blocks = len(own.pairs.entries)
+        pairs = own.pairs._replace(entries=np.empty((blocks, 3), np.int32), masked=np.empty((blocks, 1, 2), np.int32))
+        pairs.counters[USABLE] = 0
+        cramped.append(own._replace(pairs=pairs, sums=own.sums._replace(others=own.sums.others[:, :8].copy())))
+    engine._workspaces = tuple(cramped)
     assert energies(engine, state) == expected
 
 
 @pytest.mark.parametrize("edge", [31.1, None])
 def test_lists_begin_with_about_the_room_they_need(edge):
     _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)
-    terms = [term for term in engine.terms.values() if isinstance(term, PairForces)]
-    begun = [(term.pairs.entries.shape[1], term.sums.others.shape[1]) for term in terms]
+    begun = [(own.pairs.entries.shape[1], own.sums.others.shape[1]) for own in engine.room(state)]
     engine.evaluate(state)
-    terms = [term for term in engine.terms.values() if isinstance(term, PairForces)]
-    for (entries, others), term in zip(begun, terms, strict=True):
-        lanes = 4 * len(term.pairs.clusters.order) // len(term.pairs.clusters.origin)
-        needed = term.pairs.needed.max(axis=0) * (1, 1, 3 * lanes)
+    for (entries, others), own in zip(begun, engine.workspaces.values(), strict=True):
+        lanes = 4 * len(own.pairs.clusters.order) // len(own.pairs.clusters.origin)
+        needed = own.pairs.needed.max(axis=0) * (1, 1, 3 * lanes)
         assert needed[0] <= 1.1 * entries and entries < 1.6 * needed[0] + 16
         if edge:
             assert needed[2] <= 1.2 * others and others < 1.6 * needed[2] + 16
+
+
+CHANGED = {"squeezed": np.diag([0.99] * 3), "sheared": np.array([[1, 0, 0], [0.01, 1, 0], [-0.02, 0.01, 1]])}
+
+
+@pytest.mark.parametrize("change", CHANGED)
+@pytest.mark.parametrize("electrostatics", ["reaction_field", "ewald", "pme"])
+def test_everything_follows_a_cell_that_changes(electrostatics, change):
+    """Between two calls of `advance` the cell changes by a percent: all is as with an engine made for the new one."""
+    forces = {"cutoff_A": 6.0, "electrostatics": electrostatics, "tail_correction": True, "skin_A": 4.0}
+    system, engine, state = built({"spce": 60}, 14.0, 7, spread=0.1, forces=forces)
+    move(engine, state, SCHEMES["velocity_verlet"], 0.0005, 5)
+    state.position[:] = state.position @ CHANGED[change]
+    state.cell[:] = state.cell @ CHANGED[change]
+    engine.forget()
+    kept, fresh = observe(system, engine, state), observe(system, system.engine(), state)
+    assert kept.load.force == pytest.approx(fresh.load.force, abs=1e-11 * np.abs(fresh.load.force).max())
+    assert kept.virial == pytest.approx(fresh.virial, abs=1e-11 * np.abs(fresh.virial).max())
+    assert kept.components == pytest.approx(fresh.components, rel=1e-11)
+    assert kept.pressure == pytest.approx(fresh.pressure, rel=1e-9)
+    other = state.copy()
+    move(engine, state, SCHEMES["velocity_verlet"], 0.0005, 5)
+    move(system.engine(), other, SCHEMES["velocity_verlet"], 0.0005, 5)
+    assert state.position == pytest.approx(other.position, abs=1e-9)
+
+
+def test_a_cell_that_becomes_too_small_for_the_cut_off_stops_in_words():
+    _, engine, state = built({"argon": 100}, 14.0, 3, spread=0.1, forces={"cutoff_A": 6.9, "skin_A": 6.0})
+    engine.evaluate(state)
+    state.cell[:] *= 0.99
+    state.position[:] *= 0.99
+    engine.evaluate(state)  # a thinner skin serves
+    state.cell[:] *= 0.99
+    state.position[:] *= 0.99
+    with pytest.raises(SimulationError, match=r"the box has become too small for the cut-off of 6.9 Å: half its"):
+        engine.evaluate(state)
+
+
+@pytest.mark.parametrize("field", ["position", "velocity", "rotation", "step"])
+def test_code_is_not_run_on_arrays_that_it_was_not_compiled_for(field):
+    """Five argon atoms without forces and with `position` in Fortran's order once went astray without a word."""
+    system, _, state = built({"argon": 5} if field != "rotation" else {"spce": 5}, 40.0)
+    array = getattr(state, field)
+    strange = np.asfortranarray(array) if array.ndim > 1 else array.astype(np.int32)
+    engine = Engine(system.model, {})
+    with pytest.raises(TypeError, match=f"state.{field} must be a contiguous, writable array of"):
+        move(engine, state._replace(**{field: strange}), SCHEMES["velocity_verlet"], 0.01, 10)
+
+
+def test_an_address_is_held_to_the_type_it_was_compiled_for():
+    _, engine, state = built({"argon": 5}, 40.0)
+    engine.evaluate(state)
+    own = engine.workspaces["lennard_jones"]
+    sites = own.sites._replace(first=own.sites.first.astype(np.int64))
+    with pytest.raises(TypingError, match="find was compiled for parcel"):
+        add_term(own._replace(sites=sites), state, no_load(state), None)
 
 
 def test_the_list_is_rebuilt_for_moves_and_for_turns():
@@ -223,7 +277,7 @@ def test_the_list_is_rebuilt_for_moves_and_for_turns():
             state.position[:] += 0.2 * rng.standard_normal(state.position.shape)
         expected = sum(oracle.energy(state.position, state.rotation))
         assert sum(energies(engine, state).values()) == pytest.approx(expected, rel=1e-10)
-    builds = [term.pairs.counters[1] for term in engine.terms.values() if isinstance(term, PairForces)]
+    builds = [own.pairs.counters[BUILDS] for own in engine.workspaces.values()]
     assert min(builds) > 3
 
 

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import built, shaken, small_scene
+from conftest import built, move, shaken, small_scene
 from reference import Oracle
 
 from rigidmd.build.system import build
-from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SceneError
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import nearest_rotation
@@ -88,8 +86,8 @@ def test_rigid_bodies_among_frozen_atoms_follow_lammps(reference, case):
         if not scene.molecules[b].frozen:
             state.velocity[own] = m @ v / m.sum()
             state.angular_momentum_body[own] = q.T @ np.cross(x - centre, m[:, None] * v).sum(axis=0)
-    engine = Engine(system.model, system.terms)
-    engine.advance(state, scene.stages[0].scheme, 0.00025, 8, NoThermostat())
+    engine = system.engine()
+    move(engine, state, scene.stages[0].scheme, 0.00025, 8)
     file = folder / f"fix-timestep-rigid_nve_{case}.yaml"
     found, speeds = system.site_positions(state), system.site_velocities(state)
     first = np.concatenate([np.flatnonzero(system.sites.molecule == 8 * b) for b in range(len(bodies))])
@@ -117,7 +115,7 @@ def test_frozen_molecules_do_not_count_and_do_not_move(slit):
     assert system.freedom == (60, 60)
     state = system.state.copy()
     engine.forget()
-    engine.advance(state, VERLET, 0.0002, 100, NoThermostat())
+    move(engine, state, VERLET, 0.0002, 100)
     assert (state.position[20:] == system.state.position[20:]).all()
     assert (state.rotation[20:] == system.state.rotation[20:]).all()
     assert not state.velocity[20:].any()

@@ -10,14 +10,13 @@ import sys
 import numba
 import numpy as np
 import pytest
-from conftest import ROOT, built, small_scene
+from conftest import ROOT, built, move, small_scene
 from numba import types
 
 from rigidmd.build.system import build
-from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.core.schemes import SCHEMES
 from rigidmd.forces import lanes, pairs
+from rigidmd.forces.neighbors import BUILDS
 from rigidmd.jit import SIMD_BITS, Parcel, kernel
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
@@ -66,8 +65,8 @@ def test_the_pair_loops_of_water_are_vectorised(precision):
     _, engine, state = built({"spce": 30}, 20.0, forces=W1, precision=precision)
     engine.evaluate(state)
     kind = {"double": "double", "mixed": "float"}[precision]
-    for term in engine.terms.values():
-        parcel = Parcel(numba.typeof((term.arranged, term.pairs, term.sums)))
+    for own in engine.workspaces.values():
+        parcel = Parcel(numba.typeof((own.arranged, own.pairs, own.sums)))
         fresh = numba.cfunc(types.void(parcel, types.intp), **pairs._forces.options)(pairs._forces.function)
         vector = f"<{SIMD_BITS // (64 if kind == 'double' else 32)} x {kind}>"
         code = fresh.inspect_llvm()
@@ -185,15 +184,15 @@ def all_pairs(system, state):
 def test_no_pair_is_missed_in_a_long_run():
     """Wherever the list stands in its life: forces are those of a list built then and there, energies of all pairs."""
     system = build(small_scene({"spce": 400}, 23.0, forces=W1, start={"temperature_K": 600.0}))
-    engine, state = Engine(system.model, system.terms), system.state.copy()
+    engine, state = system.engine(), system.state.copy()
     for round in range(60):
-        engine.advance(state, SCHEMES["velocity_verlet"], 0.001, 7, NoThermostat(), 7 * round)
+        move(engine, state, SCHEMES["velocity_verlet"], 0.001, 7)
         load, tallies = engine.evaluate(state)
-        fresh, _ = Engine(system.model, system.terms).evaluate(state)
+        fresh, _ = system.engine().evaluate(state)
         assert load.force == pytest.approx(fresh.force, abs=1e-11 * np.abs(fresh.force).max())
         if round % 15 == 14:
             assert sum(t.energy for t in tallies.values()) == pytest.approx(all_pairs(system, state), rel=1e-11)
-    assert min(term.pairs.counters[1] for term in engine.terms.values()) > 5
+    assert min(own.pairs.counters[BUILDS] for own in engine.workspaces.values()) > 5
 
 
 @pytest.mark.skipif(SIMD_BITS == 128, reason="this is what all tests run with here")

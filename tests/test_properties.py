@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
-from rigidmd.forces.terms import State
 from rigidmd.jit import kernel
 from rigidmd.mechanics.inertia import inertia_tensor, principal_frame
 from rigidmd.mechanics.rotation import (

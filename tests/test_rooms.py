@@ -9,7 +9,7 @@ PACKAGE = ROOT / "rigidmd"
 
 # In this order: a room may import from those above it and from itself.
 ROOMS = [
-    ("errors", "units", "jit", "validation"),
+    ("errors", "units", "core", "jit", "validation"),
     ("mechanics",),
     ("forces",),
     ("dynamics",),
@@ -24,7 +24,6 @@ ROOMS = [
 ]
 RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 
-# schemes is a table of numbers that scenes name; it holds no code that knows of forces
 LIBRARIES = {
     "ase": {"build/structure_files.py", "build/matching.py", "build/cells.py"},
     "MDAnalysis": {"output/trajectory.py"},
@@ -33,8 +32,8 @@ LIBRARIES = {
     "matplotlib": {"output/report.py", "output/body_figures.py", "output/precision_report.py", "output/stability_report.py", "output/molecule_figure.py"},
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/body.py", "scene/actions.py"},
     "numba": {
-        "jit.py", "forces/terms.py", "forces/sites.py", "forces/pairs.py", "forces/neighbors.py", "forces/lanes.py",
-        "forces/clusters.py", "dynamics/advance.py",
+        "jit.py", "forces/terms.py", "forces/sites.py", "forces/neighbors.py", "forces/lanes.py",
+        "forces/clusters.py",
         "simulation/molecules.py", "measure/summary.py", "measure/body_summary.py",  # number of threads, version
     },
 }  # fmt: skip
@@ -98,6 +97,11 @@ def test_what_is_compiled_counts_in_the_digest_that_names_the_cache():
             assert not strange, f"{path} is compiled and imports {strange}"
         else:
             assert "rigidmd.jit" not in ours, f"{path} compiles"
+
+
+def test_core_compiles_nothing():
+    for path in (PACKAGE / "core").rglob("*.py"):
+        assert not {"numba", "rigidmd.jit"} & set(imports(path)), path
 
 
 def test_no_room_is_unknown():

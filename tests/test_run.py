@@ -16,7 +16,7 @@ from conftest import MOLECULES, ROOT, small_scene
 import rigidmd
 from rigidmd.build.system import build
 from rigidmd.cli import main
-from rigidmd.forces.terms import State
+from rigidmd.core.state import State
 from rigidmd.output.log import COLUMNS
 from rigidmd.output.report import summary_text
 from rigidmd.scene import Scene

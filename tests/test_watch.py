@@ -11,9 +11,10 @@ from conftest import BODIES, ROOT, small_scene
 
 from rigidmd.build.system import build
 from rigidmd.cli import main
+from rigidmd.core.schemes import KICK, SCHEMES
+from rigidmd.core.state import NOW
+from rigidmd.dynamics.baths import kinetic_energy
 from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import kinetic_energy
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.stable_step import DIRECTIONS, stable_angle, stiffest
@@ -132,7 +133,7 @@ def test_q_that_is_no_rotation():
 @pytest.mark.parametrize("name", ["force", "torque_body"])
 def test_a_load_that_is_no_number(name):
     system = build(water(2.0))
-    load, _ = Engine(system.model, system.terms).evaluate(system.state)
+    load, _ = system.engine().evaluate(system.state)
     getattr(load, name)[5, 1] = np.nan
     found = watch.step_finding(system, system.scene.watch, system.state, load, SCHEMES["velocity_verlet"], 0.002, 250.0)
     assert str(found) == f"the {name.removesuffix('_body')} on molecule 6 (spce) is no finite number"
@@ -209,9 +210,9 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluate, advance = Engine.evaluate, Engine.advance
     monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state))
 
-    def counted(self, state, scheme, dt, steps, thermostat, done=0):
-        loads.append(steps)
-        return advance(self, state, scheme, dt, steps, thermostat, done)
+    def counted(self, state, scheme, dt, until):
+        loads.append(until - state.step[NOW])
+        return advance(self, state, scheme, dt, until)
 
     monkeypatch.setattr(Engine, "advance", counted)
     ends, costs = [], []
@@ -248,11 +249,11 @@ def test_how_far_each_scheme_follows_an_oscillator(name):
         largest = 0.0
         for x, v in ((1.0, 0.0), (0.0, angle)):
             for _ in range(steps):
-                for k, kick in enumerate(scheme.kicks):
-                    tau = scheme.gradients[k] if scheme.gradients else 0.0
-                    v -= kick * angle**2 * x * (1 - tau * angle**2)
-                    if k < len(scheme.drifts):
-                        x += scheme.drifts[k] * v
+                for flow in scheme.flows:
+                    if flow.kind == KICK:
+                        v -= flow.fraction * angle**2 * x * (1 - flow.gradient * angle**2)
+                    else:
+                        x += flow.fraction * v
                 largest = max(largest, abs(x))
         return largest
 

@@ -9,16 +9,16 @@ import numpy as np
 from rigidmd.build.body_faults import order_faults, unfit, unresisted
 from rigidmd.build.body_parts import carried_fluid, frame_of, inertia_of, principal, resistance_of, rotor_of, terms_of
 from rigidmd.build.system import Sites
+from rigidmd.core.schemes import SCHEMES, Scheme
+from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.engine import Engine
 from rigidmd.dynamics.odes import SOLVERS, OdeEngine, Solver
-from rigidmd.dynamics.schemes import SCHEMES, Scheme
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.fields import Told
 from rigidmd.forces.frame import Inertial
 from rigidmd.forces.resistance import NoResistance
 from rigidmd.forces.space import Unbounded
-from rigidmd.forces.terms import State
 from rigidmd.mechanics.course import Course, during, value_at
 from rigidmd.mechanics.flight import Free, Immersed, Pinned
 from rigidmd.mechanics.inertia import Kind, kind_of_body
@@ -97,7 +97,7 @@ class BodySystem:
     def engine(self) -> Engine:
         """A new engine for it at time 0, which calls the Python functions that apply forces."""
         kind = OdeEngine if self.scene.run.integrator in SOLVERS else Engine
-        return kind(*self.during(0.0), {name: self._asker(f) for name, f in self.applied.items()})
+        return kind(*self.during(0.0), applied={name: self._asker(f) for name, f in self.applied.items()})
 
     def breaks(self) -> list[float]:
         """Times within the run at which something that follows time as told jumps or bends."""
@@ -247,7 +247,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     body = Body(flight, rotor, frame, resistance_of(scene))
     applied = applied or {}
     terms = terms_of(scene, mass, axes, centre, displaced)
-    terms |= {name: Told(np.zeros(1, np.int64), np.zeros(3), np.zeros(3)) for name in applied}
+    terms |= {name: Told() for name in applied}
     system = BodySystem(
         scene=scene,
         body=body,
@@ -299,7 +299,7 @@ def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> Sta
         if isinstance(body.flight, Immersed):
             share = body.flight.inertial_mass / body.flight.mass
             velocity = (own_rotation @ (share * (own_rotation.T @ velocity[0])))[None]
-    return State(position, velocity, rotation, momentum, time, np.zeros(1))
+    return state_of(position, velocity, rotation, momentum)
 
 
 def _left_out(system: BodySystem) -> list[str]:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from rigidmd.build.body_parts import frame_of, resistance_of
+from rigidmd.core.schemes import SCHEMES
 from rigidmd.dynamics.odes import SOLVERS
-from rigidmd.dynamics.schemes import SCHEMES
 from rigidmd.forces.frame import Turning
 from rigidmd.forces.resistance import NoResistance
 from rigidmd.mechanics.course import keeps_direction
@@ -116,8 +116,8 @@ def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[
             f"run: {run.integrator} takes steps back in time, which a resistance does not allow: use one of "
             f"{', '.join(forward)}"
         ]
-    if scheme.gradients and (braked or scene.applied or has_functions):
-        plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.gradients]
+    if scheme.has_gradient and (braked or scene.applied or has_functions):
+        plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient]
         return [
             f"run: {run.integrator} asks for the gradient of the forces, which resistance and applied forces do not "
             f"have; use one of {', '.join(plain)}"

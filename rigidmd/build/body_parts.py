@@ -185,4 +185,4 @@ def _force(force: Course, torque: Course, point: np.ndarray, follows_body: bool)
     """A force that never changes in the lab has an energy; any other keeps an account of its work."""
     if not follows_body and is_steady(force) and is_steady(torque) and not torque.constant.any():
         return SteadyForce(force.constant[0], point)
-    return Drive(force, torque, point, follows_body, np.zeros(3), np.zeros(3))
+    return Drive(force, torque, point, follows_body)

@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.build.body import BodySystem, build_body
 from rigidmd.build.cells import angles_deg, right_angled
 from rigidmd.build.system import System, build
+from rigidmd.core.schemes import Scheme
 from rigidmd.dynamics.odes import Solver
-from rigidmd.dynamics.schemes import Scheme
 from rigidmd.forces.pairs import PairForces
 from rigidmd.forces.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
@@ -110,7 +110,7 @@ def _term(system: System, name: str, term: NamedTuple) -> str:
     reach = f"cut-off {system.cutoff:g} Å" if system.cutoff < inf else "no cut-off"
     if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
         reach += f", {system.scene.forces.truncation}"
-    return f"{len(term.pairs.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
+    return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
 
 
 def _stage(stage: Stage) -> str:
@@ -130,7 +130,7 @@ def array_bytes(value) -> int:
     """Bytes of all arrays in nested tuples, each array once."""
     if isinstance(value, System):
         # The state four times: the start, the one that moves, the last good one, forces and torques.
-        fixed = (tuple(value.terms.values()), value.model, value.sites)
+        fixed = (value.engine().room(value.state), value.model, value.sites)
         return 4 * array_bytes(value.state) + array_bytes(fixed)
     return sum({id(array): array.nbytes for array in _arrays(value)}.values())
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces import ewald
 from rigidmd.forces.coulomb import reaction_field, self_energy
@@ -24,7 +25,6 @@ from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.screened import damped_self_energy, damped_shifted_force, screened_coulomb
 from rigidmd.forces.sites import BodySites, CentralSites
 from rigidmd.forces.space import Space, cell_of
-from rigidmd.forces.terms import State
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import COULOMB, KJ_PER_MOL
@@ -79,7 +79,7 @@ def electrostatics(
     forces = scene.forces
 
     def between_pairs(law: NamedTuple) -> NamedTuple:
-        return pair_forces(law, space, charged.sites, forces.skin_A, scene.precision, charged.group)
+        return pair_forces(law, charged.sites, charged.group)
 
     charge = charged.charge_e
     if forces.electrostatics == "reaction_field":
@@ -187,14 +187,13 @@ def _ewald(
         charged.charge_e, cutoff, alpha, forces.truncation != "plain", FIT_SHARE * settings.real_error
     )
     if settings.grid is None:
-        over = ewald.ewald_sum(charge, alpha, space, charged.sites, settings.waves)
+        over = ewald.EwaldSum(alpha, charge, charged.sites, settings.waves)
         most = " ".join(map(str, settings.waves.most))
         how = f"{settings.waves.total} waves, |n| up to {most}"
     else:
-        from rigidmd.forces.pme import pme  # rocket-fft is for scenes with PME only
+        from rigidmd.forces.pme import Pme  # rocket-fft is for scenes with PME only
 
-        dtype = np.float64 if scene.precision == "double" else np.float32
-        over = pme(charge, alpha, space, charged.sites, settings.grid, settings.order, dtype)
+        over = Pme(alpha, charge, charged.sites, settings.grid, settings.order)
         how = f"grid {' x '.join(map(str, settings.grid))}, splines of order {settings.order}"
     terms = {"coulomb_real": between_pairs(law), "coulomb_reciprocal": over}
     constants = {
@@ -214,7 +213,7 @@ def _ewald(
     net, net_still = charge.sum(), charge[still].sum()
     neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
     if not neutral:
-        terms["coulomb_background"] = ewald.background(net**2 - net_still**2, alpha, space)
+        terms["coulomb_background"] = ewald.background(net**2 - net_still**2, alpha)
         notes.append(
             f"the box has a net charge of {charged.charge_e.sum():+.6g} e; an even background of the opposite charge "
             "makes it neutral, and energies and pressure depend on the size of the box"
@@ -223,7 +222,7 @@ def _ewald(
         if not neutral:
             fault = "forces.ewald_surface_permittivity: a box with a net charge has no dipole of its own; leave it out"
             raise SceneError(scene.source, [fault])
-        terms["coulomb_surface"] = ewald.surface_dipole(charge, permittivity, space, charged.sites)
+        terms["coulomb_surface"] = ewald.surface_dipole(charge, permittivity, charged.sites)
     pressure = 0.0
     if still.any():
         constants["coulomb_frozen"], pressure = _of_frozen(

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
-from rigidmd.forces.terms import State
 from rigidmd.units import BOLTZMANN
 
 #: Total momentum below this fraction of the sum of |m v| is rounding, not motion.

@@ -7,8 +7,8 @@ import numpy as np
 
 from rigidmd.build.cells import pairs_within
 from rigidmd.build.momenta import mobile
+from rigidmd.core.state import State
 from rigidmd.forces.space import cell_of
-from rigidmd.forces.terms import State
 
 if TYPE_CHECKING:
     from rigidmd.build.system import System

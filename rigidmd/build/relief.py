@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.momenta import mobile
+from rigidmd.core.state import Load, State
 from rigidmd.dynamics.advance import Model
 from rigidmd.dynamics.engine import Engine
-from rigidmd.forces.terms import Load, State
 from rigidmd.mechanics.rotation import from_vector
 
 MOST_STEPS = 2000

@@ -14,13 +14,15 @@ from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, rem
 from rigidmd.build.overlaps import overlaps
 from rigidmd.build.structure import Arrangement, read_structure
 from rigidmd.build.structure_files import read_geometry
+from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.advance import Model
+from rigidmd.dynamics.engine import Engine
+from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.errors import Faults, SceneError, StructureError
-from rigidmd.forces.lennard_jones import lennard_jones, tail
+from rigidmd.forces.lennard_jones import Tail, lennard_jones, tail
 from rigidmd.forces.pairs import pair_forces
 from rigidmd.forces.sites import BodySites, CentralSites
 from rigidmd.forces.space import Space, Triclinic, space_of, wrap
-from rigidmd.forces.terms import State
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
 from rigidmd.molecules import (
@@ -39,9 +41,6 @@ from rigidmd.scene.molecules import Molecules
 from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 DEFAULT_CUTOFF = 9.0  # Å
-
-# Each random purpose has its own stream, so that one more draw here changes nothing there.
-STREAM_LATTICE, STREAM_MOMENTA = 1, 2
 
 
 class Sites(NamedTuple):
@@ -66,7 +65,8 @@ class System:
     terms: dict[str, NamedTuple]
     freedom: Freedom
     constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
-    tail_pressure: float  # u/(Å ps²), all that no motion changes
+    constant_pressure: float  # u/(Å ps²), that no motion changes
+    tail: Tail | None  # what is missing beyond the cut-off, where it is asked for
     sites: Sites
     from_lattice: bool
     cutoff: float  # Å
@@ -90,6 +90,10 @@ class System:
         """What each molecule (n,) is called in topology files."""
         return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
 
+    def engine(self) -> Engine:
+        """A new engine for it, in the precision of the scene."""
+        return Engine(self.model, self.terms, self.scene.precision, self.scene.forces.skin_A)
+
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """What `of` gives for the sites of a molecule, for all sites (s,)."""
         values = [of(m) for m in self.species]
@@ -97,7 +101,7 @@ class System:
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
-        centre = wrap(self.space, state.position) if wrapped else state.position
+        centre = wrap(space_of(state.cell), state.position) if wrapped else state.position
         return centre[self.sites.molecule] + self._arms(state)
 
     def site_velocities(self, state: State) -> np.ndarray:
@@ -127,15 +131,10 @@ def build(scene: MolecularScene) -> System:
     model = _model(species, arrangement.species, frozen)
     turning = any(m.inertia.any() for m in species)
     n = len(arrangement.species)
-    state = State(
-        np.ascontiguousarray(arrangement.position, dtype=float),
-        np.zeros((n, 3)),
-        np.ascontiguousarray(arrangement.rotation) if turning else np.zeros((0, 3, 3)),
-        np.zeros((n if turning else 0, 3)),
-        np.zeros(1),
-        np.zeros(1),
+    state = state_of(
+        position=arrangement.position, rotation=arrangement.rotation if turning else None, cell=arrangement.cell
     )
-    terms, constants, tail_pressure, charges = _terms(scene, species, model, space, cutoff, state)
+    terms, constants, pressure, beyond, charges = _terms(scene, species, model, space, cutoff, state)
     system = System(
         scene=scene,
         species=species,
@@ -145,7 +144,8 @@ def build(scene: MolecularScene) -> System:
         terms=terms,
         freedom=freedom_of(model),
         constants=constants,
-        tail_pressure=tail_pressure,
+        constant_pressure=pressure,
+        tail=beyond,
         sites=_sites(species, arrangement.species),
         from_lattice=scene.structure is None,
         cutoff=cutoff,
@@ -247,7 +247,7 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     cell = scene.box.cell
     if cell is None:
         cell = np.eye(3) * np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))
-    rng = np.random.default_rng([scene.seed, STREAM_LATTICE])
+    rng = np.random.default_rng([scene.seed, LATTICE])
     n = sum(counts)
     return Arrangement(
         species=np.repeat(np.arange(len(species)), counts),
@@ -364,13 +364,13 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
 
 def _terms(
     scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float, state: State
-) -> tuple[dict[str, NamedTuple], dict[str, float], float, Electrostatics | None]:
-    """Terms by name, constant energies by name, tail pressure, what charges are."""
+) -> tuple[dict[str, NamedTuple], dict[str, float], float, Tail | None, Electrostatics | None]:
+    """Terms by name, constant energies by name, constant pressure, what is beyond the cut-off, what charges are."""
     forces = scene.forces
     index = model.species
     usual = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
     start = forces.switch_start_A or usual
-    terms, constants, tail_pressure = {}, {}, 0.0
+    terms, constants, pressure, beyond = {}, {}, 0.0, None
     named = _named_pairs(scene, species)
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
     frozen = model.inverse_mass == 0
@@ -394,11 +394,9 @@ def _terms(
         if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
             raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
         sites = _taking_part(species, index, chosen)
-        terms["lennard_jones"] = pair_forces(
-            law, space, sites, forces.skin_A, scene.precision, _groups(sites, frozen[index])
-        )
+        terms["lennard_jones"] = pair_forces(law, sites, _groups(sites, frozen[index]))
         if forces.tail_correction:
-            constants["lennard_jones_tail"], tail_pressure = tail(law, space.volume)
+            beyond = tail(law)
     found = None
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if forces.electrostatics != "none" and any(len(c) for c in chosen):
@@ -407,8 +405,8 @@ def _terms(
         found = electrostatics(scene, charged, space, cutoff, start, state)
         terms |= found.terms
         constants |= found.constants
-        tail_pressure += found.pressure
-    return terms, constants, tail_pressure, found
+        pressure += found.pressure
+    return terms, constants, pressure, beyond, found
 
 
 def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
@@ -449,4 +447,4 @@ def _set_momenta(system: System, arrangement: Arrangement) -> None:
     temperature = scene.start.temperature_K
     if temperature is None:
         temperature = scene.stages[0].temperature_K
-    draw_momenta(system.model, state, temperature, np.random.default_rng([scene.seed, STREAM_MOMENTA]))
+    draw_momenta(system.model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))

@@ -1,23 +1,21 @@
-"""The compiled loop: n steps of any scheme, any terms, any thermostat."""
+"""The compiled loop: n steps of any row of flows, any terms, any bath."""
 
 from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.schemes import DRIFT, KICK, Scheme
+from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN
+from rigidmd.dynamics.baths import apply
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
-from rigidmd.dynamics.thermostats import apply
 from rigidmd.forces.sites import SERIAL
-from rigidmd.forces.terms import EXAMPLE, OK, load_bodies
-from rigidmd.jit import BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.forces.terms import load_bodies
+from rigidmd.jit import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
-
-class Parts(NamedTuple):
-    """Addresses of the works that move molecules; 0 until they are needed."""
-
-    kick: int = 0
-    drift: int = 0
+#: Random numbers that a flow may draw for one molecule in a step.
+DRAWS = 1 << 20
 
 
 class Model(NamedTuple):
@@ -29,104 +27,112 @@ class Model(NamedTuple):
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
-    parts: Parts = Parts()
-
-    def with_code(self) -> "Model":
-        """The model with the machine code that moves its molecules."""
-        state, load = EXAMPLE
-        kicked = (self.species, self.inverse_mass, self.inverse_inertia, state, load, 0.0)
-        return self._replace(parts=Parts(_kick.address(kicked), _drift.address((self.rotor, self.species, state, 0.0))))
 
 
-class Progress(NamedTuple):
-    """How far `advance` has come, so that it can stop for more memory and go on at the same place."""
+def code_of(model: NamedTuple) -> Code | None:
+    """The machine code that moves molecules; None of a single body, whose flows are compiled into the loop."""
+    if not isinstance(model, Model):
+        return None
+    state, load = EXAMPLE
+    kicked = (model.species, model.inverse_mass, model.inverse_inertia, state, load, 0.0)
+    return Code(kick=(_kick, kicked), drift=(_drift, (model.rotor, model.species, state, 0.0)))
 
-    cursor: np.ndarray  # (3,) steps done; stages done in this step; whether `load` is that of the present positions (1)
-    # or that with the gradient (2)
+
+class Row(NamedTuple):
+    """The flows of a scheme as arrays, in their order."""
+
+    kind: np.ndarray  # (flows,) KICK, DRIFT or BATH
+    fraction: np.ndarray  # (flows,) of the time step
+    moment: np.ndarray  # (flows,) of the time step: when each ends, as drifts count
+    gradient: np.ndarray | None  # (flows,) of dt²; None where no kick has one, and none is compiled
 
 
-def new_progress(steps: int, fresh: bool) -> Progress:
-    """At the beginning of a step; steps taken since the origin of time, whether the load is known."""
-    return Progress(np.array([steps, 0, fresh], np.int64))
+def row_of(scheme: Scheme) -> Row:
+    """The flows of a scheme."""
+    kind = np.array([flow.kind for flow in scheme.flows])
+    fraction = np.array([flow.fraction for flow in scheme.flows])
+    moment = np.cumsum(np.where(kind == DRIFT, fraction, 0.0))
+    moment[np.flatnonzero(kind == DRIFT)[-1] :] = 1.0
+    gradient = np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None
+    return Row(kind, fraction, moment, gradient)
 
 
 @kernel(outer=True)
-def advance(model, state, load, terms, thermostat, scheme, probe, dt, origin, steps, progress):
-    """Step until `steps` steps of dt have been taken since time `origin`, counted in progress.cursor[0].
+def advance(model, code, state, load, terms, bath, row, probe, dt, until, cursor):
+    """Step until `until` steps of dt have been taken, counted in state.step.
 
-    scheme : kicks, drifts, the moments (fractions of dt) at which the kicks act, and their gradients (fractions of
-    dt²). probe : room for gradients; None compiles none.
+    code : see `code_of`. terms : workspaces. probe : room for gradients; None compiles none. cursor (2,) : flows done
+    in this step; whether `load` is that of the present positions (1) or that with the gradient (2).
 
-    The scheme is walked as kick, drift, kick, ..., kick; forces are evaluated before a kick where positions have
-    changed since, so the last evaluation of a step serves the next one. A status code: when it is not OK, state and
-    progress are such that calling again continues without a trace.
+    Forces are evaluated before a kick where positions have changed since, so the last evaluation of a step serves the
+    next one. A status code: when it is not OK, state and cursor are such that calling again continues without a trace.
     """
-    kicks, drifts, moments, gradients = scheme
-    cursor = progress.cursor
-    while cursor[0] < steps:
-        while cursor[1] < len(kicks):
-            k = cursor[1]
-            if kicks[k] != 0.0:
+    while state.step[NOW] < until:
+        while cursor[0] < len(row.kind):
+            k = cursor[0]
+            h = row.fraction[k] * dt
+            if row.kind[k] == KICK:
                 if probe is None:
-                    if cursor[2] == 0:
+                    if cursor[1] == 0:
                         status = load_bodies(terms, state, load)
                         if status != OK:
                             return status
-                        cursor[2] = 1
+                        cursor[1] = 1
                 else:
-                    while cursor[2] < (1 if gradients[k] == 0.0 else 2):
-                        status = evaluate(model, state, load, terms, probe, gradients[k] * dt * dt, cursor[2] == 1)
+                    while cursor[1] < (1 if row.gradient[k] == 0.0 else 2):
+                        status = evaluate(model, state, load, terms, probe, row.gradient[k] * dt * dt, cursor[1] == 1)
                         if status != OK:
                             return status
-                        cursor[2] += 1
-                pay(model, terms, state, 0.5 * kicks[k] * dt)
-                kick(model, state, load, kicks[k] * dt)
-                pay(model, terms, state, 0.5 * kicks[k] * dt)
-            if k < len(drifts):
-                drift(model, state, drifts[k] * dt)
-                state.time[0] = origin + (cursor[0] + moments[k + 1]) * dt
-                cursor[2] = 0
-            cursor[1] += 1
-        apply(thermostat, model, state, dt)
-        cursor[1] = 0
-        cursor[0] += 1
+                        cursor[1] += 1
+                pay(model, terms, state, 0.5 * h)
+                kick(model, code, state, load, h)
+                pay(model, terms, state, 0.5 * h)
+            elif row.kind[k] == DRIFT:
+                drift(model, code, state, h)
+                state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + row.moment[k]) * dt
+                cursor[1] = 0
+            else:
+                apply(bath, model, state, h, DRAWS * k)
+            cursor[0] += 1
+        cursor[0] = 0
+        state.step[NOW] += 1
     return OK
 
 
-def kick(model, state, load, h):
+def kick(model, code, state, load, h):
     """Exact flow of the potential, in place: V += h F/m, L += h n_body."""
     raise TypeError("compiled code only")
 
 
-def drift(model, state, h):
+def drift(model, code, state, h):
     """Flow of the kinetic energy, in place: free flight and free rotation."""
     raise TypeError("compiled code only")
 
 
 def pay(model, terms, state, h):
-    """Add to `state.work` what driving terms do at the present velocity over h; half before a kick, half after."""
+    """Add to the books what driving terms do at the present velocity over h; half before a kick, half after."""
     raise TypeError("compiled code only")
 
 
 @implements(kick)
-def _kick_molecules(model, state, load, h):
+def _kick_molecules(model, code, state, load, h):
     if not is_a(model, Model):
         return None
 
-    def kick_molecules(model, state, load, h):
+    def kick_molecules(model, code, state, load, h):
         parcel = packed((model.species, model.inverse_mass, model.inverse_inertia, state, load, h))
-        call_blocks(model.parts.kick, parcel, _blocks(state))
+        call_blocks(code, "kick", parcel, _blocks(state))
 
     return kick_molecules
 
 
 @implements(drift)
-def _drift_molecules(model, state, h):
+def _drift_molecules(model, code, state, h):
     if not is_a(model, Model):
         return None
 
-    def drift_molecules(model, state, h):
-        call_blocks(model.parts.drift, packed((model.rotor, model.species, state, h)), _blocks(state))
+    def drift_molecules(model, code, state, h):
+        call_blocks(code, "drift", packed((model.rotor, model.species, state, h)), _blocks(state))
 
     return drift_molecules
 
@@ -183,7 +189,7 @@ def _groups_of(state, block):
     return GROUP * (groups * block // blocks), min(n, GROUP * (groups * (block + 1) // blocks))
 
 
-@work()
+@task()
 def _kick(parcel, block):
     species, inverse_mass, inverse_inertia, state, load, h = opened(parcel)
     first, end = _groups_of(state, block)
@@ -198,7 +204,7 @@ def _kick(parcel, block):
                     state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
 
 
-@work()
+@task()
 def _drift(parcel, block):
     rotor, species, state, h = opened(parcel)
     first, end = _groups_of(state, block)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from rigidmd.core.state import NOW, WORK
 from rigidmd.dynamics.advance import drift, kick, pay
 from rigidmd.dynamics.gradient import add_gyration, displace
 from rigidmd.forces.frame import Inertial, Turning, follow, frame_rate
@@ -22,20 +23,20 @@ class Body(NamedTuple):
 
 
 @implements(kick, inline=True)
-def _kick_body(model, state, load, h):
+def _kick_body(model, code, state, load, h):
     if is_a(model, Body):
-        return lambda model, state, load, h: push(
+        return lambda model, code, state, load, h: push(
             model.resistance, model.flight, model.rotor, model.frame, state, load, h
         )
 
 
 @implements(drift, inline=True)
-def _drift_body(model, state, h):
+def _drift_body(model, code, state, h):
     if not is_a(model, Body):
         return None
 
-    def drift_body(model, state, h):
-        time = state.time[0]
+    def drift_body(model, code, state, h):
+        time = state.time[NOW]
         carry(model.flight, model.rotor, state, time, h)
         follow(model.frame, state, time, h)
 
@@ -52,7 +53,7 @@ def _displace_body(model, state, load, tau):
             for i in range(3):
                 state.position[k, i] += tau / model.flight.mass * load.force[k, i]
         for k in range(len(load.torque_body)):
-            n, time = load.torque_body[k], state.time[0]
+            n, time = load.torque_body[k], state.time[NOW]
             turn_along(
                 state.rotation[k],
                 tau * moments(model.rotor, time, 0)[0] * n[0],
@@ -90,7 +91,7 @@ def _pay_body(model, terms, state, h):
 
     def pay_body(model, terms, state, h):
         velocity, omega = relative_motion(model, state)
-        state.work[0] += h * total_power(terms, state, velocity, omega)
+        state.books[WORK] += h * total_power(terms, state, velocity, omega)
 
     return pay_body
 
@@ -98,7 +99,7 @@ def _pay_body(model, terms, state, h):
 @kernel
 def relative_motion(model, state):
     """(velocity along the lab's, omega along the body's axes) relative to the frame, as tuples; else 0."""
-    W = frame_rate(model.frame, state.time[0])
+    W = frame_rate(model.frame, state.time[NOW])
     velocity = (0.0, 0.0, 0.0)
     omega = (0.0, 0.0, 0.0)
     if len(state.position):
@@ -123,9 +124,9 @@ def relative_motion(model, state):
     if len(state.rotation):
         q = state.rotation[0]
         L = state.angular_momentum_body[0]
-        i0, h0 = moments(model.rotor, state.time[0], 0)
-        i1, h1 = moments(model.rotor, state.time[0], 1)
-        i2, h2 = moments(model.rotor, state.time[0], 2)
+        i0, h0 = moments(model.rotor, state.time[NOW], 0)
+        i1, h1 = moments(model.rotor, state.time[NOW], 1)
+        i2, h2 = moments(model.rotor, state.time[NOW], 2)
         omega = (
             (L[0] - h0) * i0 - along(q, W, 0),
             (L[1] - h1) * i1 - along(q, W, 1),

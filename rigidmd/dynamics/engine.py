@@ -1,30 +1,36 @@
-"""The Python side of the compiled code: it gives kernels room when they ask for it and tells apart what they report."""
+"""The Python side of the compiled code: it owns lists, grids, sums and machine code, gives kernels room when they ask
+for it, and tells apart what they report."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rigidmd.dynamics.advance import Model, advance, new_progress
-from rigidmd.dynamics.body import Body
-from rigidmd.dynamics.gradient import Probe, probe_for
-from rigidmd.dynamics.schemes import Scheme
-from rigidmd.errors import SimulationError
-from rigidmd.forces.fields import answer
-from rigidmd.forces.terms import (
+from rigidmd.core.schemes import Scheme
+from rigidmd.core.state import (
     ASK,
+    CELL_CHANGED,
+    EXAMPLE,
     LIST_FULL,
     NOT_FINITE,
+    NOW,
+    ORIGIN,
     TALLY_SIZE,
     Load,
-    NoForce,
     State,
-    add_term,
     no_load,
-    with_own_work,
-    with_room,
 )
+from rigidmd.dynamics.advance import Model, advance, code_of, row_of
+from rigidmd.dynamics.baths import NoBath
+from rigidmd.dynamics.body import Body
+from rigidmd.dynamics.gradient import Probe, probe_for
+from rigidmd.errors import SimulationError
+from rigidmd.forces.fields import answer
+from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room, workspace_of
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
+
+Precision = Literal["double", "mixed"]
+DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
 class Tally(NamedTuple):
@@ -35,12 +41,14 @@ class Tally(NamedTuple):
 
 
 class Engine:
-    """A model, its terms and the work arrays to move a state.
+    """What moves states of a model under terms.
 
     Parameters
     ----------
     model : what never changes
     terms : name -> term, in the order in which forces are added
+    precision : arithmetic between sites; "mixed" is single, summed and moved in double
+    skin : extra radius of neighbour lists, Å; speed only
     applied : functions of (time, state) that terms of type `Told` stand for: name -> function
     """
 
@@ -48,59 +56,56 @@ class Engine:
         self,
         model: Model | Body,
         terms: dict[str, NamedTuple],
+        precision: Precision = "double",
+        skin: float = 1.6,
         applied: dict[str, Callable[[float, State], tuple]] | None = None,
     ):
         self.model = model
+        self.terms = terms
         self.names = list(terms)
-        # a list that another engine has left would have its pairs in another order, and sum other last bits
-        self._terms = tuple(with_own_work(term) for term in terms.values()) or (NoForce(),)
+        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin)
         self._applied = applied or {}
+        self._workspaces: tuple[NamedTuple, ...] | None = None
+        self._codes: dict = {}
         self.load: Load | None = None
         self._probe: Probe | None = None
         self._stale = True
 
     @property
-    def terms(self) -> dict[str, NamedTuple]:
-        """The terms by name, with the neighbour lists as they are now."""
-        return dict(zip(self.names, self._terms, strict=False))
+    def workspaces(self) -> dict[str, NamedTuple]:
+        """The workspaces by the names of their terms, as they are now; there are none before the first use."""
+        return dict(zip(self.names, self._workspaces or (), strict=False))
 
     def change(self, model: Model | Body, terms: dict[str, NamedTuple]) -> None:
         """Go on with others of the same types: what follows time as told enters its next piece."""
-        self.model = model
-        self._terms = tuple(terms.values()) or (NoForce(),)
+        self.model, self.terms = model, terms
+        self._workspaces = None
         self.forget()
 
     def forget(self) -> None:
         """Say that positions were changed from outside since the last step."""
         self._stale = True
 
-    def advance(
-        self, state: State, scheme: Scheme, dt: float, steps: int, thermostat: NamedTuple, done: int = 0
-    ) -> None:
-        """Move the state by `steps` steps of dt, in place. Raises SimulationError.
+    def begin(self, state: State, scheme: Scheme) -> State:
+        """A copy of a state with room for all that evolves when a scheme moves it."""
+        return state.copy()
 
-        done : steps taken since an origin of time, `done` times dt ago; a run in parts keeps the very times of a whole.
-        """
+    def advance(self, state: State, scheme: Scheme, dt: float, until: int) -> None:
+        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
+        self._prepare(state)
+        keep_time(state, dt)
         if self.load is None:
             self.load = no_load(state)
-        progress = new_progress(done, not self._stale)
-        origin = float(state.time[0]) if done == 0 else self._origin
-        self._origin = origin
-        rows = (
-            np.array(scheme.kicks),
-            np.array(scheme.drifts),
-            np.array([*np.cumsum((0.0, *scheme.drifts))[:-1], 1.0]),
-            np.array(scheme.gradients) if scheme.gradients else None,
-        )
-        if scheme.gradients and self._probe is None:
+        if scheme.has_gradient and self._probe is None:
             self._probe = probe_for(state)
-        probe = self._probe if scheme.gradients else None
+        probe = self._probe if scheme.has_gradient else None
         model = self.model_for(scheme)
-        if isinstance(model, Model):
-            model = model.with_code()
-        while status := advance(
-            model, state, self.load, self._terms, thermostat, rows, probe, dt, origin, done + steps, progress
-        ):
+        kind = type(model.rotor)
+        if kind not in self._codes:
+            self._codes[kind] = code_of(model)
+        code, bath, row = self._codes[kind], scheme.bath or NoBath(), row_of(scheme)
+        cursor = np.array([0, not self._stale], np.int64)
+        while status := advance(model, code, state, self.load, self._workspaces, bath, row, probe, dt, until, cursor):
             self._answer(status, state)
         self._stale = False
 
@@ -113,23 +118,51 @@ class Engine:
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
+        self._prepare(state)
         load = no_load(state)
         tallies = {}
         for k, name in enumerate(self.names):
             tally = np.zeros(TALLY_SIZE)
-            while status := add_term(self._terms[k], state, load, tally):
+            while status := add_term(self._workspaces[k], state, load, tally):
                 self._answer(status, state)
             tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
         return load, tallies
 
+    def room(self, state: State) -> tuple[NamedTuple, ...]:
+        """Workspaces for the cell of a state, new ones, without machine code: what they hold in memory."""
+        setup = self._setup._replace(cell=state.cell)
+        return tuple(workspace_of(term, setup) for term in self.terms.values()) or (NoForce(),)
+
+    def _prepare(self, state: State) -> None:
+        """Check what compiled code is to work on, and make its workspaces."""
+        _check_arrays(state)
+        if self._workspaces is None:
+            self._workspaces = tuple(with_code(workspace) for workspace in self.room(state))
+
     def _answer(self, status: int, state: State) -> None:
-        if status == LIST_FULL:
-            self._terms = tuple(with_room(term) for term in self._terms)
+        if status in (LIST_FULL, CELL_CHANGED):
+            self._workspaces = tuple(with_room(workspace, state.cell) for workspace in self._workspaces)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == ASK:
             for name, function in self._applied.items():
-                answer(self.terms[name], function, state)
+                answer(self.workspaces[name], function, state)
+
+
+def keep_time(state: State, dt: float) -> None:
+    """Begin a new stretch of equal steps, in place, where the last one was of others, or time was set from outside."""
+    if state.time[NOW] != state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt:
+        state.begin_stretch()
+
+
+def _check_arrays(state: State) -> None:
+    """Raise TypeError if an array of a state is not of the type that code is compiled for."""
+    for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
+        if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
+            raise TypeError(
+                f"state.{name} must be a contiguous, writable array of {example.dtype} in C order with "
+                f"{example.ndim} axes (core.state.state_of makes a state of any arrays)"
+            )
 
 
 class NotFiniteError(SimulationError):

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.terms import OK, Load, State, load_bodies, no_load
+from rigidmd.core.state import OK, Load, State, no_load
+from rigidmd.forces.terms import load_bodies
 from rigidmd.jit import kernel
 
 #: The difference is taken over this fraction of tau a. Over the whole of it, as others do (Wisdom, Holman & Touma

@@ -13,12 +13,13 @@ import numpy as np
 from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
+from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
 from rigidmd.dynamics.body import relative_motion
-from rigidmd.dynamics.engine import Engine
+from rigidmd.dynamics.engine import Engine, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.frame import frame_rate
 from rigidmd.forces.resistance import braking
-from rigidmd.forces.terms import OK, State, load_bodies, no_load, total_power
+from rigidmd.forces.terms import load_bodies, total_power
 from rigidmd.jit import kernel
 from rigidmd.mechanics.flight import along, inertial_mass
 from rigidmd.mechanics.odes import (
@@ -37,7 +38,7 @@ FORMULATIONS = {"matrix": Matrix(), "quaternion": Quaternion(), "euler_angles": 
 RK4, DOP853, RADAU = "rk4", "dop853", "radau"
 SOLVERS = (RK4, DOP853, RADAU)
 
-SINGULAR = 4  # beyond the codes of forces.terms: Euler angles too near theta = 0 or pi
+SINGULAR = 5  # beyond the codes of core.state: Euler angles too near theta = 0 or pi
 #: Half of the digits of phi and psi are gone there: theta itself has an error of 1e-16.
 SMALLEST_SINE = 1e-8
 #: Nearer than this, an axis that moves by its distance in a step may jump over the pole.
@@ -64,7 +65,7 @@ def moment_rates_of(rotor, time, k):
 def read(form, model, state, time, y):
     """The variables as a state, in place."""
     n = form.variables
-    state.time[0] = time
+    state.time[NOW] = time
     read_attitude(form, y, state.rotation)
     for m in range(len(state.angular_momentum_body)):
         for k in range(3):
@@ -75,7 +76,7 @@ def read(form, model, state, time, y):
         for k in range(3):
             state.position[m, k] = y[n + k]
             state.velocity[m, k] = y[n + 3 + k]
-    state.work[0] = y[-1]
+    state.books[WORK] = y[-1]
 
 
 @kernel(outer=True)
@@ -129,13 +130,13 @@ def singular(form, y, dy, dt):
 
 
 @kernel(outer=True)
-def rk4(form, model, terms, state, load, y, stages, dt, origin, steps, cursor):
-    """Classical Runge-Kutta until cursor[0] = steps; cursor[1]: stages done in a step; stages (5, variables)."""
+def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
+    """Classical Runge-Kutta until state.step is `until`; cursor (1,): stages done in a step; stages (5, variables)."""
     shift = (0.0, 0.5, 0.5, 1.0)
-    while cursor[0] < steps:
-        time = origin + cursor[0] * dt
-        while cursor[1] < 4:
-            k = cursor[1]
+    while state.step[NOW] < until:
+        time = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
+        while cursor[0] < 4:
+            k = cursor[0]
             for i in range(len(y)):
                 stages[4, i] = y[i] + shift[k] * dt * stages[max(k - 1, 0), i] if k else y[i]
             status = slopes(form, model, terms, state, load, time + shift[k] * dt, stages[4], stages[k])
@@ -143,113 +144,137 @@ def rk4(form, model, terms, state, load, y, stages, dt, origin, steps, cursor):
                 return status
             if k == 0 and singular(form, y, stages[0], dt):
                 return SINGULAR
-            cursor[1] += 1
+            cursor[0] += 1
         for i in range(len(y)):
             y[i] += dt / 6 * (stages[0, i] + 2 * stages[1, i] + 2 * stages[2, i] + stages[3, i])
-        cursor[1] = 0
-        cursor[0] += 1
+        cursor[0] = 0
+        state.step[NOW] += 1
     return OK
 
 
 class OdeEngine(Engine):
-    """An engine that moves a body by a general solver. The variables live here between calls; the state shows them."""
+    """An engine that moves a body by a general solver.
 
-    _y = _integrator = _between = None
+    The variables are in `state.bath`, which `begin` makes; the rest of the state shows them. Of DOP853 and Radau,
+    whose steps go beyond where they are asked to stop, it also has where the last step began and how long it was to
+    be: (time, length, variables there, variables now, sizes of all of them but the work). DOP853 goes on from that to
+    the bit; Radau up to its tolerance, because it also remembers a Jacobian.
+    """
+
+    _solver = _between = None
+    _anew = False  # whether what acts has changed, so that nothing of earlier steps is of use
     own_steps = 0  # that DOP853 or Radau has taken
 
     @property
     def evaluations(self) -> int:
         """Of the slopes, by DOP853 or Radau, since it last began."""
-        return self._integrator.nfev
+        return self._solver.nfev
 
-    def advance(
-        self, state: State, solver: Solver, dt: float, steps: int, thermostat: NamedTuple, done: int = 0
-    ) -> None:
-        """Move the state by `steps` steps of dt, in place. DOP853 and Radau choose their own steps in between.
-
-        Raises SimulationError.
-        """
-        form = FORMULATIONS[solver.formulation] if len(state.rotation) else NoAttitude()
-        if self._y is None:
-            self._y = self._variables(form, state)
-            self.load = no_load(state)
-        self._origin = float(state.time[0]) if done == 0 else self._origin
-        if solver.name == RK4:
-            self._rk4(form, state, dt, steps, done)
-        else:
-            self._adaptive(form, state, solver, self._origin + (done + steps) * dt)
-
-    def forget(self) -> None:
-        """As `Engine.forget`; the variables stay, the solver begins anew."""
-        self._integrator = self._between = None
-
-    def _variables(self, form: Form, state: State) -> np.ndarray:
+    def begin(self, state: State, solver: Solver) -> State:
+        """A copy of a state with the variables of a solver."""
         omega = []
         if len(state.rotation):
             for k in range(3):
-                inertia, _, carried, _ = moment_rates_of(self.model.rotor, state.time[0], k)
+                inertia, _, carried, _ = moment_rates_of(self.model.rotor, state.time[NOW], k)
                 omega.append((state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0)
         flight = [state.position.ravel(), state.velocity.ravel()]
-        return np.concatenate([variables_of(form, state.rotation), omega, *flight, state.work])
+        y = np.concatenate([variables_of(_form(solver, state), state.rotation), omega, *flight, state.books[[WORK]]])
+        if solver.name != RK4:
+            y = np.concatenate([[state.time[NOW], 0.0], y, y, self._sizes(solver, state, y)])
+        return state.copy()._replace(bath=y)
 
-    def _rk4(self, form: Form, state: State, dt: float, steps: int, done: int) -> None:
-        cursor, stages = np.array([done, 0]), np.zeros((5, len(self._y)))
-        while status := rk4(
-            form, self.model, self._terms, state, self.load, self._y, stages, dt, self._origin, done + steps, cursor
-        ):
+    def advance(self, state: State, solver: Solver, dt: float, until: int) -> None:
+        """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError."""
+        self._prepare(state)
+        keep_time(state, dt)
+        form = _form(solver, state)
+        if self.load is None:
+            self.load = no_load(state)
+        if solver.name == RK4:
+            self._rk4(form, state, dt, until)
+        else:
+            self._adaptive(form, state, solver, dt, until)
+
+    def forget(self) -> None:
+        """As `Engine.forget`; the variables stay, the solver begins anew."""
+        super().forget()
+        self._solver = self._between = None
+        self._anew = True
+
+    def _rk4(self, form: Form, state: State, dt: float, until: int) -> None:
+        y = state.bath
+        cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
+        while status := rk4(form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor):
             if status == SINGULAR:
-                raise SingularError(self._y[1], self._origin + cursor[0] * dt)
+                raise SingularError(y[1], state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt)
             self._answer(status, state)
-        read(form, self.model, state, self._origin + (done + steps) * dt, self._y)
+        read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
-    def _adaptive(self, form: Form, state: State, solver: Solver, end: float) -> None:
-        dy = np.zeros(len(self._y))
+    def _adaptive(self, form: Form, state: State, solver: Solver, dt: float, until: int) -> None:
+        variables = len(state.bath) // 3
+        begun, there, y, sizes = np.split(state.bath, [2, 2 + variables, 2 + 2 * variables])
+        end = state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt
+        if self._anew:
+            begun[:], there[:] = (state.time[NOW], 0.0), y
+            sizes[:] = self._sizes(solver, state, y)
+            self._anew = False
+        if self._solver is None:
+            if singular(form, there, there, 0.0):
+                raise SingularError(there[1], begun[0])
+            self._solver = self._new_solver(form, state, solver, begun, there, sizes)
+        running = self._solver
+        while running.t < end:
+            begun[:] = running.t, running.h_abs
+            there[:] = running.y
+            with np.errstate(all="ignore"):
+                problem = running.step()
+            self.own_steps += 1
+            if singular(form, running.y, running.y, 0.0):
+                raise SingularError(running.y[1], running.t)
+            if problem or not np.isfinite(running.y).all():
+                raise SimulationError(
+                    f"at t = {running.t:.6g}: {solver.name} finds no step that keeps its tolerances "
+                    f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
+                )
+            self._between = running.dense_output()
+        if self._between is not None:
+            y[:] = self._between(end)
+        state.step[NOW] = until
+        read(form, self.model, state, end, y)
+
+    def _new_solver(self, form: Form, state: State, solver: Solver, begun, there, sizes):
+        """SciPy's solver at the beginning of one of its steps; of a length that it chooses where none is known."""
+        dy = np.zeros(len(there))
 
         def rates(time, y):
-            while status := slopes(form, self.model, self._terms, state, self.load, time, y, dy):
+            while status := slopes(form, self.model, self._workspaces, state, self.load, time, y, dy):
                 self._answer(status, state)
             return dy.copy()
 
-        if self._integrator is None:
-            if singular(form, self._y, dy, 0.0):
-                raise SingularError(self._y[1], state.time[0])
-            kind = {DOP853: Dop853, RADAU: Radau}[solver.name]
-            absolute = solver.absolute_tolerance * self._sizes(form, state, solver.duration)
-            self._integrator = kind(
-                rates, state.time[0], self._y, np.inf, rtol=solver.relative_tolerance, atol=absolute
-            )
-        integrator = self._integrator
-        while integrator.t < end:
-            with np.errstate(all="ignore"):
-                problem = integrator.step()
-            self.own_steps += 1
-            if singular(form, integrator.y, dy, 0.0):
-                raise SingularError(integrator.y[1], integrator.t)
-            if problem or not np.isfinite(integrator.y).all():
-                raise SimulationError(
-                    f"at t = {integrator.t:.6g}: {solver.name} finds no step that keeps its tolerances "
-                    f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
-                )
-            self._between = integrator.dense_output()
-        if self._between is not None:
-            self._y = self._between(end)
-        read(form, self.model, state, end, self._y)
+        kind = {DOP853: Dop853, RADAU: Radau}[solver.name]
+        absolute = solver.absolute_tolerance * np.append(sizes, np.inf)
+        step = {"first_step": begun[1]} if begun[1] else {}
+        return kind(rates, begun[0], there.copy(), np.inf, rtol=solver.relative_tolerance, atol=absolute, **step)
 
-    def _sizes(self, form: Form, state: State, duration: float) -> np.ndarray:
-        """Sizes of the variables, from the start and from what its forces do in the time of the run."""
+    def _sizes(self, solver: Solver, state: State, y: np.ndarray) -> np.ndarray:
+        """Sizes of the variables but the work, from where they are and from what forces do in the time of the run."""
         load, _ = self.evaluate(state)
-        attitude = np.ones(form.variables)
-        parts = [attitude]
+        form, duration = _form(solver, state), solver.duration
+        parts = [np.ones(form.variables)]
         if len(state.rotation):
-            inertia = max(moment_rates_of(self.model.rotor, state.time[0], k)[0] for k in range(3))
+            inertia = max(moment_rates_of(self.model.rotor, state.time[NOW], k)[0] for k in range(3))
             torque = np.abs(load.torque_body).max() * duration / inertia
-            parts.append(np.full(3, max(np.abs(self._y[form.variables :][:3]).max(), torque, 1 / duration)))
+            parts.append(np.full(3, max(np.abs(y[form.variables :][:3]).max(), torque, 1 / duration)))
         if len(state.position):
             force = np.abs(load.force).max() * duration / self.model.flight.mass
             speed = max(np.abs(state.velocity).max(), force)
             way = max(np.abs(state.position).max(), speed * duration)
             parts += [np.full(3, way or 1.0), np.full(3, speed or 1.0)]
-        return np.concatenate([*parts, [np.inf]])
+        return np.concatenate(parts)
+
+
+def _form(solver: Solver, state: State) -> Form:
+    return FORMULATIONS[solver.formulation] if len(state.rotation) else NoAttitude()
 
 
 class SingularError(SimulationError):

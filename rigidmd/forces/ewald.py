@@ -21,12 +21,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
+from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.space import Space, fill_cell
-from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
-from rigidmd.jit import BLOCKS, PAIR_FLAGS, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.forces.space import follow_cell, volume_of
+from rigidmd.forces.terms import Setup
+from rigidmd.jit import BLOCKS, PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.units import COULOMB
 
 WIDTH = lane_count(np.float64)
@@ -85,10 +86,10 @@ def _waves(most, inside) -> Waves:
     )
 
 
-class Work(NamedTuple):
+class WaveSums(NamedTuple):
     """Where an Ewald sum is added up. Sites are filled up to whole vectors with charges 0."""
 
-    cell: np.ndarray  # (3, 3)
+    cell: np.ndarray  # (3, 3) that the strengths are for
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
@@ -102,60 +103,54 @@ class Work(NamedTuple):
     tallies: np.ndarray  # (blocks, 10)
 
 
-class Parts(NamedTuple):
-    """Addresses of the works of a sum; 0 until they are needed."""
-
-    turn: int = 0
-    sum: int = 0
-    push: int = 0
-
-
 class EwaldSum(NamedTuple):
     """The sum over k vectors one by one."""
 
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
-    space: Space
     sites: BodySites | CentralSites
     waves: Waves
-    work: Work
-    parts: Parts
+
+    def workspace(self, setup: Setup) -> "EwaldWorkspace":
+        """Room for the sums; their arithmetic is double whatever the setup says."""
+        s, over = len(self.charge), self.waves
+        slots = -(-s // WIDTH) * WIDTH
+        angles = (3, int(over.most.max()) + 1, slots)
+        sums = WaveSums(
+            cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)),
+            position=np.zeros((s, 3)),
+            force=np.zeros((s, 3)),
+            charge=np.concatenate([self.charge, np.zeros(slots - s)]),
+            cosine=np.zeros(angles),
+            sine=np.zeros(angles),
+            strength=np.zeros(over.total // 2),
+            real=np.zeros(over.total // 2),
+            imaginary=np.zeros(over.total // 2),
+            push=np.zeros((3, slots)),
+            tallies=np.zeros((len(over.bounds) - 1, TALLY_SIZE)),
+        )
+        return EwaldWorkspace(self.alpha, self.sites, over, sums)
+
+
+class EwaldWorkspace(NamedTuple):
+    """Workspace of an `EwaldSum`."""
+
+    alpha: float
+    sites: BodySites | CentralSites
+    waves: Waves
+    sums: WaveSums
+    code: Code | None = None
 
     @property
     def site_force(self) -> np.ndarray:
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
-        return self.work.force
+        return self.sums.force
 
-    def with_room(self) -> "EwaldSum":
-        """The term with its machine code."""
-        content = (self.alpha, self.waves, self.work)
-        return self._replace(parts=Parts(*(part.address(content) for part in (_turn, _sum, _push))))
-
-    def with_own_work(self) -> "EwaldSum":
-        """The term with work arrays that it shares with no other."""
-        return ewald_sum(self.charge, self.alpha, self.space, self.sites, self.waves)
-
-
-def ewald_sum(charge: np.ndarray, alpha: float, space: Space, sites: BodySites | CentralSites, over: Waves) -> EwaldSum:
-    """The term for sites with charges (s,), in units where q²/r is an energy in u Å²/ps²."""
-    s = len(charge)
-    slots = -(-s // WIDTH) * WIDTH
-    angles = (3, int(over.most.max()) + 1, slots)
-    made = Work(
-        cell=np.zeros((3, 3)),
-        reciprocal=np.zeros((3, 3)),
-        position=np.zeros((s, 3)),
-        force=np.zeros((s, 3)),
-        charge=np.concatenate([charge, np.zeros(slots - s)]),
-        cosine=np.zeros(angles),
-        sine=np.zeros(angles),
-        strength=np.zeros(over.total // 2),
-        real=np.zeros(over.total // 2),
-        imaginary=np.zeros(over.total // 2),
-        push=np.zeros((3, slots)),
-        tallies=np.zeros((len(over.bounds) - 1, TALLY_SIZE)),
-    )
-    return EwaldSum(alpha, charge, space, sites, over, made, Parts())
+    def with_code(self) -> "EwaldWorkspace":
+        """With its machine code."""
+        content = (self.alpha, self.waves, self.sums)
+        return self._replace(code=Code(turn=(_turn, content), sum=(_sum, content), push=(_push, content)))
 
 
 @kernel
@@ -176,22 +171,20 @@ def invert_cell(cell, reciprocal):
 
 @implements(terms.add_forces, counted=False)
 def _add_ewald_sum(term, state, load, tally):
-    if not is_a(term, EwaldSum):
+    if not is_a(term, EwaldWorkspace):
         return None
 
     def add_ewald_sum(term, state, load, tally):
-        if term.parts.sum == 0:
-            return LIST_FULL
-        own = term.work
+        own = term.sums
         place_sites(term.sites, state, own.position)
-        if fill_cell(term.space, own.cell):
+        if follow_cell(state.cell, own.cell):
             volume = abs(invert_cell(own.cell, own.reciprocal))
             _set_strengths(term.waves, own, term.alpha, volume)
         parcel = packed((term.alpha, term.waves, own))
         blocks = len(own.tallies)
-        call_blocks(term.parts.turn, parcel, blocks)
-        call_blocks(term.parts.sum, parcel, blocks)
-        call_blocks(term.parts.push, parcel, blocks)
+        call_blocks(term.code, "turn", parcel, blocks)
+        call_blocks(term.code, "sum", parcel, blocks)
+        call_blocks(term.code, "push", parcel, blocks)
         if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
@@ -219,7 +212,7 @@ def _set_strengths(over, own, alpha, volume):
             own.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
 
 
-@work(counted=False)
+@task(counted=False)
 def _turn(parcel, block):
     """Cosines and sines of a share of the sites, by the angle sum: each power costs one complex product."""
     _alpha, over, own = opened(parcel)
@@ -252,7 +245,7 @@ def _times(a, b):
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _sum(parcel, block):
     """S(k) of the columns of a block, its energy and virial; times the strength, for the forces."""
     alpha, over, own = opened(parcel)
@@ -308,7 +301,7 @@ def add_wave_virial(tally, energy, k, slope):
             tally[1 + 3 * row + column] += energy * (unit - slope * k[row] * k[column])
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _push(parcel, block):
     """Forces on a share of the sites."""
     _alpha, over, own = opened(parcel)
@@ -364,14 +357,11 @@ class Background(NamedTuple):
     """The charge, spread evenly, that makes a charged box neutral."""
 
     strength: float  # energy times the volume, u Å⁵/ps²
-    space: Space
-    cell: np.ndarray  # (3, 3) and
-    reciprocal: np.ndarray  # (3, 3) room for the volume
 
 
-def background(square: float, alpha: float, space: Space) -> Background:
+def background(square: float, alpha: float) -> Background:
     """The term for a net charge whose square is given, in units where q²/r is an energy in u Å²/ps²."""
-    return Background(-pi / (2 * alpha**2) * square, space, np.zeros((3, 3)), np.zeros((3, 3)))
+    return Background(-pi / (2 * alpha**2) * square)
 
 
 @implements(terms.add_forces)
@@ -381,8 +371,7 @@ def _add_background(term, state, load, tally):
 
     def add_background(term, state, load, tally):
         if tally is not None:
-            fill_cell(term.space, term.cell)
-            energy = term.strength / abs(invert_cell(term.cell, term.reciprocal))
+            energy = term.strength / volume_of(state.cell)
             for k in (0, 1, 5, 9):
                 tally[k] += energy
         return OK
@@ -395,48 +384,43 @@ class SurfaceDipole(NamedTuple):
 
     strength: float  # 2 pi/(2 eps + 1)
     charge: np.ndarray  # (s,)
-    space: Space
+    sites: BodySites | CentralSites
+
+    def workspace(self, setup: Setup) -> "SurfaceWorkspace":
+        """Room for positions and forces."""
+        return SurfaceWorkspace(*self, *np.zeros((2, len(self.charge), 3)))
+
+
+class SurfaceWorkspace(NamedTuple):
+    """Workspace of a `SurfaceDipole`."""
+
+    strength: float
+    charge: np.ndarray
     sites: BodySites | CentralSites
     position: np.ndarray  # (s, 3)
-    force: np.ndarray  # (s, 3)
-    cell: np.ndarray  # (3, 3) and
-    reciprocal: np.ndarray  # (3, 3) room for the volume
-
-    @property
-    def site_force(self) -> np.ndarray:
-        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
-        return self.force
-
-    def with_own_work(self) -> "SurfaceDipole":
-        """The term with work arrays that it shares with no other."""
-        return self._replace(position=self.position.copy(), force=self.force.copy())
+    site_force: np.ndarray  # (s, 3) as last evaluated, lab frame, u Å/ps²
 
 
-def surface_dipole(
-    charge: np.ndarray, permittivity: float, space: Space, sites: BodySites | CentralSites
-) -> SurfaceDipole:
+def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | CentralSites) -> SurfaceDipole:
     """The term for charges (s,) that sum to 0, in units where q²/r is an energy in u Å²/ps²."""
-    strength = 2 * pi / (2 * permittivity + 1)
-    place = np.zeros((2, len(charge), 3))
-    return SurfaceDipole(strength, charge, space, sites, *place, np.zeros((3, 3)), np.zeros((3, 3)))
+    return SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
 
 
 @implements(terms.add_forces)
 def _add_surface_dipole(term, state, load, tally):
-    if not is_a(term, SurfaceDipole):
+    if not is_a(term, SurfaceWorkspace):
         return None
 
     def add_surface_dipole(term, state, load, tally):
         place_sites(term.sites, state, term.position)
-        fill_cell(term.space, term.cell)
-        share = term.strength / abs(invert_cell(term.cell, term.reciprocal))
+        share = term.strength / volume_of(state.cell)
         energy = 0.0
         for k in range(3):
             dipole = 0.0
             for i in range(len(term.charge)):
                 dipole += term.charge[i] * term.position[i, k]
             for i in range(len(term.charge)):
-                term.force[i, k] = -2 * share * term.charge[i] * dipole
+                term.site_force[i, k] = -2 * share * term.charge[i] * dipole
             energy += share * dipole * dipole
         if tally is not None:
             # at a fixed volume the energy follows the sites, f (x) x; it also falls with the volume
@@ -445,9 +429,9 @@ def _add_surface_dipole(term, state, load, tally):
             for i in range(len(term.charge)):
                 for row in range(3):
                     for k in range(3):
-                        tally[1 + 3 * row + k] += term.force[i, row] * term.position[i, k]
-            virial_of_offsets(term.sites, state, term.force, tally)
-        load_from_sites(term.sites, state, load, term.force)
+                        tally[1 + 3 * row + k] += term.site_force[i, row] * term.position[i, k]
+            virial_of_offsets(term.sites, state, term.site_force, tally)
+        load_from_sites(term.sites, state, load, term.site_force)
         return OK
 
     return add_surface_dipole

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.terms import ASK, OK, add_forces, power
+from rigidmd.core.state import ASK, OK
+from rigidmd.forces.terms import Setup, add_forces, power
 from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.course import Course, value
 from rigidmd.mechanics.flight import along
@@ -24,6 +25,19 @@ class Drive(NamedTuple):
     torque: Course
     point: np.ndarray  # (3,) body
     follows_body: bool  # force and torque are given along the body's axes
+
+    def workspace(self, setup: Setup) -> "Driving":
+        """Room for what it is at present."""
+        return Driving(*self, np.zeros(3), np.zeros(3))
+
+
+class Driving(NamedTuple):
+    """Workspace of a `Drive`."""
+
+    force: Course
+    torque: Course
+    point: np.ndarray
+    follows_body: bool
     force_lab: np.ndarray  # (3,) as last evaluated
     torque_body: np.ndarray  # (3,) as last evaluated, that of the force included
 
@@ -31,7 +45,15 @@ class Drive(NamedTuple):
 
 
 class Told(NamedTuple):
-    """Force and torque that a Python function says, asked wherever positions have changed."""
+    """Force and torque that a Python function says; the engine knows which one."""
+
+    def workspace(self, setup: Setup) -> "Asked":
+        """Room for the answer."""
+        return Asked(np.zeros(1, np.int64), np.zeros(3), np.zeros(3))
+
+
+class Asked(NamedTuple):
+    """Workspace of a `Told`; it asks wherever positions have changed."""
 
     fresh: np.ndarray  # (1,) whether the answer is that for the present moment
     force_lab: np.ndarray  # (3,)
@@ -78,7 +100,7 @@ def add_torque(point, rotation, force_lab, torque_body):
 
 @implements(add_forces)
 def _add_drive(term, state, load, tally):
-    if not is_a(term, Drive):
+    if not is_a(term, Driving):
         return None
 
     def add_drive(term, state, load, tally):
@@ -103,7 +125,7 @@ def _add_drive(term, state, load, tally):
 
 @implements(add_forces)
 def _add_told(term, state, load, tally):
-    if not is_a(term, Told):
+    if not is_a(term, Asked):
         return None
 
     def add_told(term, state, load, tally):
@@ -129,7 +151,7 @@ def hand_over(term, load):
 
 @implements(power)
 def _drive_power(term, state, velocity, omega):
-    if not (is_a(term, Drive) or is_a(term, Told)):
+    if not (is_a(term, Driving) or is_a(term, Asked)):
         return None
 
     def drive_power(term, state, velocity, omega):
@@ -144,7 +166,7 @@ def _drive_power(term, state, velocity, omega):
     return drive_power
 
 
-def answer(term: Told, function, state) -> None:
+def answer(term: Asked, function, state) -> None:
     """Ask a Python function of (time, state) for its force (3,) in the lab and torque (3,) in the body frame."""
     force, torque = function(float(state.time[0]), state)
     term.force_lab[:] = force

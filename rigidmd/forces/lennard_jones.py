@@ -174,8 +174,23 @@ def _arrange(law, arranged, order):
     return arrange
 
 
-def tail(law: LennardJones, volume: float) -> tuple[float, float]:
-    """Energy (u Å²/ps²) and pressure (u/(Å ps²)) that the cut-off takes away, for g(r) = 1 beyond where it acts.
+class Tail(NamedTuple):
+    """What the cut-off takes away, at any volume."""
+
+    energy_volume: float  # energy times the volume, u Å⁵/ps²
+    pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
+
+    def energy(self, volume: float) -> float:
+        """u Å²/ps²"""
+        return self.energy_volume / volume
+
+    def pressure(self, volume: float) -> float:
+        """u/(Å ps²)"""
+        return self.pressure_square / volume**2
+
+
+def tail(law: LennardJones) -> Tail:
+    """Energy and pressure that the cut-off takes away, for g(r) = 1 beyond where it acts.
 
     U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated); for endings that shift the whole
     potential the constant inside counts too, as in GROMACS' dispersion correction. Allen & Tildesley (2017), 2.8.
@@ -188,9 +203,9 @@ def tail(law: LennardJones, volume: float) -> tuple[float, float]:
         # The pressure is that of the force alone: a jump of the energy at the cut-off (plain) has none.
         jump = law.cutoff ** (3 - p) / 3 if end[0] == 0 and isinstance(law.shape, Plain) else 0.0
         strength = sign * count @ c @ count
-        energy += 2 * pi / volume * strength * lost
-        pressure += 2 * pi / volume**2 * strength * (lost + jump)
-    return energy, pressure
+        energy += 2 * pi * strength * lost
+        pressure += 2 * pi * strength * (lost + jump)
+    return Tail(energy, pressure)
 
 
 def _lost(law: LennardJones, end: np.ndarray, p: int) -> float:

@@ -17,6 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, OK
+from rigidmd.errors import SimulationError
 from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
 from rigidmd.forces.clusters import (
     Clusters,
@@ -43,30 +45,22 @@ from rigidmd.forces.lanes import (
     zeros,
 )  # fmt: skip
 from rigidmd.forces.sites import BodySites, CentralSites
-from rigidmd.forces.space import Space, cell_of
-from rigidmd.forces.terms import EXAMPLE, LIST_FULL, NOT_FINITE, OK
-from rigidmd.jit import PAIR_FLAGS, call, call_blocks, kernel, opened, packed, work
+from rigidmd.forces.space import follow_cell
+from rigidmd.jit import PAIR_FLAGS, Code, call, call_blocks, kernel, opened, packed, task
 
 IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first holds what is inside the cut-off when the list is built, the others parts of the skin
 MOST_BEYOND = 2**16 - 1
+LONGEST_SKIN = 0.45  # of the smallest edge
 LOST = 1e9  # list radii from the origin, none longer than a box: so many boxes can be counted in 32 bits
 ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
 
 
-class Parts(NamedTuple):
-    """Addresses of the works that keep a list; 0 until they are needed."""
-
-    place: int = 0
-    follow: int = 0
-    wrap: int = 0
-    bin: int = 0
-    prepare: int = 0
-    settle: int = 0
-    grow: int = 0
-    fill: int = 0
+# Columns of PairList.needed and PairList.counters.
+ENTRIES, MASKED, WINDOW = 0, 1, 2
+USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 
 
 class PairList(NamedTuple):
@@ -80,7 +74,7 @@ class PairList(NamedTuple):
     shells_per_A: float  # beyond the cut-off
     reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
     group: np.ndarray  # (s,) pairs inside one group are left out
-    cell: np.ndarray  # (3, 3) of the box, rows a, b, c, Å
+    cell: np.ndarray  # (3, 3) the cell that it was last used with, Å
     clusters: Clusters
     tree: BoxTree
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
@@ -91,7 +85,6 @@ class PairList(NamedTuple):
     masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and as bits the lanes that count for each site of the row
     needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
     counters: np.ndarray  # (4,) usable (0 or 1); builds; status of the last update; images
-    parts: Parts
 
 
 @kernel(inline=True)
@@ -106,27 +99,26 @@ def image_of(entry):
     return entry & (IMAGES - 1)
 
 
-def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
+def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
     """A list that will be built at its first use, with about the room that sites spread evenly would need.
 
-    reach : how far apart sites of one group can be, Å, infinite if nobody knows
+    cell : (3, 3). reach : how far apart sites of one group can be, Å, infinite if nobody knows
     """
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.farthest), len(clusters.order)
     rows = slots // 2
     count = len(clusters.origin) // 4
-    room = ceil(_clusters_met(space, count, cutoff + skin) * rows / blocks)
+    room = ceil(_clusters_met(cell, count, cutoff + skin) * rows / blocks)
     needed = np.zeros((blocks, 3), np.int64)
-    needed[:, 2] = _clusters_ahead(space, count, blocks, cutoff + skin)
-    # longer, second images could come near between builds, and IMAGES would be too few
-    skin = min(skin, 0.45 * min(space.edges)) if cutoff < inf else inf
+    needed[:, WINDOW] = _clusters_ahead(cell, count, blocks, cutoff + skin)
+    skin = _fitting_skin(cell, cutoff, skin)
     return PairList(
         cutoff=cutoff,
         skin=skin,
         shells_per_A=(SHELLS - 1) / skin,
         reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
         group=group,
-        cell=cell_of(space),
+        cell=cell.copy(),
         clusters=clusters,
         tree=box_tree(count),
         shift=zeros(4 * IMAGES, np.float64),
@@ -137,45 +129,63 @@ def empty_list(space: Space, group: np.ndarray, reach: float, cutoff: float, ski
         masked=np.empty((blocks, ceil(1.5 * rows / blocks), 2), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
         needed=needed,
         counters=np.zeros(4, np.int64),
-        parts=Parts(),
     )
 
 
-def _clusters_met(space: Space, count: int, radius: float) -> float:
+def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
+    """The skin, or less: longer, second images could come near between builds, and IMAGES would be too few."""
+    return min(skin, LONGEST_SKIN * cell.diagonal().min()) if cutoff < inf else inf
+
+
+def _clusters_met(cell: np.ndarray, count: int, radius: float) -> float:
     """Entries of a row to be expected; 0 where nobody knows the density, so that the first build finds out."""
     if radius == inf:
         return count / 2 + 1
-    if space.volume == inf:
+    volume = cell.diagonal().prod()
+    if volume == inf:
         return 0.0
-    edge = np.cbrt(space.volume / count)
+    edge = np.cbrt(volume / count)
     near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3  # Steiner's formula
     return min(0.42 * near / edge**3, count / 2) + 1  # half of them, a sixth less: measured, cubes touch with corners
 
 
-def _clusters_ahead(space: Space, count: int, blocks: int, radius: float) -> int:
+def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
     """Clusters from the first of a block to the last that its rows are expected to meet."""
-    if space.volume == inf or radius == inf:
+    volume = cell.diagonal().prod()
+    if volume == inf or radius == inf:
         return 0
-    layers = (radius + 2 * np.cbrt(space.volume / count)) / space.x  # clusters are sorted along x first
+    layers = (radius + 2 * np.cbrt(volume / count)) / cell[0, 0]  # clusters are sorted along x first
     return min(count, ceil(count * (min(layers, 0.5) + 1 / blocks)))
 
 
-def with_room(pairs: PairList, sites: BodySites | CentralSites) -> PairList:
-    """The list of sites with its machine code and, with a tenth to spare, the room its last build asked for."""
-    if pairs.parts.fill == 0:
-        placed = (pairs, sites, EXAMPLE[0])
-        pairs = pairs._replace(
-            parts=Parts(
-                place=_place.address(placed),
-                follow=_follow.address(pairs),
-                wrap=_wrap.address(placed),
-                bin=_bin.address(placed),
-                prepare=_prepare.address(pairs),
-                settle=_settle.address(placed),
-                grow=_grow.address(pairs),
-                fill=_fill.address(pairs),
+def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
+    """The machine code that keeps a list of sites."""
+    placed = (pairs, sites, EXAMPLE[0])
+    return Code(
+        place=(_place, placed),
+        follow=(_follow, pairs),
+        wrap=(_wrap, placed),
+        bin=(_bin, placed),
+        prepare=(_prepare, pairs),
+        settle=(_settle, placed),
+        grow=(_grow, pairs),
+        fill=(_fill, pairs),
+    )
+
+
+def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
+    """The list with, and a tenth to spare, the room its last build asked for, and a skin that the cell has room for.
+
+    Raises SimulationError where the cell has become too small for the cut-off.
+    """
+    if pairs.counters[STATUS] == CELL_CHANGED:
+        if 2 * pairs.cutoff > cell.diagonal().min():
+            raise SimulationError(
+                f"the box has become too small for the cut-off of {pairs.cutoff:g} Å: half its smallest edge is "
+                f"{cell.diagonal().min() / 2:.4g} Å. Begin with a larger box, or take a shorter cut-off"
             )
-        )
+        skin = _fitting_skin(cell, pairs.cutoff, pairs.skin)
+        pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     blocks = len(pairs.needed)
     entries, masked, _ = pairs.needed.max(axis=0)
     if entries > pairs.entries.shape[1]:
@@ -186,29 +196,34 @@ def with_room(pairs: PairList, sites: BodySites | CentralSites) -> PairList:
 
 
 @kernel(counted=False)
-def update_list(pairs, sites, state):
+def update_list(pairs, code, sites, state):
     """Bring clusters to where the molecules are, and build the list anew if it is no longer good. A status code."""
     blocks = len(pairs.needed)
     parcel = packed(pairs)
     placed = packed((pairs, sites, state))
-    if pairs.counters[0] == 1:
-        call_blocks(pairs.parts.place, placed, blocks)
-        call_blocks(pairs.parts.follow, parcel, blocks)
+    if follow_cell(state.cell, pairs.cell):
+        pairs.counters[USABLE] = 0
+    if pairs.counters[USABLE] == 1:
+        call_blocks(code, "place", placed, blocks)
+        call_blocks(code, "follow", parcel, blocks)
         if farthest(pairs) < inf:
             return OK
-    pairs.counters[0] = 0
-    call_blocks(pairs.parts.wrap, placed, blocks)
-    call_blocks(pairs.parts.bin, placed, blocks)
-    call(pairs.parts.prepare, parcel, 0)
-    if pairs.counters[2] != OK:
-        return pairs.counters[2]
-    call_blocks(pairs.parts.settle, placed, blocks)
-    call(pairs.parts.grow, parcel, 0)
-    call_blocks(pairs.parts.fill, parcel, blocks)
-    if most_needed(pairs, 0) > pairs.entries.shape[1] or most_needed(pairs, 1) > pairs.masked.shape[1]:
+    pairs.counters[USABLE] = 0
+    shortest = min(pairs.cell[0, 0], pairs.cell[1, 1], pairs.cell[2, 2])
+    if pairs.cutoff < inf and (2 * pairs.cutoff > shortest or pairs.skin > LONGEST_SKIN * shortest):
+        return CELL_CHANGED
+    call_blocks(code, "wrap", placed, blocks)
+    call_blocks(code, "bin", placed, blocks)
+    call(code, "prepare", parcel)
+    if pairs.counters[STATUS] != OK:
+        return pairs.counters[STATUS]
+    call_blocks(code, "settle", placed, blocks)
+    call(code, "grow", parcel)
+    call_blocks(code, "fill", parcel, blocks)
+    if most_needed(pairs, ENTRIES) > pairs.entries.shape[1] or most_needed(pairs, MASKED) > pairs.masked.shape[1]:
         return LIST_FULL
-    pairs.counters[0] = 1
-    pairs.counters[1] += 1
+    pairs.counters[USABLE] = 1
+    pairs.counters[BUILDS] += 1
     return OK
 
 
@@ -250,36 +265,36 @@ def lanes_of_second(bits):
     return bits >> MASK_BITS
 
 
-@work(counted=False)
+@task(counted=False)
 def _place(parcel, block):
     pairs, sites, state = opened(parcel)
     place_block(pairs.clusters, pairs.cell, sites, state, block)
 
 
-@work(counted=False)
+@task(counted=False)
 def _follow(parcel, block):
     pairs = opened(parcel)
     follow_block(pairs.clusters, 0.5 * pairs.skin, block)
 
 
-@work(counted=False)
+@task(counted=False)
 def _wrap(parcel, block):
     pairs, sites, state = opened(parcel)
     wrap_block(pairs.clusters, pairs.cell, sites, state, LOST * (pairs.cutoff + pairs.skin), block)
 
 
-@work(counted=False)
+@task(counted=False)
 def _bin(parcel, block):
     pairs, sites, state = opened(parcel)
     bin_block(pairs.clusters, pairs.cell, sites, state, block)
 
 
-@work()
+@task()
 def _prepare(parcel, block):
     """Sort the sites for a new list; a status code into counters[2]."""
     pairs = opened(parcel)
-    pairs.counters[2] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
-    pairs.counters[3] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+    pairs.counters[STATUS] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
+    pairs.counters[IMAGES_FOUND] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
 
 
 @kernel
@@ -321,19 +336,19 @@ def _images_along(cell, k, offset, radius):
     return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
 
 
-@work(counted=False)
+@task(counted=False)
 def _settle(parcel, block):
     pairs, sites, state = opened(parcel)
     settle_block(pairs.clusters, pairs.cell, sites, state, pairs.group, block)
 
 
-@work(counted=False)
+@task(counted=False)
 def _grow(parcel, block):
     pairs = opened(parcel)
     grow(pairs.tree, pairs.clusters)
 
 
-@work()
+@task()
 def _fill(parcel, block):
     pairs = opened(parcel)
     room = 256
@@ -388,9 +403,9 @@ def fill_block(pairs, block, room):
             return 2 * candidates
         entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
         window = max(window, ahead + c - clusters.bounds[block] + 1)
-    pairs.needed[block, 0] = entries
-    pairs.needed[block, 1] = masked
-    pairs.needed[block, 2] = min(window, len(clusters.origin) // 4)
+    pairs.needed[block, ENTRIES] = entries
+    pairs.needed[block, MASKED] = masked
+    pairs.needed[block, WINDOW] = min(window, len(clusters.origin) // 4)
     return 0
 
 
@@ -405,7 +420,7 @@ def _find_candidates(pairs, c, scratch):
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
     entry = scratch.entry
     candidates = 0
-    for image in range(pairs.counters[3]):
+    for image in range(pairs.counters[IMAGES_FOUND]):
         reaches = True
         for k in range(3):
             shift = pairs.shift[4 * image + k]

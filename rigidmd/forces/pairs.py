@@ -8,9 +8,9 @@ images, sums energies, virial and forces, and hands the forces to the bodies.
 from math import inf
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from rigidmd.core.state import EXAMPLE, LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces import neighbors, terms
 from rigidmd.forces.lanes import (
     double,
@@ -28,6 +28,10 @@ from rigidmd.forces.lanes import (
     zeros,
 )  # fmt: skip
 from rigidmd.forces.neighbors import (
+    BUILDS,
+    STATUS,
+    USABLE,
+    WINDOW,
     PairList,
     cluster_of,
     empty_list,
@@ -36,25 +40,13 @@ from rigidmd.forces.neighbors import (
     image_of,
     lanes_of_first,
     lanes_of_second,
+    list_code,
     most_needed,
     update_list,
 )  # fmt: skip
 from rigidmd.forces.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
-from rigidmd.forces.space import Space, fill_cell
-from rigidmd.forces.terms import LIST_FULL, OK, TALLY_SIZE
-from rigidmd.jit import PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
-
-PRECISIONS = {"double": np.float64, "mixed": np.float32}
-
-
-class Parts(NamedTuple):
-    """Addresses of the works that evaluate a law; 0 until they are needed."""
-
-    find: int = 0
-    forces: int = 0
-    forces_and_energies: int = 0
-    gather: int = 0
-    hand_over: int = 0
+from rigidmd.forces.terms import Setup
+from rigidmd.jit import PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 
 
 class Sums(NamedTuple):
@@ -66,15 +58,36 @@ class Sums(NamedTuple):
 
 
 class PairForces(NamedTuple):
-    """A pair law, the sites that take part in it, and the work arrays to evaluate it."""
+    """A pair law and the sites that take part in it."""
 
     law: NamedTuple  # in the order of the sites
+    sites: BodySites | CentralSites
+    group: np.ndarray  # (s,) sites of one group do not act on one another
+
+    def workspace(self, setup: Setup) -> "PairWorkspace":
+        """Room for a neighbour list, which is built at the first use, and for sums."""
+        law, sites = self.law, self.sites
+        reach = _diameter(sites) if np.array_equal(self.group, sites.molecule) else inf
+        pairs = empty_list(setup.cell, self.group, reach, law.cutoff, setup.skin, setup.dtype)
+        blocks, slots = len(pairs.needed), len(pairs.clusters.order)
+        sums = Sums(
+            own=pairs.clusters.square,  # while forces are summed nobody builds a list
+            others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
+            tallies=np.zeros((blocks, TALLY_SIZE)),
+        )
+        return PairWorkspace(law, law.room(slots, setup.dtype), sites, pairs, sums)
+
+
+class PairWorkspace(NamedTuple):
+    """Workspace of a `PairForces`."""
+
+    law: NamedTuple
     arranged: NamedTuple  # what the loop reads: numbers for each site in the order of slots, in the precision of lanes
-    space: Space
     sites: BodySites | CentralSites
     pairs: PairList
     sums: Sums
-    parts: Parts
+    list_code: Code | None = None
+    code: Code | None = None
 
     @property
     def site_force(self) -> np.ndarray:
@@ -86,59 +99,37 @@ class PairForces(NamedTuple):
         """The same in the order of the lists."""
         return InSlots(self.sums.own, self.pairs.clusters.slot)
 
-    def with_room(self) -> "PairForces":
-        """The term with its machine code and as much room as its last list asked for."""
-        term = self._replace(pairs=neighbors.with_room(self.pairs, self.sites))
-        lanes = lane_count(dtype := term.sums.others.dtype)
-        clusters = int(term.pairs.needed[:, 2].max())
-        if 3 * lanes * clusters > term.sums.others.shape[1]:
-            others = zeros((len(term.sums.others), 3 * lanes * (int(1.1 * clusters) + 1)), dtype)
-            term = term._replace(sums=term.sums._replace(others=others))
-        if term.parts.forces == 0:
-            state, load = terms.EXAMPLE
-            lists = (term.law, term.arranged, term.space, term.sites, term.pairs, term.sums, state)
-            content = (term.arranged, term.pairs, term.sums)
-            term = term._replace(
-                parts=Parts(
-                    find=_find.address(lists),
-                    forces=_forces.address(content),
-                    forces_and_energies=_forces_and_energies.address(content),
-                    gather=_gather.address(content),
-                    hand_over=_hand_over.address((term.sites, term.forces_in_slots, state, load)),
-                )
-            )
-        return term
+    def with_code(self) -> "PairWorkspace":
+        """With the machine code that finds pairs and computes their forces."""
+        state, load = EXAMPLE
+        lists = list_code(self.pairs, self.sites)
+        content = (self.arranged, self.pairs, self.sums)
+        code = Code(
+            find=(_find, (lists, self.law, self.arranged, self.sites, self.pairs, self.sums, state)),
+            forces=(_forces, content),
+            forces_and_energies=(_forces_and_energies, content),
+            gather=(_gather, content),
+            hand_over=(_hand_over, (self.sites, self.forces_in_slots, state, load)),
+        )
+        return self._replace(code=code, list_code=lists)
 
-    def with_own_work(self) -> "PairForces":
-        """The term with a list and work arrays that it shares with no other."""
-        precision = next(name for name, dtype in PRECISIONS.items() if dtype == self.sums.others.dtype)
-        return pair_forces(self.law, self.space, self.sites, self.pairs.skin, precision, self.pairs.group)
+    def with_room(self, cell: np.ndarray) -> "PairWorkspace":
+        """With as much room as the last list asked for."""
+        pairs = neighbors.with_room(self.pairs, cell)
+        others, clusters = self.sums.others, int(pairs.needed[:, WINDOW].max())
+        if 3 * lane_count(others.dtype) * clusters > others.shape[1]:
+            others = _room_for_others(pairs, len(others), int(1.1 * clusters) + 1)
+        return self._replace(pairs=pairs, sums=self.sums._replace(others=others))
 
 
-def pair_forces(
-    law: NamedTuple,
-    space: Space,
-    sites: BodySites | CentralSites,
-    skin: float,
-    precision: str = "double",
-    group: np.ndarray | None = None,
-) -> PairForces:
-    """The term for a law with a `cutoff`; its neighbour list is built at the first use.
+def _room_for_others(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
+    dtype = pairs.clusters.local.dtype
+    return zeros((blocks, 3 * lane_count(dtype) * clusters), dtype)
 
-    group (s,) : sites of one group do not act on one another; the sites' molecules when not given
-    """
-    dtype = PRECISIONS[precision]
-    if group is None:
-        group = sites.molecule
-    reach = _diameter(sites) if np.array_equal(group, sites.molecule) else inf
-    pairs = empty_list(space, group, reach, law.cutoff, skin, dtype)
-    blocks, slots = len(pairs.needed), len(pairs.clusters.order)
-    sums = Sums(
-        own=pairs.clusters.square,  # while forces are summed nobody builds a list
-        others=zeros((blocks, 3 * lane_count(dtype) * int(pairs.needed[:, 2].max())), dtype),
-        tallies=np.zeros((blocks, TALLY_SIZE)),
-    )
-    return PairForces(law, law.room(slots, dtype), space, sites, pairs, sums, Parts())
+
+def pair_forces(law: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None) -> PairForces:
+    """The term for a law with a `cutoff`; sites of one molecule do not act on one another if no groups are given."""
+    return PairForces(law, sites, sites.molecule if group is None else group)
 
 
 def _diameter(sites: BodySites | CentralSites) -> float:
@@ -161,24 +152,23 @@ def arrange(law, arranged, order):
 
 @implements(terms.add_forces, counted=False)
 def _add_pair_forces(term, state, load, tally):
-    if not is_a(term, PairForces):
+    if not is_a(term, PairWorkspace):
         return None
-    if (state, load) != tuple(map(numba.typeof, terms.EXAMPLE)):
-        raise TypeError(f"forces between pairs are compiled for states like terms.EXAMPLE, not for {state}, {load}")
 
     def add_pair_forces(term, state, load, tally):
-        parts, pairs, sums = term.parts, term.pairs, term.sums
-        if parts.find == 0:
-            return LIST_FULL
-        call(parts.find, packed((term.law, term.arranged, term.space, term.sites, pairs, sums, state)), 0)
-        if pairs.counters[2] != OK:
-            return pairs.counters[2]
+        code, pairs, sums = term.code, term.pairs, term.sums
+        call(code, "find", packed((term.list_code, term.law, term.arranged, term.sites, pairs, sums, state)))
+        if pairs.counters[STATUS] != OK:
+            return pairs.counters[STATUS]
         parcel = packed((term.arranged, pairs, sums))
         blocks = len(sums.tallies)
-        call_blocks(parts.forces if tally is None else parts.forces_and_energies, parcel, blocks)
-        call_blocks(parts.gather, parcel, blocks)
+        if tally is None:
+            call_blocks(code, "forces", parcel, blocks)
+        else:
+            call_blocks(code, "forces_and_energies", parcel, blocks)
+        call_blocks(code, "gather", parcel, blocks)
         force = InSlots(sums.own, pairs.clusters.slot)
-        call(parts.hand_over, packed((term.sites, force, state, load)), 0)
+        call(code, "hand_over", packed((term.sites, force, state, load)))
         if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
@@ -189,40 +179,39 @@ def _add_pair_forces(term, state, load, tally):
     return add_pair_forces
 
 
-@work()
+@task()
 def _find(parcel, block):
-    """Bring sites, and what the loop reads of them, to where the bodies are; a status code into counters[2]."""
-    law, arranged, space, sites, pairs, sums, state = opened(parcel)
-    builds = pairs.counters[1]
-    fill_cell(space, pairs.cell)
-    status = update_list(pairs, sites, state)
-    if pairs.counters[1] != builds:
+    """Bring sites, and what the loop reads of them, to where the bodies are; a status code into counters[STATUS]."""
+    code, law, arranged, sites, pairs, sums, state = opened(parcel)
+    builds = pairs.counters[BUILDS]
+    status = update_list(pairs, code, sites, state)
+    if pairs.counters[BUILDS] != builds:
         arrange(law, arranged, pairs.clusters.order)
-        if 3 * width_of(sums.others) * most_needed(pairs, 2) > sums.others.shape[1]:
-            pairs.counters[0] = 0
+        if 3 * width_of(sums.others) * most_needed(pairs, WINDOW) > sums.others.shape[1]:
+            pairs.counters[USABLE] = 0
             status = LIST_FULL
-    pairs.counters[2] = status
+    pairs.counters[STATUS] = status
 
 
-@work()
+@task()
 def _hand_over(parcel, block):
     sites, force, state, load = opened(parcel)
     load_from_sites(sites, state, load, force)
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _forces(parcel, block):
     law, pairs, sums = opened(parcel)
     block_forces(law, pairs, sums.own, sums.others, None, block)
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _forces_and_energies(parcel, block):
     law, pairs, sums = opened(parcel)
     block_forces(law, pairs, sums.own, sums.others, sums.tallies, block)
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _gather(parcel, block):
     _, pairs, sums = opened(parcel)
     gather_block(pairs, sums.own, sums.others, block)
@@ -234,7 +223,7 @@ def block_forces(law, pairs, own, others, tallies, block):
     clusters = pairs.clusters
     width = width_of(clusters.local)
     others = others[block]
-    others[: 3 * width * pairs.needed[block, 2]] = 0.0
+    others[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
     if tallies is not None:
         tallies[block] = 0.0
     entries = pairs.entries[block]
@@ -363,6 +352,6 @@ def gather_block(pairs, own, others, block):
                 ahead = c - clusters.bounds[b]
                 if ahead < 0:
                     ahead += len(clusters.origin) // 4
-                if ahead < pairs.needed[b, 2]:
+                if ahead < pairs.needed[b, WINDOW]:
                     on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
             store(own, at, narrowed(on_cluster, own))

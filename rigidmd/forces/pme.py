@@ -22,14 +22,15 @@ from typing import NamedTuple
 import numpy as np
 from rocket_fft import c2c, c2r, r2c
 
+from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.ewald import add_wave_virial, invert_cell
 from rigidmd.forces.lanes import load_eight, load_four, store, total
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.space import Space, fill_cell
+from rigidmd.forces.space import follow_cell
 from rigidmd.forces.splines import aliases, weights
-from rigidmd.forces.terms import LIST_FULL, NOT_FINITE, OK, TALLY_SIZE
-from rigidmd.jit import BLOCKS, PAIR_FLAGS, call, call_blocks, implements, is_a, kernel, opened, packed, work
+from rigidmd.forces.terms import Setup
+from rigidmd.jit import BLOCKS, PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 
 SERIAL_POINTS = 16**3  # up to this many grid points there is one block, and no thread is started
 
@@ -73,122 +74,103 @@ class Mesh(NamedTuple):
     weight: np.ndarray  # (blocks, 64) the weights of one site, to be taken one by one
 
 
-class Parts(NamedTuple):
-    """Addresses of the works; 0 until they are needed."""
-
-    weigh: int = 0
-    scale: int = 0
-    sort: int = 0
-    spread: int = 0
-    convolve: int = 0
-    convolve_and_count: int = 0
-    gather: int = 0
-    pull: int = 0
-
-
 class Pme(NamedTuple):
     """The reciprocal part by smooth particle mesh Ewald."""
 
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
-    space: Space
+    sites: BodySites | CentralSites
+    grid: tuple[int, int, int]  # points along a, b, c
+    order: int  # of the splines
+
+    def workspace(self, setup: Setup) -> "PmeWorkspace":
+        """Room for the grid, in the precision of the setup."""
+        grid, order = self.grid, self.order
+        kind = np.dtype(setup.dtype)
+        pair = np.complex64 if kind == np.float32 else np.complex128
+        s, width = len(self.charge), 4 if order <= 4 else 8
+        blocks = max(1, min(BLOCKS, grid[0] // order)) if np.prod(grid) > SERIAL_POINTS else 1
+        value = np.zeros((order, width))
+        value[:, :order] = weights(order)
+        slope = value[1:] * np.arange(1, order)[:, None]
+        spline = (UpToFour if width == 4 else UpToEight)(
+            tuple(range(order)), value.ravel().astype(kind), slope.ravel().astype(kind)
+        )
+        table = np.zeros((3, 6, max(grid)))
+        for d in range(3):
+            table[d, :, : grid[d]] = aliases(grid[d], order)
+        waves = (grid[0], grid[1], grid[2] // 2 + 1)
+        mesh = Mesh(
+            points=np.array(grid, np.int64),
+            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
+            cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)),
+            position=np.zeros((s, 3)),
+            force=np.zeros((s, 3)),
+            corner=np.zeros((s, 3), np.int32),
+            part=np.zeros((s, 4), kind),
+            order=np.zeros(s, np.int32),
+            first=np.zeros(grid[0] + 1, np.int64),
+            grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
+            wave=np.zeros(waves, pair),
+            influence=np.zeros(waves, kind),
+            alias=table,
+            axes=np.arange(3)[:, None],
+            tallies=np.zeros((blocks, TALLY_SIZE)),
+            lost=np.zeros(blocks, np.bool_),
+            weight=np.zeros((blocks, 64), kind),
+        )
+        return PmeWorkspace(self.alpha, self.charge, self.sites, spline, mesh)
+
+
+class PmeWorkspace(NamedTuple):
+    """Workspace of a `Pme`."""
+
+    alpha: float
+    charge: np.ndarray
     sites: BodySites | CentralSites
     spline: UpToFour | UpToEight
     mesh: Mesh
-    parts: Parts
+    code: Code | None = None
 
     @property
     def site_force(self) -> np.ndarray:
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
         return self.mesh.force
 
-    def with_room(self) -> "Pme":
-        """The term with its machine code."""
+    def with_code(self) -> "PmeWorkspace":
+        """With its machine code."""
         content = (self.alpha, self.charge, self.spline, self.mesh)
-        works = (_weigh, _scale, _sort, _spread, _convolve, _convolve_and_count, _back, _pull)
-        return self._replace(parts=Parts(*(part.address(content) for part in works)))
-
-    def with_own_work(self) -> "Pme":
-        """The term with work arrays that it shares with no other."""
-        grid = tuple(int(n) for n in self.mesh.points)
-        return pme(self.charge, self.alpha, self.space, self.sites, grid, len(self.spline.nodes), self.mesh.grid.dtype)
-
-
-def pme(
-    charge: np.ndarray,
-    alpha: float,
-    space: Space,
-    sites: BodySites | CentralSites,
-    grid: tuple[int, int, int],
-    order: int,
-    dtype: type = np.float64,
-) -> Pme:
-    """The term for charges (s,), in units where q²/r is an energy in u Å²/ps²; grid points along a, b, c."""
-    kind = np.dtype(dtype)
-    pair = np.complex64 if kind == np.float32 else np.complex128
-    s, width = len(charge), 4 if order <= 4 else 8
-    blocks = max(1, min(BLOCKS, grid[0] // order)) if np.prod(grid) > SERIAL_POINTS else 1
-    value = np.zeros((order, width))
-    value[:, :order] = weights(order)
-    slope = value[1:] * np.arange(1, order)[:, None]
-    spline = (UpToFour if width == 4 else UpToEight)(
-        tuple(range(order)), value.ravel().astype(kind), slope.ravel().astype(kind)
-    )
-    table = np.zeros((3, 6, max(grid)))
-    for d in range(3):
-        table[d, :, : grid[d]] = aliases(grid[d], order)
-    waves = (grid[0], grid[1], grid[2] // 2 + 1)
-    mesh = Mesh(
-        points=np.array(grid, np.int64),
-        bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
-        cell=np.zeros((3, 3)),
-        reciprocal=np.zeros((3, 3)),
-        position=np.zeros((s, 3)),
-        force=np.zeros((s, 3)),
-        corner=np.zeros((s, 3), np.int32),
-        part=np.zeros((s, 4), kind),
-        order=np.zeros(s, np.int32),
-        first=np.zeros(grid[0] + 1, np.int64),
-        grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
-        wave=np.zeros(waves, pair),
-        influence=np.zeros(waves, kind),
-        alias=table,
-        axes=np.arange(3)[:, None],
-        tallies=np.zeros((blocks, TALLY_SIZE)),
-        lost=np.zeros(blocks, np.bool_),
-        weight=np.zeros((blocks, 64), kind),
-    )
-    return Pme(alpha, charge, space, sites, spline, mesh, Parts())
+        tasks = (_weigh, _scale, _sort, _spread, _convolve, _convolve_and_count, _back, _pull)
+        names = ("weigh", "scale", "sort", "spread", "convolve", "convolve_and_count", "back", "pull")
+        return self._replace(code=Code(**{name: (one, content) for name, one in zip(names, tasks, strict=True)}))
 
 
 @implements(terms.add_forces, counted=False)
 def _add_pme(term, state, load, tally):
-    if not is_a(term, Pme):
+    if not is_a(term, PmeWorkspace):
         return None
 
     def add_pme(term, state, load, tally):
-        parts = term.parts
-        if parts.spread == 0:
-            return LIST_FULL
-        mesh = term.mesh
+        code, mesh = term.code, term.mesh
         blocks = len(mesh.tallies)
         parcel = packed((term.alpha, term.charge, term.spline, mesh))
         place_sites(term.sites, state, mesh.position)
-        if fill_cell(term.space, mesh.cell):
+        if follow_cell(state.cell, mesh.cell):
             invert_cell(mesh.cell, mesh.reciprocal)
-            call_blocks(parts.weigh, parcel, blocks)
-        call_blocks(parts.scale, parcel, blocks)
+            call_blocks(code, "weigh", parcel, blocks)
+        call_blocks(code, "scale", parcel, blocks)
         for block in range(blocks):
             if mesh.lost[block]:
                 return NOT_FINITE
-        call(parts.sort, parcel, 0)
-        call_blocks(parts.spread, parcel, blocks)
+        call(code, "sort", parcel)
+        call_blocks(code, "spread", parcel, blocks)
         if tally is None:
-            call_blocks(parts.convolve, parcel, blocks)
+            call_blocks(code, "convolve", parcel, blocks)
         else:
-            call_blocks(parts.convolve_and_count, parcel, blocks)
-        call_blocks(parts.gather, parcel, blocks)
-        call_blocks(parts.pull, parcel, blocks)
+            call_blocks(code, "convolve_and_count", parcel, blocks)
+        call_blocks(code, "back", parcel, blocks)
+        call_blocks(code, "pull", parcel, blocks)
         if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
@@ -200,7 +182,7 @@ def _add_pme(term, state, load, tally):
     return add_pme
 
 
-@work(counted=False)
+@task(counted=False)
 def _weigh(parcel, block):
     """What waves do, for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
     alpha, _charge, _spline, mesh = opened(parcel)
@@ -238,7 +220,7 @@ def _weigh(parcel, block):
                     mesh.influence[x, y, z] = g * own / (whole * weakened)
 
 
-@work(counted=False)
+@task(counted=False)
 def _scale(parcel, block):
     """Positions of a share of the sites in grid cells."""
     _alpha, charge, _spline, mesh = opened(parcel)
@@ -260,7 +242,7 @@ def _scale(parcel, block):
         mesh.part[i, 3] = charge[i]
 
 
-@work(counted=False)
+@task(counted=False)
 def _sort(parcel, block):
     """Sort sites by the plane of their corner; within a plane they keep their order."""
     _alpha, _charge, _spline, mesh = opened(parcel)
@@ -313,7 +295,7 @@ def slopes_at(spline, part):
     return found
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _spread(parcel, block):
     """Charges on the planes of a block, and their waves within the planes."""
     _alpha, _charge, spline, mesh = opened(parcel)
@@ -349,7 +331,7 @@ def _spread(parcel, block):
     c2c(mesh.wave[low:high], mesh.wave[low:high], mesh.axes[1], True, 1.0, 1)
 
 
-@work(counted=False)
+@task(counted=False)
 def _convolve(parcel, block):
     """From waves of charge to waves of potential, for a block of rows."""
     _alpha, _charge, _spline, mesh = opened(parcel)
@@ -363,7 +345,7 @@ def _convolve(parcel, block):
     c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
-@work(counted=False)
+@task(counted=False)
 def _convolve_and_count(parcel, block):
     """The same, with energy and virial."""
     alpha, _charge, _spline, mesh = opened(parcel)
@@ -394,7 +376,7 @@ def _convolve_and_count(parcel, block):
     c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
-@work(counted=False)
+@task(counted=False)
 def _back(parcel, block):
     """From waves within the planes of a block to the potential on them."""
     _alpha, _charge, spline, mesh = opened(parcel)
@@ -413,7 +395,7 @@ def _back(parcel, block):
                 grid[plane, nb + k, c] = grid[plane, k, c]
 
 
-@work(fastmath=PAIR_FLAGS, counted=False)
+@task(fastmath=PAIR_FLAGS, counted=False)
 def _pull(parcel, block):
     """Forces on a share of the sites: the gradient of the potential at each, times its charge."""
     _alpha, charge, spline, mesh = opened(parcel)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.state import WORK
 from rigidmd.forces.frame import frame_rate
 from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.flight import Pinned, along, inertial_mass
@@ -91,7 +92,7 @@ def push_spin(resistance, rotor, frame, state, load, h):
             rate = inverse[k] * (linear[k] + quadratic[k] * size)
             after, turned = pushed(before[k], pushes[k], dries[k], rate, h)
             L[k] = (after + dragged[k]) / inverse[k] + carried[k]
-            state.work[0] += (0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned) / inverse[k]
+            state.books[WORK] += (0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned) / inverse[k]
 
 
 @kernel
@@ -173,7 +174,7 @@ def _push_flight(resistance, flight, rotor, frame, state, load, h):
         size = middle_size(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
         for k in range(3):
             after, flown = pushed(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
-            state.work[0] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
+            state.books[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
             gain = (after - before[k]) * mass[k] / flight.mass
             if turns:
                 for i in range(3):  # along axis k only: what the other axes see stays as it was

@@ -1,11 +1,11 @@
-"""The space molecules live in: a periodic box with right angles, a slanted one, or none. Chosen by type."""
+"""The space molecules live in: a periodic box with right angles, a slanted one, or none."""
 
 from math import inf, prod
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.jit import implements, is_a, kernel
+from rigidmd.jit import kernel
 
 
 class Orthorhombic(NamedTuple):
@@ -60,7 +60,7 @@ Space = Orthorhombic | Triclinic | Unbounded
 
 def space_of(cell: np.ndarray | None) -> Space:
     """The space with this cell matrix (3, 3), rows a, b, c with a along x and b in the xy plane, Å; None for no box."""
-    if cell is None:
+    if cell is None or cell[0, 0] == inf:
         return Unbounded()
     (x, _, _), (xy, y, _), (xz, yz, z) = (map(float, row) for row in cell)
     return Triclinic(x, y, z, xy, xz, yz) if xy or xz or yz else Orthorhombic(x, y, z)
@@ -91,30 +91,18 @@ def fractions(space: Space, position: np.ndarray) -> np.ndarray:
     return np.stack([a, b, c], axis=1)
 
 
-def fill_cell(space, cell):
-    """Write the cell matrix (3, 3), rows the edges a, b, c, into an array; whether it has changed."""
-    raise TypeError("compiled code only")
-
-
-@implements(fill_cell)
-def _fill_cell(space, cell):
-    if is_a(space, Triclinic):
-
-        def fill_slanted(space, cell):
-            slants = _put(cell, 1, 0, space.xy) | _put(cell, 2, 0, space.xz) | _put(cell, 2, 1, space.yz)
-            return slants | _put_edges(space, cell)
-
-        return fill_slanted
-    return lambda space, cell: _put_edges(space, cell)
+@kernel(inline=True)
+def volume_of(cell):
+    """Volume of a cell (3, 3) in standard orientation, Å³."""
+    return cell[0, 0] * cell[1, 1] * cell[2, 2]
 
 
 @kernel
-def _put_edges(space, cell):
-    return _put(cell, 0, 0, space.x) | _put(cell, 1, 1, space.y) | _put(cell, 2, 2, space.z)
-
-
-@kernel
-def _put(cell, k, j, value):
-    changed = cell[k, j] != value
-    cell[k, j] = value
+def follow_cell(cell, known):
+    """Copy a cell (3, 3) into the one that is known; whether it has changed."""
+    changed = False
+    for k in range(3):
+        for n in range(3):
+            changed |= known[k, n] != cell[k, n]
+            known[k, n] = cell[k, n]
     return changed

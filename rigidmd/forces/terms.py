@@ -1,8 +1,10 @@
-"""Terms: what acts on the bodies, and the one dispatch over them.
+"""Terms and workspaces: what acts on the bodies, how it is computed, and the one dispatch over them.
 
-A term is a NamedTuple of numbers and arrays. `add_forces(term, state, load, tally)` is chosen by the term's type at
-compile time; a term that a scene does not have is never compiled. To add a law, write one file with such a NamedTuple
-and an `@implements(add_forces)` (or, for a law between pairs of sites, an `@implements(pairs.pair)`).
+A term is a frozen NamedTuple of numbers: it says what acts. A workspace is what an engine makes of a term to compute
+it: the term's numbers and, where it needs them, lists, grids, sums and machine code. It belongs to that engine.
+`add_forces(workspace, state, load, tally)` is chosen by the workspace's type at compile time; what a scene does not
+have is never compiled. To add a law, write one file with a NamedTuple and an `@implements(add_forces)` (or, for a law
+between pairs of sites, an `@implements(pairs.pair)`). A term that needs no workspace is its own.
 """
 
 from typing import NamedTuple
@@ -10,56 +12,31 @@ from typing import NamedTuple
 import numpy as np
 from numba import literal_unroll
 
+from rigidmd.core.state import OK
 from rigidmd.jit import implements, is_a, kernel
 
-# What a kernel reports; the worst one wins, Python acts on it (dynamics.engine).
-OK = 0
-ASK = 1  # a Python function has to be asked for its force: ask it and call again
-LIST_FULL = 2  # the neighbour list needs more room: enlarge it and call again
-NOT_FINITE = 3  # a position is not a number, or so large that it says nothing any more
+
+class Setup(NamedTuple):
+    """What an engine makes workspaces for."""
+
+    cell: np.ndarray  # (3, 3) as it is at first; workspaces follow that of the state
+    dtype: type  # of the arithmetic between sites: numpy.float64 or numpy.float32
+    skin: float  # extra radius of neighbour lists, Å
 
 
-class State(NamedTuple):
-    """Everything that changes during a run, and nothing else. float64; n bodies; molecules in Å, ps, u, bodies in SI.
-
-    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3): what does not turn is not stored. Nor is
-    the position and velocity of a body that is pinned at a point: (0, 3).
-    """
-
-    position: np.ndarray  # (n, 3) centre of mass, lab frame, never wrapped
-    velocity: np.ndarray  # (n, 3) lab frame
-    rotation: np.ndarray  # (n, 3, 3) Q, body to lab
-    angular_momentum_body: np.ndarray  # (n, 3)
-    time: np.ndarray  # (1,)
-    work: np.ndarray  # (1,) done on a body so far by what drives or brakes it; its energy less this is conserved
-
-    def copy(self) -> "State":
-        """A state that shares nothing with this one."""
-        return State(*(array.copy() for array in self))
+def workspace_of(term: NamedTuple, setup: Setup) -> NamedTuple:
+    """Room to compute a term, nothing compiled yet; the term itself where it needs none."""
+    return term.workspace(setup) if hasattr(term, "workspace") else term
 
 
-class Load(NamedTuple):
-    """What acts on the bodies at the present positions."""
-
-    force: np.ndarray  # (n, 3) lab frame; (0, 3) for a pinned body
-    torque_body: np.ndarray  # (n, 3) body frame; (0, 3) for points
+def with_code(workspace: NamedTuple) -> NamedTuple:
+    """The workspace with its machine code."""
+    return workspace.with_code() if hasattr(workspace, "with_code") else workspace
 
 
-#: What states and loads of molecules are: works are compiled for these types of arrays.
-EXAMPLE = (
-    State(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(1), np.zeros(1)),
-    Load(np.zeros((0, 3)), np.zeros((0, 3))),
-)
-
-
-def no_load(state: State) -> Load:
-    """Zero forces and torques for the bodies of a state."""
-    return Load(np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body))
-
-
-# A tally is a float64 array (10,): energy, then the molecular virial tensor sum F (x) R in rows (u Å²/ps²).
-# None in its place compiles the kernels without energies.
-TALLY_SIZE = 10
+def with_room(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
+    """The workspace with all the room that it asked for, for a cell (3, 3). Raises SimulationError."""
+    return workspace.with_room(cell) if hasattr(workspace, "with_room") else workspace
 
 
 def add_forces(term, state, load, tally):
@@ -89,16 +66,6 @@ class NoForce(NamedTuple):
 def _add_no_force(term, state, load, tally):
     if is_a(term, NoForce):
         return lambda term, state, load, tally: OK
-
-
-def with_room(term: NamedTuple) -> NamedTuple:
-    """The term with its machine code and all the room that it asked for; a term that needs none as it is."""
-    return term.with_room() if hasattr(term, "with_room") else term
-
-
-def with_own_work(term: NamedTuple) -> NamedTuple:
-    """The term with work arrays that it shares with no other; a term that has none as it is."""
-    return term.with_own_work() if hasattr(term, "with_own_work") else term
 
 
 @kernel(outer=True)

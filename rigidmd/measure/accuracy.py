@@ -8,10 +8,10 @@ from scipy.special import erf
 
 from rigidmd.build.momenta import mobile
 from rigidmd.build.system import System, build
+from rigidmd.core.state import State
 from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.sites import place_sites
-from rigidmd.forces.terms import State
 from rigidmd.units import COULOMB
 
 #: The sum that others are held against leaves out so much of what they are estimated to.
@@ -73,8 +73,8 @@ def rounding(system: System, state: State) -> tuple[float, float] | None:
     scene = system.scene
     if scene.precision == "double":
         return None
-    double = build(scene.model_copy(update={"precision": "double"}))
-    found, exact = (Engine(s.model, s.terms).evaluate(state)[0] for s in (system, double))
+    exact = Engine(system.model, system.terms, "double", scene.forces.skin_A).evaluate(state)[0]
+    found = system.engine().evaluate(state)[0]
     errors = []
     for a, b in zip(found, exact, strict=True):
         size = float(np.linalg.norm(b))
@@ -84,11 +84,11 @@ def rounding(system: System, state: State) -> tuple[float, float] | None:
 
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     """Coulomb forces on charged sites (s, 3), pairs inside molecules left out, and the Coulomb energy."""
-    engine = Engine(system.model, {name: term for name, term in system.terms.items() if name.startswith("coulomb")})
+    charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
+    engine = Engine(system.model, charged, system.scene.precision, system.scene.forces.skin_A)
     _, tallies = engine.evaluate(state)
-    terms = engine.terms
-    force = sum(term.site_force for term in terms.values() if hasattr(term, "site_force"))
-    real = terms["coulomb_real"]
+    force = sum(workspace.site_force for workspace in engine.workspaces.values() if hasattr(workspace, "site_force"))
+    real = system.terms["coulomb_real"]
     position = np.empty_like(force)
     place_sites(real.sites, state, position)
     force = force + _inside(real.law.charge, position, real.sites.first, real.law.alpha)

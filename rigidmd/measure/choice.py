@@ -6,8 +6,8 @@ Forces, not seconds: the same scene makes the same choice on every machine and e
 from math import ceil, floor, inf, log10
 from typing import NamedTuple
 
+from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
-from rigidmd.forces.terms import State
 from rigidmd.measure.precision import Subject, Trial, end_of, gap, look
 
 #: In this order: a later one that costs more at its first good step is not refined.

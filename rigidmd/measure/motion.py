@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.body import BodySystem
+from rigidmd.core.state import WORK, State
 from rigidmd.forces.fields import Drive, SteadyForce, Told
 from rigidmd.forces.frame import Inertial
 from rigidmd.forces.resistance import NoResistance
-from rigidmd.forces.terms import State
 from rigidmd.mechanics.course import is_steady
 from rigidmd.mechanics.flight import Immersed, inertial_masses
 from rigidmd.mechanics.rotation import direction, to_euler_angles, to_quaternion
@@ -115,7 +115,12 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
                 potential -= position @ term.force
             if system.turns:
                 potential -= np.einsum("i,tij,j->t", term.force, rotation, term.point)
-    return {"kinetic": kinetic, "potential": potential, "energy": kinetic + potential, "work": states.work.reshape(n)}
+    return {
+        "kinetic": kinetic,
+        "potential": potential,
+        "energy": kinetic + potential,
+        "work": states.books.reshape(n, 2)[:, WORK],
+    }
 
 
 def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.system import System
+from rigidmd.core.state import Load, State
 from rigidmd.dynamics.engine import Engine
-from rigidmd.forces.terms import Load, State
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import BAR, BOLTZMANN
 
@@ -68,6 +68,10 @@ def observe(system: System, engine: Engine, state: State, verlet_step: float = n
     """
     load, tallies = engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
+    volume, beyond = state.volume, 0.0
+    if system.tail is not None:
+        components["lennard_jones_tail"] = system.tail.energy(volume)
+        beyond = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     model = system.model
     mass = model.mass[model.species]
@@ -81,8 +85,9 @@ def observe(system: System, engine: Engine, state: State, verlet_step: float = n
     if len(load.torque_body):
         rotation_unbiased += slant * float((load.torque_body**2 * model.inverse_inertia[model.species]).sum())
     freedom = system.freedom
-    volume = system.space.volume
-    pressure = (2 * translation + virial.trace()) / (3 * volume) + system.tail_pressure if volume < inf else nan
+    pressure = nan
+    if volume < inf:
+        pressure = (2 * translation + virial.trace()) / (3 * volume) + system.constant_pressure + beyond
     return Observation(
         components=components,
         virial=virial,

@@ -14,12 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.schemes import Scheme
+from rigidmd.core.state import State
 from rigidmd.dynamics.engine import Engine, NotFiniteError
 from rigidmd.dynamics.odes import RK4, OdeEngine, Solver
-from rigidmd.dynamics.schemes import Scheme
-from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.errors import SimulationError
-from rigidmd.forces.terms import State
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import Observation
 from rigidmd.measure.summary import mean
@@ -190,7 +189,7 @@ def measure(
     share, whole = 0.0, sum(trial.forces * (repeats + (averages or 0.0) / span) for trial in good)
     for _ in range(repeats):
         for trial in good:
-            engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
+            engine, state = _begun(subject, trial)
             _advance(subject, engine, state, trial, 0)
             began = clock.perf_counter()
             _advance(subject, engine, state, trial, trial.steps)
@@ -224,19 +223,32 @@ def plan(subject: Subject, steps: dict[str, list[float]]) -> list[Trial]:
     return list(trials.values())
 
 
+def _begun(subject: Subject, trial: Trial) -> tuple[Engine, State]:
+    """A new engine for a trial, and the start for it to move."""
+    method = subject.methods[trial.integrator]
+    engine = method.engine()
+    return engine, engine.begin(subject.state, _how(method, trial))
+
+
+def _how(method: Method, trial: Trial) -> Scheme | Solver:
+    """What moves the subject, with the tolerance of a trial where it has one."""
+    if not method.chooses_steps:
+        return method.how
+    return method.how._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
+
+
 def _advance(subject: Subject, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
     method = subject.methods[trial.integrator]
-    how, dt = method.how, trial.timestep * subject.time_size
-    if method.chooses_steps:
-        how = how._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
-        dt = subject.span / trial.steps
-    engine.advance(state, how, dt, steps, NoThermostat(), done)
+    how = _how(method, trial)
+    dt = subject.span / trial.steps if method.chooses_steps else trial.timestep * subject.time_size
+    engine.advance(state, how, dt, done + steps)
 
 
 def end_of(subject: Subject, method: Method, steps: int) -> State:
     """The end of the span in so many steps."""
-    engine, state = method.engine(), subject.state.copy()
-    engine.advance(state, method.how, subject.span / steps, steps, NoThermostat())
+    engine = method.engine()
+    state = engine.begin(subject.state, method.how)
+    engine.advance(state, method.how, subject.span / steps, steps)
     return state
 
 
@@ -248,7 +260,7 @@ def gap(a: State, b: State) -> tuple[float, float]:
 
 def look(subject: Subject, trial: Trial, exact: State | None) -> None:
     """One run with looks at what is conserved; all of the trial but its seconds. Its end is held against `exact`."""
-    engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
+    engine, state = _begun(subject, trial)
     first = subject.energy(engine, state)
     times, energies = [0.0], [0.0]
     every, done = max(1, trial.steps // LOOKS), 0
@@ -284,7 +296,7 @@ def look(subject: Subject, trial: Trial, exact: State | None) -> None:
 
 def _average(subject: Subject, trial: Trial, length: float) -> None:
     """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and without bias."""
-    engine, state = subject.methods[trial.integrator].engine(), subject.state.copy()
+    engine, state = _begun(subject, trial)
     dt = trial.timestep * subject.time_size
     verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
     every = max(1, round(LOOK_PS / dt))

@@ -8,11 +8,10 @@ import numpy as np
 
 from rigidmd.build.body import BodySystem
 from rigidmd.build.system import System
-from rigidmd.dynamics.engine import Engine
+from rigidmd.core.schemes import DRIFT, KICK, Scheme
+from rigidmd.core.state import Load, State
 from rigidmd.dynamics.odes import RK4, Solver
-from rigidmd.dynamics.schemes import Scheme
 from rigidmd.forces.fields import SteadyForce
-from rigidmd.forces.terms import Load, State
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.mechanics.rotor import SplitRotor
 
@@ -35,14 +34,14 @@ def stable_angle(method: Scheme | Solver) -> float:
         return 2 * sqrt(2) if method.name == RK4 else inf
     angle = np.linspace(0, 30, 30_001)
     z = angle**2
-    gradients = method.gradients or (0.0,) * len(method.kicks)
     one, none = np.ones_like(z), np.zeros_like(z)
     x, v = (one, none), (none, one)  # rows of the matrix, of (x, v dt)
-    for k, (kick, gradient) in enumerate(zip(method.kicks, gradients, strict=True)):
-        push = kick * z * (1 - gradient * z)
-        v = tuple(b - push * a for a, b in zip(x, v, strict=True))
-        if k < len(method.drifts):
-            x = tuple(a + method.drifts[k] * b for a, b in zip(x, v, strict=True))
+    for flow in method.flows:
+        if flow.kind == KICK:
+            push = flow.fraction * z * (1 - flow.gradient * z)
+            v = tuple(b - push * a for a, b in zip(x, v, strict=True))
+        elif flow.kind == DRIFT:
+            x = tuple(a + flow.fraction * b for a, b in zip(x, v, strict=True))
     beyond = np.abs(x[0] + v[1]) > 2 + 1e-9
     return float(angle[beyond.argmax()]) if beyond.any() else inf
 
@@ -60,7 +59,7 @@ def stiffest(system: System, state: State) -> Stiffest | None:
     The largest eigenvalue of the mass-weighted matrix of force differences, in the space that it makes of one random
     vector (Arnoldi); the state is left alone. One evaluation of forces for each of `DIRECTIONS` directions.
     """
-    model, engine = system.model, Engine(system.model, system.terms)
+    model, engine = system.model, system.engine()
     mass = np.sqrt(model.inverse_mass[model.species])[:, None]
     inertia = np.sqrt(model.inverse_inertia[model.species])[: len(state.rotation)]
     radius = np.array([m.radius for m in system.species])[model.species][: len(state.rotation), None]

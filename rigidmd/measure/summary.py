@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.build.relief import Relief
 from rigidmd.build.system import System
-from rigidmd.forces.terms import State
+from rigidmd.core.state import State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL

@@ -13,12 +13,12 @@ from rigidmd.build.body import BodySystem
 from rigidmd.build.overlaps import OVERLAP, close_pairs
 from rigidmd.build.relief import kicks
 from rigidmd.build.system import System
+from rigidmd.core.schemes import Scheme
+from rigidmd.core.state import Load, State
 from rigidmd.dynamics.engine import NotFiniteError
 from rigidmd.dynamics.odes import Solver
-from rigidmd.dynamics.schemes import Scheme
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import SteadyForce
-from rigidmd.forces.terms import Load, State
 from rigidmd.measure.motion import energies, is_balanced
 from rigidmd.measure.samples import Sample
 from rigidmd.mechanics.rotation import orthogonality_error
@@ -259,7 +259,7 @@ class BodyCheck:
         self._moved = abs(self._start["kinetic"]) + (0.0 if system.flies else 2 * swing)
 
     def _energies(self, state: State) -> dict[str, float]:
-        columns = energies(self.system, state.time, State(*(array[None] for array in state)))
+        columns = energies(self.system, state.time[:1], State(*(array[None] for array in state)))
         return {name: float(values[0]) for name, values in columns.items()}
 
     @np.errstate(over="ignore", invalid="ignore")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.state import WORK
 from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.course import Course, rate, value
 
@@ -333,9 +334,9 @@ def _turn_alone(rotor, state, time, h):
             1 / value(rotor.inertia, middle, 2),
         )
         offset = (value(rotor.momentum, middle, 0), value(rotor.momentum, middle, 1), value(rotor.momentum, middle, 2))
-        state.work[0] += driven_energy(rotor, L, middle) - before
+        state.books[WORK] += driven_energy(rotor, L, middle) - before
         turn_by_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
-        state.work[0] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
+        state.books[WORK] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
 
     return turn_driven
 

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.build.system import System
-from rigidmd.forces.space import cell_of
-from rigidmd.forces.terms import State
+from rigidmd.core.state import State
 from rigidmd.output.folder import whole_file
 
 
@@ -17,6 +16,5 @@ def write_state(path: Path, system: System, state: State) -> None:
             temporary,
             species_names=np.array([m.name for m in system.species]),
             species=system.model.species,
-            cell=cell_of(system.space),
             **state._asdict(),
         )

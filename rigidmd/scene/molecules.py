@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.dynamics.schemes import AUTO, SCHEMES, Rotor, Scheme, auto_faults, rotor_fault
+from rigidmd.core.schemes import AUTO, SCHEMES, Rotor, Scheme, auto_faults, rotor_fault
 from rigidmd.molecules import Mixing, Site, SiteName, model_fault
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.watch import Watch

@@ -8,7 +8,7 @@ from math import ceil
 import numpy as np
 
 from rigidmd.build.body import Pose, build_body
-from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.core.state import NOW
 from rigidmd.errors import SimulationError
 from rigidmd.forces.frame import Inertial
 from rigidmd.measure.body_summary import summarise_body
@@ -52,11 +52,11 @@ class BodySimulation(Simulation):
 
     def _reset(self) -> None:
         self.engine = self.system.engine()
-        self.state = self.system.state.copy()
+        self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
         self._say("compiling (kept on disk: the next run starts at once)")
-        self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0, NoThermostat())
+        self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0)
         self._reset()
         self._stretches = self._phases()
         self._watch = BodyCheck(self.system, self.scene.watch)
@@ -74,8 +74,8 @@ class BodySimulation(Simulation):
 
     def _begin(self, k: int) -> Phase:
         if k > 0:
-            self.state.time[0] = self.system.breaks()[k - 1]
-            self.engine.change(*self.system.during(float(self.state.time[0])))
+            self.state.begin_stretch(self.system.breaks()[k - 1])
+            self.engine.change(*self.system.during(float(self.state.time[NOW])))
         return self._stretches[k]
 
     def _phases(self) -> list[Phase]:
@@ -93,7 +93,8 @@ class BodySimulation(Simulation):
         return phases
 
     def _advance(self, k: int, steps: int, done: int) -> None:
-        self.engine.advance(self.state, self.system.method, self._stretches[k].dt, steps, NoThermostat(), done)
+        until = int(self.state.step[NOW]) + steps
+        self.engine.advance(self.state, self.system.method, self._stretches[k].dt, until)
 
     def _patience(self, k: int) -> int:
         """Half a second or less of computing."""

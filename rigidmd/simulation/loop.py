@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.state import State
 from rigidmd.dynamics.engine import NotFiniteError
 from rigidmd.errors import SimulationError
-from rigidmd.forces.terms import State
 from rigidmd.output.folder import check_folder, make_folder
 from rigidmd.scene import BodyScene, Scene
 
@@ -270,7 +270,7 @@ class Simulation(ABC):
                     began = clock.perf_counter()
                     self._advance(k, to - done, done)
                     seconds += clock.perf_counter() - began
-                    if not all(np.isfinite(array).all() for array in self.state):
+                    if not self.state.is_finite:
                         raise NotFiniteError(self.state)
                     bar.update(phase.dt * (to - done))
                     done = to

@@ -3,17 +3,17 @@
 import contextlib
 from collections.abc import Callable
 from math import nan
-from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from rigidmd.build.relief import Relief, relieve
 from rigidmd.build.system import build
-from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.thermostats import NoThermostat, VelocityRescaling
+from rigidmd.core.schemes import Scheme
+from rigidmd.core.state import NOW, Load, State
+from rigidmd.dynamics.baths import VelocityRescaling
+from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.forces.terms import Load, State
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.observables import Observation, observe
@@ -27,7 +27,6 @@ from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
 from rigidmd.simulation.subjects import choose_for_molecules
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
 
-STREAM_THERMOSTAT = 3  # see build.system for the others
 LAST_GOOD_STATE = "last_good_state.npz"
 
 
@@ -50,7 +49,7 @@ class MolecularSimulation(Simulation):
         return observe(self.system, self.engine, self.state, step)
 
     def _reset(self) -> None:
-        self.engine = Engine(self.system.model, self.system.terms)
+        self.engine = self.system.engine()
         self.state = self.system.state.copy()
         self.scene = self.system.scene = self._asked  # a run may have decided what it leaves open
         numba.set_num_threads(self.threads)
@@ -99,7 +98,7 @@ class MolecularSimulation(Simulation):
                     )
         for k in range(len(self.scene.stages)):
             if not self.scene.stages[k].is_open:
-                self.engine.advance(self.state, self.scene.stages[k].scheme, 0.0, 0, self._thermostat(k))
+                self.engine.advance(self.state, self._row(k), 0.0, 0)
         self.engine.forget()
         self._relief = relief
         self._choices: dict[int, str] = {}
@@ -107,27 +106,22 @@ class MolecularSimulation(Simulation):
         self._stage = 0
         self._last_good: tuple[int, float, State] | None = None
         self._thermal = 0.0
-        self._thermostats = [self._thermostat(k) for k in range(len(self.scene.stages))]
 
-    def _thermostat(self, k: int) -> NamedTuple:
+    def _row(self, k: int) -> Scheme:
+        """The scheme of a stage, with its thermostat."""
         stage = self.scene.stages[k]
         idle = stage.ensemble == "nve"
         if all(stage.ensemble == "nve" for stage in self.scene.stages):
-            return NoThermostat()
+            return stage.scheme
         # a stage without a thermostat among others with one has one that rests: all then run the same machine code
-        seed = np.random.SeedSequence([self.scene.seed, STREAM_THERMOSTAT, k])
-        return VelocityRescaling(
-            0.0 if idle else BOLTZMANN * stage.temperature_K,
-            np.inf if idle else stage.thermostat_time_ps,
-            self.system.freedom.total,
-            np.random.Generator(np.random.Philox(seed)),
-            np.zeros(1),
+        return stage.scheme.with_bath(
+            VelocityRescaling(
+                0.0 if idle else BOLTZMANN * stage.temperature_K,
+                np.inf if idle else stage.thermostat_time_ps,
+                self.system.freedom.total,
+                key_of(self.scene.seed, BATH, k),
+            )
         )
-
-    def _heat(self, k: int) -> float:
-        """Energy that the thermostat of a stage has put in so far."""
-        thermostat = self._thermostats[k]
-        return float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
 
     def _durations(self) -> list[float]:
         return [stage.duration_ps for stage in self.scene.stages]
@@ -138,7 +132,8 @@ class MolecularSimulation(Simulation):
         self._stage = k
         self._estimate(k)
         # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
-        self.engine = Engine(self.system.model, self.system.terms)
+        self.engine = self.system.engine()
+        self.state.begin_stretch()
         stage = self.scene.stages[k]
         return Phase(stage.timestep_fs * FEMTOSECOND, stage.steps)
 
@@ -176,9 +171,8 @@ class MolecularSimulation(Simulation):
             write_scene(self.folder, self.scene, self.system)
 
     def _advance(self, k: int, steps: int, done: int) -> None:
-        stage = self.scene.stages[k]
-        dt = stage.timestep_fs * FEMTOSECOND
-        self.engine.advance(self.state, stage.scheme, dt, steps, self._thermostats[k], done)
+        dt = self.scene.stages[k].timestep_fs * FEMTOSECOND
+        self.engine.advance(self.state, self._row(k), dt, int(self.state.step[NOW]) + steps)
 
     def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
         results.samples = Samples()
@@ -191,9 +185,9 @@ class MolecularSimulation(Simulation):
 
         def sample(moment: Moment) -> None:
             seen = moment.observation
-            conserved = seen.energy - self._heat(moment.stage)
+            conserved = seen.energy - float(self.state.books.sum())
             begin = begins.setdefault(moment.stage, max(0, len(samples.rows) - 1))
-            origin = samples.rows[begin].energy if samples.rows else conserved
+            origin = samples.rows[begin].conserved if samples.rows else conserved
             samples.rows.append(
                 Sample(
                     moment.step,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from rigidmd.dynamics.schemes import SCHEMES
+from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SceneError
 from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.precision import Precision, Subject, measure, plan

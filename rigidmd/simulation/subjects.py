@@ -11,12 +11,10 @@ import numpy as np
 from rigidmd.build.body import BodySystem, Pose, build_body
 from rigidmd.build.momenta import mobile
 from rigidmd.build.system import System
-from rigidmd.dynamics.engine import Engine
+from rigidmd.core.schemes import SCHEMES, Scheme
+from rigidmd.core.state import State
 from rigidmd.dynamics.odes import FORMULATIONS
-from rigidmd.dynamics.schemes import SCHEMES, Scheme
-from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.errors import SceneError
-from rigidmd.forces.terms import State
 from rigidmd.measure.choice import choose
 from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.observables import observe
@@ -50,7 +48,7 @@ def natural_time(system: System, state: State) -> float | None:
     Its inverse squared is <F²/m> / <m v²>, for a harmonic motion in equilibrium its mean square frequency; the same of
     torques.
     """
-    engine = Engine(system.model, system.terms)
+    engine = system.engine()
     load, _ = engine.evaluate(state)
     mass, inverse = (system.model.mass[system.model.species], system.model.inverse_mass[system.model.species])
     rates = [_ratio((load.force**2).sum(axis=1) @ inverse, mass @ (state.velocity**2).sum(axis=1))]
@@ -67,8 +65,9 @@ def _ratio(a: float, b: float) -> float:
 def molecular_subject(system: System, start: State, rotor: str | None, span: float) -> Subject:
     """Molecules from a state on, for `span` ps."""
     state = start.copy()
-    state.time[0] = 0.0
-    kinetic = observe(system, Engine(system.model, system.terms), state).kinetic
+    state.step[:] = 0
+    state.begin_stretch(0.0)
+    kinetic = observe(system, system.engine(), state).kinetic
     freedom = max(system.freedom.total, 1)
     thermal = 2 * kinetic / freedom
     mass = system.model.mass[system.model.species]
@@ -88,7 +87,7 @@ def molecular_subject(system: System, start: State, rotor: str | None, span: flo
     return Subject(
         name=system.scene.name,
         state=state,
-        methods={name: Method(lambda: Engine(system.model, system.terms), _on_rotor(name, rotor)) for name in SCHEMES},
+        methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
         energy=lambda engine, now: observe(system, engine, now).energy,
         energy_unit="kT per degree of freedom",
         energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
@@ -187,10 +186,11 @@ def body_subject(
 
 def _first_look(system: BodySystem, whole: float) -> Motion:
     """How the body moves in this time, roughly."""
-    engine, state = system.engine(), system.state.copy()
+    engine = system.engine()
+    state = engine.begin(system.state, system.method)
     snapshots, every = [Snapshot(0.0, state.copy())], STEPS // LOOKS
     for k in range(LOOKS):
-        engine.advance(state, system.method, whole / STEPS, every, NoThermostat(), k * every)
+        engine.advance(state, system.method, whole / STEPS, (k + 1) * every)
         snapshots.append(Snapshot(float(state.time[0]), state.copy()))
     return motion(system, snapshots)
 

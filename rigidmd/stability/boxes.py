@@ -7,7 +7,6 @@ import numpy as np
 
 from rigidmd.build.describe import describe
 from rigidmd.build.system import build
-from rigidmd.dynamics.engine import Engine
 from rigidmd.measure.stability import REFUSED, RIGHT, Finding, Outcome
 from rigidmd.scene import Scene
 from rigidmd.stability.cases import case
@@ -58,14 +57,14 @@ def far_away(find: Finding, quick: bool) -> None:
     system = build(Scene.from_dict(data))
     state = system.state.copy()
     state.position[:] = np.round(state.position * 2**10) / 2**10
-    load, tallies = Engine(system.model, system.terms).evaluate(state)
+    load, tallies = system.engine().evaluate(state)
     energy = sum(tally.energy for tally in tallies.values())
     force = np.abs(load.force).max()
 
     def moved(position) -> Outcome:
         other = state.copy()
         other.position[:] = position
-        load_there, there = Engine(system.model, system.terms).evaluate(other)
+        load_there, there = system.engine().evaluate(other)
         gap = abs(sum(tally.energy for tally in there.values()) - energy) / abs(energy)
         return Outcome(max(gap, np.abs(load_there.force - load.force).max() / force), 0.0)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.build.system import build
-from rigidmd.forces.terms import State
+from rigidmd.core.state import State
 from rigidmd.measure.stability import REFUSED, RIGHT, TOLD, Finding, Outcome, longest_step
 from rigidmd.output.state import write_state
 from rigidmd.scene import Scene

@@ -8,8 +8,8 @@ from math import inf, nan
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
-from rigidmd.forces.terms import State
 from rigidmd.measure.stability import Outcome
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.scene import Scene

@@ -4,7 +4,7 @@ from math import hypot
 
 import numpy as np
 
-from rigidmd.forces.terms import State
+from rigidmd.core.state import State
 from rigidmd.measure.stability import Finding, Outcome, longest_step
 from rigidmd.measure.summary import mean
 from rigidmd.stability.cases import case

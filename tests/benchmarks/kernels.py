@@ -16,17 +16,17 @@ import time
 
 import numba
 import numpy as np
-from numba import njit
+from numba import literally, njit
 from peers import WORKLOADS, choice, numbers, start_of
 from scipy.spatial import cKDTree
 
 from rigidmd import Scene, Simulation
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
-from rigidmd.forces.neighbors import end_of_row, farthest
-from rigidmd.forces.pairs import PRECISIONS, PairForces
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import State, no_load
+from rigidmd.dynamics.engine import DTYPES
+from rigidmd.forces.neighbors import BUILDS, MASKED, end_of_row, farthest
+from rigidmd.forces.pairs import PairWorkspace
 from rigidmd.forces.sites import place_sites
-from rigidmd.forces.terms import State, no_load
 from rigidmd.jit import SIMD_BITS, call, call_blocks, packed
 
 STEP = 2e-3  # ps
@@ -36,15 +36,15 @@ ENDINGS = ("shift", "switch", "smooth_switch")
 
 
 @njit
-def run_blocks(address, content, blocks):
-    """All blocks of a work on this thread."""
-    call_blocks(address, packed(content), blocks)
+def run_blocks(code, name, content, blocks):
+    """All blocks of a task on this thread."""
+    call_blocks(code, literally(name), packed(content), blocks)
 
 
 @njit
-def run_once(address, content):
-    """A work that has one block."""
-    call(address, packed(content), 0)
+def run_once(code, name, content):
+    """A task that has one block."""
+    call(code, literally(name), packed(content))
 
 
 @njit
@@ -71,9 +71,9 @@ def milliseconds(function, *arguments) -> float:
     return 1e3 * min(taken)
 
 
-def useful_pairs(term: PairForces, state: State) -> int:
+def useful_pairs(term: PairWorkspace, state: State) -> int:
     """Pairs of sites of different molecules inside the cut-off."""
-    edges, group = np.array(term.space.edges), term.pairs.group
+    edges, group = state.cell.diagonal(), term.pairs.group
     position = np.empty((len(group), 3))
     place_sites(term.sites, state, position)
     tree = cKDTree(np.mod(position, edges) % edges, boxsize=edges)
@@ -81,10 +81,10 @@ def useful_pairs(term: PairForces, state: State) -> int:
     return int((group[found[:, 0]] != group[found[:, 1]]).sum())
 
 
-def lanes_of(term: PairForces) -> int:
+def lanes_of(term: PairWorkspace) -> int:
     """Lanes that the loop works on with the list as it is."""
     pairs = term.pairs
-    rows = entries_that_matter(pairs) + pairs.needed[:, 1].sum()
+    rows = entries_that_matter(pairs) + pairs.needed[:, MASKED].sum()
     return int(rows) * 2 * 4 * len(pairs.clusters.order) // len(pairs.clusters.origin)
 
 
@@ -96,38 +96,38 @@ def measure(job: dict) -> list[dict]:
     simulation = Simulation(scene)
     engine, state = simulation.engine, simulation.state
     numba.set_num_threads(1)
-    scheme, still = SCHEMES["velocity_verlet"], NoThermostat()
-    engine.advance(state, scheme, STEP, STEPS, still)
-    builds = [term.pairs.counters[1] for term in engine.terms.values()]
+    scheme = SCHEMES["velocity_verlet"]
+    engine.advance(state, scheme, STEP, STEPS)
+    builds = [own.pairs.counters[BUILDS] for own in engine.workspaces.values()]
     began = time.perf_counter()
-    engine.advance(state, scheme, STEP, STEPS, still)
+    engine.advance(state, scheme, STEP, 2 * STEPS)
     step = 1e3 * (time.perf_counter() - began) / STEPS
     found = []
     load = no_load(state)
-    for (name, term), before in zip(engine.terms.items(), builds, strict=True):
+    for (name, term), before in zip(engine.workspaces.items(), builds, strict=True):
         pairs, blocks = term.pairs, len(term.pairs.needed)
-        parts, content = pairs.parts, (term.arranged, pairs, term.sums)
+        code, lists, content = term.code, term.list_code, (term.arranged, pairs, term.sums)
         placed, on_sites = (pairs, term.sites, state), (term.sites, term.forces_in_slots, state, load)
-        every = STEPS / max(1, pairs.counters[1] - before)
+        every = STEPS / max(1, pairs.counters[BUILDS] - before)
         lanes, useful = lanes_of(term), useful_pairs(term, state)
-        forces = milliseconds(run_blocks, term.parts.forces, content, blocks)
+        forces = milliseconds(run_blocks, code, "forces", content, blocks)
         found.append({
-            **job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * PRECISIONS[job["precision"]]().itemsize),
+            **job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * DTYPES[job["precision"]]().itemsize),
             "kernel": f"{name}, {type(term.arranged).__name__}", "step": step, "every": every,
             "per_pair": 1e6 * forces / useful, "per_lane": 1e6 * forces / lanes, "useful": useful / lanes,
             "parts": {
                 "pairs": forces,
-                "gather": milliseconds(run_blocks, term.parts.gather, content, blocks),
-                "follow": milliseconds(run_blocks, parts.follow, pairs, blocks),
-                "sites": milliseconds(run_blocks, parts.place, placed, blocks)
-                + milliseconds(run_once, term.parts.hand_over, on_sites),
+                "gather": milliseconds(run_blocks, code, "gather", content, blocks),
+                "follow": milliseconds(run_blocks, lists, "follow", pairs, blocks),
+                "sites": milliseconds(run_blocks, lists, "place", placed, blocks)
+                + milliseconds(run_once, code, "hand_over", on_sites),
                 "list": (
-                    milliseconds(run_blocks, parts.wrap, placed, blocks)
-                    + milliseconds(run_blocks, parts.bin, placed, blocks)
-                    + milliseconds(run_once, parts.prepare, pairs)
-                    + milliseconds(run_blocks, parts.settle, placed, blocks)
-                    + milliseconds(run_once, parts.grow, pairs)
-                    + milliseconds(run_blocks, parts.fill, pairs, blocks)
+                    milliseconds(run_blocks, lists, "wrap", placed, blocks)
+                    + milliseconds(run_blocks, lists, "bin", placed, blocks)
+                    + milliseconds(run_once, lists, "prepare", pairs)
+                    + milliseconds(run_blocks, lists, "settle", placed, blocks)
+                    + milliseconds(run_once, lists, "grow", pairs)
+                    + milliseconds(run_blocks, lists, "fill", pairs, blocks)
                 ) / every,
             },
         })  # fmt: skip

@@ -73,15 +73,14 @@ class Rigidmd:
     @staticmethod
     def run(job: dict, sites: dict, folder: Path) -> dict:
         from rigidmd import Scene, Simulation
-        from rigidmd.dynamics.schemes import SCHEMES
-        from rigidmd.dynamics.thermostats import NoThermostat
+        from rigidmd.core.schemes import SCHEMES
         from rigidmd.measure.observables import observe
         from rigidmd.units import KJ_PER_MOL
 
         simulation = Simulation(Scene.from_dict(job["scene"], Path(job["sites"]).parent))
         system, engine, start = simulation.system, simulation.engine, simulation.state
         scheme, dt = SCHEMES[job["options"]["integrator"]], job["timestep_fs"] * 1e-3
-        engine.advance(start.copy(), scheme, dt, WARM_UP, NoThermostat())
+        engine.advance(start.copy(), scheme, dt, WARM_UP)
         engine.forget()
         looks, seconds, done, state = [], 0.0, 0, start.copy()
 
@@ -94,12 +93,12 @@ class Rigidmd:
             np.save(folder / "forces.npy", observe(system, engine, state).load.force / KJ_PER_MOL)
         for now in pieces(job):
             began = time.perf_counter()
-            engine.advance(state, scheme, dt, now, NoThermostat(), done)
+            engine.advance(state, scheme, dt, done + now)
             seconds += time.perf_counter() - began
             done += now
             if job["every"]:
                 look()
-        lists = [term.pairs for term in engine.terms.values() if hasattr(term, "pairs")]
+        lists = [own.pairs for own in engine.workspaces.values() if hasattr(own, "pairs")]
         settings = (
             f"list {lists[0].cutoff + lists[0].skin:.4g} Å, rebuilt when a site has moved {lists[0].skin / 2:g} Å"
         )

@@ -24,8 +24,7 @@ from peers import WORKLOADS, numbers, write_start
 
 from rigidmd import Scene, Simulation
 from rigidmd.build.describe import array_bytes
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
+from rigidmd.core.schemes import SCHEMES
 
 WORK = WORKLOADS["W1"]
 UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cut-off
@@ -65,20 +64,22 @@ def measure(job: dict) -> dict:
         keep(Path(folder), job["copies"], one.state)
         simulation = Simulation(Scene.from_dict(scene(job["copies"], job["precision"]), Path(folder)))
     engine, state = simulation.engine, simulation.state
-    scheme, still = SCHEMES["velocity_verlet"], NoThermostat()
+    scheme, done = SCHEMES["velocity_verlet"], 0
     seconds = {}
     for cores in job["cores"]:
         numba.set_num_threads(cores)
-        engine.advance(state, scheme, STEP, 3, still)
+        done += 3
+        engine.advance(state, scheme, STEP, done)
         steps, spent = 0, 0.0
         while steps < FEWEST_STEPS or spent < SECONDS:
             began = time.perf_counter()
-            engine.advance(state, scheme, STEP, FEWEST_STEPS, still)
+            done += FEWEST_STEPS
+            engine.advance(state, scheme, STEP, done)
             spent += time.perf_counter() - began
             steps += FEWEST_STEPS
         seconds[cores] = spent / steps
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    arrays = array_bytes((state, engine.load, engine.model, tuple(engine.terms.values())))
+    arrays = array_bytes((state, engine.load, engine.model, tuple(engine.workspaces.values())))
     return {"molecules": UNIT * job["copies"] ** 3, "seconds": seconds, "peak": peak, "arrays": arrays}
 
 

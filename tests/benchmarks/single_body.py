@@ -21,9 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import known
 
+from rigidmd.core.schemes import SCHEMES
 from rigidmd.dynamics.odes import OdeEngine, Solver
-from rigidmd.dynamics.schemes import SCHEMES
-from rigidmd.dynamics.thermostats import NoThermostat
 from rigidmd.scene import Scene
 from rigidmd.simulation import Simulation
 
@@ -65,7 +64,7 @@ def main():
     def flows(name, n):
         engine, state = system.engine(), start.copy()
         began = time.perf_counter()
-        engine.advance(state, SCHEMES[name], top.period / n, NUTATIONS * n, NoThermostat())
+        engine.advance(state, SCHEMES[name], top.period / n, NUTATIONS * n)
         return time.perf_counter() - began, state.rotation[0]
 
     def python(tolerance):
@@ -74,9 +73,10 @@ def main():
         return time.perf_counter() - began, y[:9].reshape(3, 3)
 
     def compiled(tolerance):
-        engine, state = OdeEngine(system.body, system.terms), start.copy()
+        engine, solver = OdeEngine(system.body, system.terms), Solver("dop853", "matrix", end, tolerance, tolerance)
+        state = engine.begin(start, solver)
         began = time.perf_counter()
-        engine.advance(state, Solver("dop853", "matrix", end, tolerance, tolerance), end, 1, NoThermostat())
+        engine.advance(state, solver, end, 1)
         return time.perf_counter() - began, state.rotation[0]
 
     cases = [(name, n, lambda name=name, n=n: flows(name, n)) for name, ns in STEPS.items() for n in ns]
@@ -106,7 +106,7 @@ def speed(system, start, top):
     for _ in range(REPEATS):
         engine, state = system.engine(), start.copy()
         began = time.perf_counter()
-        engine.advance(state, SCHEMES["velocity_verlet"], top.period / 1e4, 1_000_000, NoThermostat())
+        engine.advance(state, SCHEMES["velocity_verlet"], top.period / 1e4, 1_000_000)
         spent.append(time.perf_counter() - began)
     print(f"velocity Verlet, one core: {1 / median(spent):.2f} million steps a second\n")
 

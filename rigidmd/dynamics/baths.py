@@ -1,17 +1,18 @@
-"""Thermostats: flows on the momenta, chosen by type; NVE compiles none.
+"""Baths: flows on the momenta that keep a temperature, chosen by type; NVE compiles none.
 
-`apply(thermostat, model, state, h)` acts once a time step. Everything random comes from the thermostat's own generator.
+`apply(bath, model, state, h, draw)` acts where the row of a step says. What a bath puts in is in `state.books[HEAT]`;
+its random numbers are counted by the step, from `draw` on, see `noise`.
 """
 
 from math import exp, inf, sqrt
 from typing import NamedTuple
 
-import numpy as np
-
+from rigidmd.core.state import HEAT, NOW
+from rigidmd.dynamics.noise import Key, chi_square, normals
 from rigidmd.jit import implements, is_a, kernel
 
 
-class NoThermostat(NamedTuple):
+class NoBath(NamedTuple):
     """NVE."""
 
     rate: float = 0.0
@@ -28,40 +29,39 @@ class VelocityRescaling(NamedTuple):
     thermal_energy: float  # kB T, u Å²/ps²
     time_constant: float  # ps; if infinite it does nothing
     degrees_of_freedom: int
-    generator: np.random.Generator
-    heat: np.ndarray  # (1,) energy put in so far, u Å²/ps²; total energy - heat is conserved
+    key: Key
 
 
-def apply(thermostat, model, state, h):
-    """The thermostat's flow over a time h (ps), in place."""
+def apply(bath, model, state, h, draw):
+    """The flow of a bath over a time h (ps), in place; `draw` is its first draw in this step."""
     raise TypeError("compiled code only")
 
 
 @implements(apply)
-def _apply_none(thermostat, model, state, h):
-    if is_a(thermostat, NoThermostat):
-        return lambda thermostat, model, state, h: None
+def _apply_none(bath, model, state, h, draw):
+    if is_a(bath, NoBath):
+        return lambda bath, model, state, h, draw: None
 
 
 @implements(apply)
-def _apply_rescaling(thermostat, model, state, h):
-    if not is_a(thermostat, VelocityRescaling):
+def _apply_rescaling(bath, model, state, h, draw):
+    if not is_a(bath, VelocityRescaling):
         return None
 
-    def rescale(thermostat, model, state, h):
-        if thermostat.time_constant == inf:
+    def rescale(bath, model, state, h, draw):
+        if bath.time_constant == inf:
             return
         kinetic = kinetic_energy(model, state)
-        freedom = thermostat.degrees_of_freedom
+        freedom = bath.degrees_of_freedom
         if kinetic == 0.0 or freedom == 0:
             return
-        # eq. A7, with one Gaussian apart and the sum of the squares of the others from a Gamma distribution
-        c = exp(-h / thermostat.time_constant)
-        share = 0.5 * thermostat.thermal_energy * (1 - c) / kinetic
-        gauss = thermostat.generator.standard_normal()
-        others = 2 * thermostat.generator.standard_gamma(0.5 * (freedom - 1)) if freedom > 1 else 0.0
+        # eq. A7, with one Gaussian apart and the sum of the squares of the others at once
+        c = exp(-h / bath.time_constant)
+        share = 0.5 * bath.thermal_energy * (1 - c) / kinetic
+        gauss, _ = normals(bath.key, draw, 0, state.step[NOW])
+        others = chi_square(bath.key, draw + 1, 0, state.step[NOW], freedom - 1)
         scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
-        thermostat.heat[0] += (scale2 - 1) * kinetic
+        state.books[HEAT] += (scale2 - 1) * kinetic
         scale = sqrt(scale2)
         for m in range(len(state.velocity)):
             for k in range(3):

@@ -1,6 +1,6 @@
-"""Integrators as data: palindromes of kicks (forces and torques) and drifts (free flight and free rotation).
+"""Integrators as data: rows of flows, kicks (forces and torques), drifts (free flight and free rotation), baths.
 
-A row says by which fractions of the time step the two flows alternate, kick first. Both flows are symplectic and
+A row says by which fractions of the time step the flows follow one another. Kick and drift are symplectic and
 time-reversible, so any palindrome of them is too; its coefficients decide its order.
 
 Compositions of whole Verlet steps keep their order with any rotor, because such a step is symmetric whatever the rotor
@@ -10,37 +10,92 @@ does. Every other row counts on a drift that is the free motion itself: with the
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
+#: The flows that a step is made of: by the forces, free flight and free rotation, by a bath.
+KICK, DRIFT, BATH = 0, 1, 2
+
+
+class Flow(NamedTuple):
+    """One flow of a step."""
+
+    kind: int  # KICK, DRIFT or BATH
+    fraction: float  # of the time step
+    gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.gradient)
+
 
 class Scheme(NamedTuple):
-    """kick(kicks[0] dt) drift(drifts[0] dt) kick(kicks[1] dt) ... kick(kicks[-1] dt); a kick of 0 costs nothing."""
+    """A step as a row of flows, with what the row needs to know."""
 
     name: str
-    kicks: tuple[float, ...]  # one more than drifts; sum 1
-    drifts: tuple[float, ...]  # sum 1
+    flows: tuple[Flow, ...]  # kicks add up to 1, drifts too
     order: int
     exact_rotor: bool  # whether its order needs one
     source: str
-    gradients: tuple[float, ...] = ()  # tau/dt² of each kick (dynamics.gradient); none where empty
+    bath: tuple | None = None  # whose flow BATH is (dynamics.baths)
 
     def with_rotor(self, rotor: str | None) -> "Scheme":
         """This scheme on the rotor named ("split" or "exact"); its own where none is."""
         return self if rotor is None else self._replace(exact_rotor=rotor == "exact")
 
+    def with_bath(self, bath: tuple) -> "Scheme":
+        """This scheme with a bath that acts for a whole time step at the end of each."""
+        return self._replace(flows=(*self.flows, Flow(BATH, 1.0)), bath=bath)
+
+    @property
+    def kicks(self) -> tuple[float, ...]:
+        """Fractions of its kicks."""
+        return tuple(flow.fraction for flow in self.flows if flow.kind == KICK)
+
+    @property
+    def drifts(self) -> tuple[float, ...]:
+        """Fractions of its drifts."""
+        return tuple(flow.fraction for flow in self.flows if flow.kind == DRIFT)
+
+    @property
+    def has_gradient(self) -> bool:
+        """Whether a kick uses the gradient of the forces."""
+        return any(flow.gradient for flow in self.flows)
+
     @property
     def force_evaluations(self) -> int:
-        """A step: the last kick of a step and the first of the next share theirs; a gradient takes one more."""
-        return sum(kick != 0 for kick in self.kicks[1:]) + sum(tau != 0 for tau in self.gradients)
+        """A step: each kick behind a drift takes one, the last kick of a step and the first of the next share theirs.
+
+        A gradient takes one more.
+        """
+        moving = [flow for flow in self.flows if flow.kind != BATH]
+        after_drift = sum(b.kind == KICK and a.kind == DRIFT for a, b in pairwise((moving[-1], *moving)))
+        return after_drift + sum(flow.gradient != 0 for flow in self.flows)
 
 
 def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Scheme:
     """Velocity Verlet steps of these lengths one after the other; neighbouring kicks are one."""
     kicks = (steps[0] / 2, *((a + b) / 2 for a, b in pairwise(steps)), steps[-1] / 2)
-    return Scheme(name, kicks, steps, order, False, source)
+    return Scheme(name, _alternating(kicks, steps), order, False, source)
 
 
-def split(name: str, kicks: tuple[float, ...], drifts: tuple[float, ...], order: int, source: str) -> Scheme:
-    """Kicks and drifts as they are, for an exact rotor."""
-    return Scheme(name, kicks, drifts, order, True, source)
+def split(
+    name: str,
+    kicks: tuple[float, ...],
+    drifts: tuple[float, ...],
+    order: int,
+    source: str,
+    gradients: tuple[float, ...] | None = None,
+) -> Scheme:
+    """kick(kicks[0] dt) drift(drifts[0] dt) ... kick(kicks[-1] dt) as they are, for an exact rotor.
+
+    gradients : of each kick, see `Flow.gradient`
+    """
+    return Scheme(name, _alternating(kicks, drifts, gradients), order, True, source)
+
+
+def _alternating(
+    kicks: tuple[float, ...], drifts: tuple[float, ...], gradients: tuple[float, ...] | None = None
+) -> tuple[Flow, ...]:
+    """Kick first, drift, ..., kick; those of length 0 are left out."""
+    flows = []
+    for k, (kick, tau) in enumerate(zip(kicks, gradients or (0.0,) * len(kicks), strict=True)):
+        flows.append(Flow(KICK, kick, tau))
+        flows += [Flow(DRIFT, drift) for drift in drifts[k : k + 1]]
+    return tuple(flow for flow in flows if flow.fraction)
 
 
 def odd(*half: float) -> tuple[float, ...]:
@@ -149,14 +204,16 @@ SCHEMES = {
             (0.5, 0.5),
             order=2,
             source="Takahashi & Imada 1984, J. Phys. Soc. Jpn. 53, 3765; of order 4 but for a change of variables",
-        )._replace(gradients=(0.0, 1 / 12, 0.0)),
+            gradients=(0.0, 1 / 12, 0.0),
+        ),
         split(
             "chin_4a",
             odd(1 / 6),
             (0.5, 0.5),
             order=4,
             source="Chin 1997, Phys. Lett. A 226, 344, scheme A",
-        )._replace(gradients=(0.0, 1 / 24, 0.0)),
+            gradients=(0.0, 1 / 24, 0.0),
+        ),
         composed(
             "kahan_li_6",
             odd(0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230),

@@ -1,0 +1,1 @@
+"""What every room may name without compiling anything: the state, status codes, integrators as rows."""

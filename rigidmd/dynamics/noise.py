@@ -1,0 +1,88 @@
+"""Random numbers by counting: Philox4x32-10 (Salmon et al. 2011, SC '11: Parallel random numbers: as easy as 1, 2, 3).
+
+A number is a function of a key and a counter, so there is no generator to carry along and no state to save, and any
+number of threads draws the same. The key is that of (seed, purpose, stage); the counter is (draw, molecule, step).
+"""
+
+from math import cos, log, pi, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.jit import kernel
+
+#: Purposes, each with its own stream, so that one more draw here changes nothing there.
+LATTICE, MOMENTA, BATH = 1, 2, 3
+
+MULTIPLIER_0, MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+WEYL_0, WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
+LOW = np.uint64(0xFFFFFFFF)
+HALF = np.uint64(32)
+WHOLE = 2.0**-32
+
+
+class Key(NamedTuple):
+    """The key of a stream: two 32-bit numbers."""
+
+    low: np.uint64
+    high: np.uint64
+
+
+def key_of(seed: int, purpose: int, stage: int = 0) -> Key:
+    """The key of a purpose (LATTICE, MOMENTA, BATH) in a stage; well mixed, so that seeds may be 1, 2, 3."""
+    low, high = np.random.SeedSequence([seed, purpose, stage]).generate_state(2, np.uint32)
+    return Key(np.uint64(low), np.uint64(high))
+
+
+@kernel(outer=True)
+def philox(key, draw, molecule, step):
+    """Four 32-bit numbers, as uint64, of a counter: draw and molecule below 2^32, step below 2^63."""
+    a, b = np.uint64(draw) & LOW, np.uint64(molecule) & LOW
+    c, d = np.uint64(step) & LOW, np.uint64(step) >> HALF
+    low, high = key.low, key.high
+    for _ in range(10):
+        first, second = MULTIPLIER_0 * a, MULTIPLIER_1 * c
+        a, b, c, d = (second >> HALF) ^ b ^ low, second & LOW, (first >> HALF) ^ d ^ high, first & LOW
+        low, high = (low + WEYL_0) & LOW, (high + WEYL_1) & LOW
+    return a, b, c, d
+
+
+@kernel(outer=True)
+def uniforms(key, draw, molecule, step):
+    """Two independent numbers in (0, 1), to 2^-64: neither 0 nor 1 comes up."""
+    a, b, c, d = philox(key, draw, molecule, step)
+    return ((a + 0.5) * WHOLE + b) * WHOLE, ((c + 0.5) * WHOLE + d) * WHOLE
+
+
+@kernel(outer=True)
+def normals(key, draw, molecule, step):
+    """Two independent normal numbers of mean 0 and variance 1 (Box & Muller 1958)."""
+    u, v = uniforms(key, draw, molecule, step)
+    radius = sqrt(-2 * log(u))
+    return radius * cos(2 * pi * v), radius * sin(2 * pi * v)
+
+
+@kernel(outer=True)
+def chi_square(key, draw, molecule, step, freedom):
+    """The sum of squares of so many normal numbers, from draws `draw`, draw + 1, ... (Marsaglia & Tsang 2000).
+
+    Twice a number of the Gamma distribution of shape freedom/2; below shape 1 by that of shape + 1 (their section 6).
+    """
+    if freedom == 0:
+        return 0.0
+    shape = 0.5 * freedom
+    scale = 1.0
+    if shape < 1:
+        u, _ = uniforms(key, draw, molecule, step)
+        scale = u ** (1 / shape)
+        shape += 1
+        draw += 1
+    d = shape - 1 / 3
+    c = 1 / sqrt(9 * d)
+    while True:
+        x, _ = normals(key, draw, molecule, step)
+        u, _ = uniforms(key, draw + 1, molecule, step)
+        draw += 2
+        v = (1 + c * x) ** 3
+        if v > 0 and log(u) < 0.5 * x * x + d - d * v + d * log(v):
+            return 2 * scale * d * v

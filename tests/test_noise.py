@@ -1,0 +1,64 @@
+"""Random numbers by counting: known answers, distributions, and that streams are apart."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from rigidmd.dynamics.noise import BATH, LATTICE, MOMENTA, Key, chi_square, key_of, normals, philox, uniforms
+from rigidmd.jit import kernel
+
+
+def words(*values):
+    return tuple(int(value, 16) for value in values)
+
+
+# counter (4 words), key (2 words), result: kat_vectors of Random123 for philox4x32-10
+KNOWN = [
+    (words(*["0"] * 4), words("0", "0"), words("6627e8d5", "e169c58d", "bc57ac4c", "9b00dbd8")),
+    (words(*["ffffffff"] * 4), words(*["ffffffff"] * 2), words("408f276d", "41c83b0e", "a20bc7c6", "6d5451fd")),
+    (
+        words("243f6a88", "85a308d3", "13198a2e", "03707344"),
+        words("a4093822", "299f31d0"),
+        words("d16cfe09", "94fdcceb", "5001e420", "24126ea1"),
+    ),
+]
+
+
+@pytest.mark.parametrize(("counter", "key", "result"), KNOWN)
+def test_known_answers(counter, key, result):
+    a, b, c, d = counter
+    found = philox(Key(np.uint64(key[0]), np.uint64(key[1])), np.uint64(a), np.uint64(b), np.uint64(c + (d << 32)))
+    assert tuple(map(int, found)) == result
+
+
+@kernel(outer=True)
+def fill(key, freedom, uniform, normal, square):
+    for step in range(len(square)):
+        uniform[step, 0], uniform[step, 1] = uniforms(key, 0, 0, step)
+        normal[step, 0], normal[step, 1] = normals(key, 1, 0, step)
+        square[step] = chi_square(key, 2, 0, step, freedom)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 7, 1293])
+def test_distributions(freedom):
+    n = 20_000
+    uniform, normal, square = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
+    fill(key_of(5, BATH), freedom, uniform, normal, square)
+    assert stats.kstest(uniform.ravel(), "uniform").pvalue > 1e-3
+    assert stats.kstest(normal.ravel(), "norm").pvalue > 1e-3
+    assert stats.kstest(square, "chi2", args=(freedom,)).pvalue > 1e-3
+    for pair in (uniform, normal):
+        assert abs(np.corrcoef(pair.T)[0, 1]) < 4 / np.sqrt(n)
+
+
+def test_no_freedom_has_no_energy():
+    assert chi_square(key_of(5, BATH), 0, 0, 0, 0) == 0
+
+
+def test_streams_are_apart():
+    keys = {
+        key_of(seed, purpose, stage) for seed in range(4) for purpose in (LATTICE, MOMENTA, BATH) for stage in (0, 1)
+    }
+    assert len(keys) == 4 * 3 * 2
+    numbers = {uniforms(key_of(1, BATH), draw, m, step) for draw in (0, 1) for m in (0, 1) for step in (0, 1, 2**40)}
+    assert len(numbers) == 2 * 2 * 3
