@@ -7,6 +7,7 @@ from: any change of one of them starts a new folder. `RIGIDMD_CACHE` names anoth
 
 import atexit
 import contextlib
+import functools
 import hashlib
 import os
 import re
@@ -26,7 +27,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.codegen import get_host_cpu_features
 from numba.core.errors import TypingError
@@ -57,6 +58,7 @@ def _simd_bits() -> int:
 SIMD_BITS = _simd_bits()
 
 
+@functools.cache
 def source_digest() -> str:
     """Hexadecimal digest of the sources of compiled code, of Numba's version and of the width of vectors."""
     digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS}".encode())
@@ -70,8 +72,12 @@ def _sources(place: Path) -> list[Path]:
     return [place] if place.is_file() else list(place.rglob("*.py"))
 
 
-def _cache_folder() -> str:
-    """A writable folder for compiled code; caches of older sources that nobody used for a month are removed."""
+@functools.cache
+def cache_folder() -> str:
+    """A writable folder for compiled code; caches of older sources that nobody used for a month are removed.
+
+    Nothing is read, made or removed before the first kernel is compiled.
+    """
     if named := os.environ.get("RIGIDMD_CACHE"):
         base = Path(named)
     else:
@@ -96,9 +102,6 @@ def _cache_folder() -> str:
     return str(folder)
 
 
-CACHE_FOLDER = _cache_folder()
-
-
 class Index(IndexDataCacheFile):
     """What is compiled, by the types of the arguments. One with types of a module that is not there counts as absent.
 
@@ -117,7 +120,29 @@ class Index(IndexDataCacheFile):
             return {}
 
 
-class Inner(CPUDispatcher):
+class Kernel(CPUDispatcher):
+    """A dispatcher with a cache of ours, which it opens when it first compiles."""
+
+    @property
+    def _cache(self):
+        found = self.__dict__.get("_opened")
+        if found is None:
+            found = self.__dict__["_opened"] = _opened_cache(self.py_func)
+        return found
+
+    @_cache.setter
+    def _cache(self, none) -> None:
+        """Numba sets one that does nothing when it makes a dispatcher."""
+
+
+def _opened_cache(function) -> FunctionCache:
+    with _own_cache():
+        found = FunctionCache(function)
+    found._cache_file.__class__ = Index
+    return found
+
+
+class Inner(Kernel):
     """A kernel that only compiled code calls. It has no wrapper for Python, which would take every term apart.
 
     To call one that has none ends in a crash. Without wrappers, and without copies between slices of arrays, whose
@@ -129,7 +154,7 @@ class Inner(CPUDispatcher):
 
 
 def kernel(function=None, *, parallel=False, fastmath=False, inline=False, counted=True, outer=False):
-    """`numba.njit`, cached on disk under `CACHE_FOLDER`. Other users of Numba keep their own cache folder.
+    """`numba.njit`, cached on disk in `cache_folder()`. Other users of Numba keep their own cache folder.
 
     inline: make LLVM inline it wherever it is called, for what runs in an inner loop. Terms are passed as their fields,
     forty arguments and more, and a call costs more than a pair of sites. And for whatever has fastmath: a function that
@@ -146,18 +171,15 @@ def kernel(function=None, *, parallel=False, fastmath=False, inline=False, count
         return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted, outer=outer)
     options = _options(fastmath, inline) | ({"parallel": True, "_nrt": True} if parallel else _counting(counted))
     options |= {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer}
-    with _own_cache():
-        compiled = numba.njit(cache=True, **options)(function)
-    compiled._cache._cache_file.__class__ = Index
-    if not outer:
-        compiled.__class__ = Inner
+    compiled = numba.njit(**options)(function)
+    compiled.__class__ = Kernel if outer else Inner
     return compiled
 
 
 @contextlib.contextmanager
 def _own_cache():
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = CACHE_FOLDER
+    numba.config.CACHE_DIR = cache_folder()
     try:
         yield
     finally:
@@ -235,11 +257,9 @@ class Task:
             # Code from the cache that starts threads needs them to be there. Numba sees to that, but loses sight of it
             # where what was compiled called something that itself came from the cache; that ended in a crash.
             numba.get_num_threads()
-            with _own_cache():
-                code = CFunc(self.function, ((parcel, types.intp), types.void), locals={}, options=self.options)
-                code.enable_caching()
-                code._cache._cache_file.__class__ = Index
-                code.compile()
+            code = CFunc(self.function, ((parcel, types.intp), types.void), locals={}, options=self.options)
+            code._cache = _opened_cache(self.function)
+            code.compile()
             self.compiled[parcel] = code
         return self.compiled[parcel].address
 

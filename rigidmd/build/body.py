@@ -9,11 +9,11 @@ import numpy as np
 from rigidmd.build.body_faults import order_faults, unfit, unresisted
 from rigidmd.build.body_parts import carried_fluid, frame_of, inertia_of, principal, resistance_of, rotor_of, terms_of
 from rigidmd.build.system import Sites
-from rigidmd.core.schemes import SCHEMES, Scheme
+from rigidmd.core.schemes import SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.engine import Engine
-from rigidmd.dynamics.odes import SOLVERS, OdeEngine, Solver
+from rigidmd.dynamics.odes import OdeEngine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.fields import Told
 from rigidmd.forces.frame import Inertial

@@ -3,8 +3,7 @@
 import numpy as np
 
 from rigidmd.build.body_parts import frame_of, resistance_of
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.dynamics.odes import SOLVERS
+from rigidmd.core.schemes import SCHEMES, SOLVERS
 from rigidmd.forces.frame import Turning
 from rigidmd.forces.resistance import NoResistance
 from rigidmd.mechanics.course import keeps_direction

@@ -9,8 +9,7 @@ import numpy as np
 from rigidmd.build.body import BodySystem, build_body
 from rigidmd.build.cells import angles_deg, right_angled
 from rigidmd.build.system import System, build
-from rigidmd.core.schemes import Scheme
-from rigidmd.dynamics.odes import Solver
+from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.forces.pairs import PairForces
 from rigidmd.forces.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles

@@ -131,6 +131,22 @@ def rotor_fault(integrator: str, rotor: Rotor | None) -> str:
     return ""
 
 
+#: General solvers of the textbook's equations, and the variables of attitude that they may be written in.
+RK4, DOP853, RADAU = "rk4", "dop853", "radau"
+SOLVERS = (RK4, DOP853, RADAU)
+FORMULATIONS = ("matrix", "quaternion", "euler_angles")
+
+
+class Solver(NamedTuple):
+    """A general solver of first-order systems, in place of a scheme of flows."""
+
+    name: str  # RK4, DOP853 or RADAU
+    formulation: str  # of FORMULATIONS
+    duration: float = 1.0  # of the whole run
+    relative_tolerance: float = 1e-12  # of DOP853 and RADAU
+    absolute_tolerance: float = 1e-12  # the same, in parts of the sizes that the variables have in this run
+
+
 BLANES_MOAN = "Blanes & Moan 2002, J. Comput. Appl. Math. 142, 313"
 KAHAN_LI = "Kahan & Li 1997, Math. Comp. 66, 1089; Hairer, Lubich & Wanner, section V.3"
 OMELYAN = "Omelyan, Mryglod & Folk 2002, Comput. Phys. Commun. 146, 188"

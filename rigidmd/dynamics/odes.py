@@ -7,12 +7,12 @@ and nothing here keeps Q a rotation but accuracy.
 """
 
 from math import hypot, sin
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
+from rigidmd.core.schemes import DOP853, FORMULATIONS, RADAU, RK4, Solver
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
 from rigidmd.dynamics.body import relative_motion
 from rigidmd.dynamics.engine import Engine, keep_time
@@ -34,25 +34,13 @@ from rigidmd.mechanics.odes import (
 )
 from rigidmd.mechanics.rotor import moment_rates
 
-FORMULATIONS = {"matrix": Matrix(), "quaternion": Quaternion(), "euler_angles": EulerAngles()}
-RK4, DOP853, RADAU = "rk4", "dop853", "radau"
-SOLVERS = (RK4, DOP853, RADAU)
+FORMS = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
 SINGULAR = 5  # beyond the codes of core.state: Euler angles too near theta = 0 or pi
 #: Half of the digits of phi and psi are gone there: theta itself has an error of 1e-16.
 SMALLEST_SINE = 1e-8
 #: Nearer than this, an axis that moves by its distance in a step may jump over the pole.
 NEAR_A_POLE = 0.1
-
-
-class Solver(NamedTuple):
-    """A general solver of first-order systems, in place of a scheme of flows."""
-
-    name: str  # RK4, DOP853 or RADAU
-    formulation: str  # of FORMULATIONS
-    duration: float = 1.0  # of the whole run
-    relative_tolerance: float = 1e-12  # of DOP853 and RADAU
-    absolute_tolerance: float = 1e-12  # the same, in parts of the sizes that the variables have in this run
 
 
 @kernel(outer=True)
@@ -274,7 +262,7 @@ class OdeEngine(Engine):
 
 
 def _form(solver: Solver, state: State) -> Form:
-    return FORMULATIONS[solver.formulation] if len(state.rotation) else NoAttitude()
+    return FORMS[solver.formulation] if len(state.rotation) else NoAttitude()
 
 
 class SingularError(SimulationError):

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.schemes import Scheme
+from rigidmd.core.schemes import RK4, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.dynamics.engine import Engine, NotFiniteError
-from rigidmd.dynamics.odes import RK4, OdeEngine, Solver
+from rigidmd.dynamics.odes import OdeEngine
 from rigidmd.errors import SimulationError
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import Observation

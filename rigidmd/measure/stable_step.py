@@ -8,9 +8,8 @@ import numpy as np
 
 from rigidmd.build.body import BodySystem
 from rigidmd.build.system import System
-from rigidmd.core.schemes import DRIFT, KICK, Scheme
+from rigidmd.core.schemes import DRIFT, KICK, RK4, Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.odes import RK4, Solver
 from rigidmd.forces.fields import SteadyForce
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.mechanics.rotor import SplitRotor

@@ -13,10 +13,9 @@ from rigidmd.build.body import BodySystem
 from rigidmd.build.overlaps import OVERLAP, close_pairs
 from rigidmd.build.relief import kicks
 from rigidmd.build.system import System
-from rigidmd.core.schemes import Scheme
+from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.engine import NotFiniteError
-from rigidmd.dynamics.odes import Solver
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields import SteadyForce
 from rigidmd.measure.motion import energies, is_balanced

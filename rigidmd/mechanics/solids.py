@@ -9,7 +9,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import elliprd
 
 
 class Solid(NamedTuple):
@@ -91,6 +90,8 @@ def added_mass_of_ellipsoid(semi_axes: Sequence[float], density: float) -> tuple
     gamma - beta = (b² - c²) near and 2 (b² - c²) + (b² + c²) (beta - gamma) = (b² - c²) (alpha + 2 far), so that
     (b² - c²)² near / (alpha + 2 far) has neither the 0/0 of equal axes nor the cancellation close to it.
     """
+    from scipy.special import elliprd  # scenes of other solids need no SciPy
+
     axes = np.asarray(semi_axes, dtype=float)
     following, last = axes[[1, 2, 0]], axes[[2, 0, 1]]
     a, b, c = axes**2, following**2, last**2

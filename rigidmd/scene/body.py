@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.core.schemes import AUTO, SCHEMES, Rotor, auto_faults, rotor_fault
-from rigidmd.dynamics.odes import FORMULATIONS, SOLVERS
+from rigidmd.core.schemes import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_faults, rotor_fault
 from rigidmd.mechanics.inertia import impossible, shifted
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,

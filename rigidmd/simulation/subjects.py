@@ -11,9 +11,8 @@ import numpy as np
 from rigidmd.build.body import BodySystem, Pose, build_body
 from rigidmd.build.momenta import mobile
 from rigidmd.build.system import System
-from rigidmd.core.schemes import SCHEMES, Scheme
+from rigidmd.core.schemes import FORMULATIONS, SCHEMES, Scheme
 from rigidmd.core.state import State
-from rigidmd.dynamics.odes import FORMULATIONS
 from rigidmd.errors import SceneError
 from rigidmd.measure.choice import choose
 from rigidmd.measure.motion import Motion, Snapshot, motion

@@ -50,7 +50,7 @@ from scipy.special import erfc
 from rigidmd import Scene, Simulation
 from rigidmd.build.system import build
 from rigidmd.forces.ewald import in_energy_units, intramolecular_energy
-from rigidmd.jit import CACHE_FOLDER
+from rigidmd.jit import cache_folder
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import align
@@ -255,7 +255,7 @@ def start_of(name: str, source: str) -> Start:
     """The start of a workload, made or taken once and then kept in the cache folder."""
     work = WORKLOADS[name]
     digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES} cell".encode()).hexdigest()[:8]
-    folder = Path(CACHE_FOLDER).parent / "peers" / f"{name}-{source}-{digest}"
+    folder = Path(cache_folder()).parent / "peers" / f"{name}-{source}-{digest}"
     if not (folder / "start.npz").is_file():
         print(f"{name}: making the start, kept in {folder}", flush=True)
         folder.mkdir(parents=True, exist_ok=True)

@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import known
 
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.dynamics.odes import OdeEngine, Solver
+from rigidmd.core.schemes import SCHEMES, Solver
+from rigidmd.dynamics.odes import OdeEngine
 from rigidmd.scene import Scene
 from rigidmd.simulation import Simulation
 
