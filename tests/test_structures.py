@@ -15,10 +15,10 @@ from rigidmd.build.cells import pairs_within, standard_rotation
 from rigidmd.build.structure import read_structure
 from rigidmd.build.structure_files import element_of, read_geometry
 from rigidmd.build.system import build
+from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.molecules import Molecule, Site, load_model, molecule
-from rigidmd.output.state import write_state
 from rigidmd.output.trajectory import TrajectoryFile, write_topology
 from rigidmd.scene import Scene
 from rigidmd.units import GRAM_PER_CM3
@@ -720,7 +720,7 @@ def test_what_this_engine_writes_it_reads(ending, tmp_path):
         file.write(state, float(k), k)
     file.close()
     write_topology(tmp_path / "t.gro", system, moved, wrapped=True)
-    write_state(tmp_path / "t.npz", system, moved)
+    write_state(tmp_path / "t.npz", moved, system.names, system.model.species)
     for name, frame, error in ((f"t.{ending}", -1, 2e-3), ("t.gro", None, 0.02), ("t.npz", None, 0.0)):
         found = read_structure(tmp_path / name, system.species, None, True, TOLERANCE, frame)
         step = found.position - moved.position

@@ -34,8 +34,9 @@ def stopped(scene, folder=None, change=None):
     """The message of a run that has to stop."""
     simulation = Simulation(scene, folder)
     if change:
-        simulation.system.from_lattice = False  # no relief: the start is as it is
-        change(simulation.system.state)
+        state = simulation.system.state.copy()
+        change(state)
+        simulation.start_from(state)
     with pytest.raises(SimulationError) as caught:
         simulation.run()
     return str(caught.value)

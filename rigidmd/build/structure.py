@@ -8,11 +8,10 @@ import numpy as np
 from rigidmd.build.cells import angles_deg, reduced, right_angled, roomiest, standard_rotation
 from rigidmd.build.matching import Matched, massive, match
 from rigidmd.build.structure_files import Atoms, read_atoms
+from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
-from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.molecules import Molecule
 
-NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 MOST_NAMED = 5  # how many molecules a message names before it only counts
 SAME_BOX = 1e-4  # boxes of file and scene that differ by less, relatively, are the same as printed
 #: Units in which files are given by mistake, in Å.
@@ -206,40 +205,19 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
-    """The final state of an earlier run (output.state); every bit of it."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            names = [str(name) for name in data["species_names"]]
-            arrays = {
-                key: data[key]
-                for key in ("species", "position", "velocity", "rotation", "angular_momentum_body", "cell")
-            }
-    except FileNotFoundError:
-        raise StructureError(str(path), ["there is no such file"]) from None
-    except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user
-        raise StructureError(str(path), [f"is not a state that rigidmd wrote: {error}"]) from None
+    """The final state of an earlier run; every bit of it."""
+    saved = read_state(path)
     known = [molecule.name for molecule in species]
-    if missing := [name for name in names if name not in known]:
+    if missing := [name for name in saved.names if name not in known]:
         raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
-    n = len(arrays["species"])
-    turning = len(arrays["rotation"]) > 0
-    shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3)}
-    shapes |= {"rotation": (n, 3, 3), "angular_momentum_body": (n, 3)} if turning else {}
-    bad = [k for k, shape in shapes.items() if arrays[k].shape != shape or arrays[k].dtype.kind not in "fi"]
-    bad += [k for k, a in arrays.items() if k not in (*bad, "cell") and not np.isfinite(a).all()]
-    if not bad and (arrays["species"].dtype.kind != "i" or not np.isin(arrays["species"], np.arange(len(names))).all()):
-        bad.append("species")
-    if not bad and orthogonality_error(arrays["rotation"]) > NOT_A_ROTATION:
-        bad.append("rotation")
-    if bad:
-        raise StructureError(str(path), [f"{', '.join(sorted(set(bad)))}: damaged (wrong shape or values)"])
+    state, n, turning = saved.state, len(saved.species), len(saved.state.rotation) > 0
     return Arrangement(
-        species=np.array([known.index(name) for name in names])[arrays["species"]],
-        position=arrays["position"],
-        rotation=arrays["rotation"] if turning else np.tile(np.eye(3), (n, 1, 1)),
-        velocity=arrays["velocity"],
-        angular_momentum_body=arrays["angular_momentum_body"] if turning else np.zeros((n, 3)),
-        cell=arrays["cell"] if np.isfinite(arrays["cell"]).all() else None,
+        species=np.array([known.index(name) for name in saved.names])[saved.species],
+        position=state.position,
+        rotation=state.rotation if turning else np.tile(np.eye(3), (n, 1, 1)),
+        velocity=state.velocity,
+        angular_momentum_body=state.angular_momentum_body if turning else np.zeros((n, 3)),
+        cell=state.cell if np.isfinite(state.cell).all() else None,
         residual_rms=0.0,
         residual_max=0.0,
     )

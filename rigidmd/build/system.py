@@ -53,9 +53,9 @@ class Sites(NamedTuple):
     mass: np.ndarray  # (s,)
 
 
-@dataclass
+@dataclass(frozen=True)
 class System:
-    """What a scene becomes. `state` is the start; nothing else here changes during a run."""
+    """What a scene becomes. `state` is the start; nothing here changes during a run."""
 
     scene: MolecularScene
     species: list[Molecule]
@@ -84,6 +84,11 @@ class System:
         """Smallest Lennard-Jones diameter, or the smallest radius where there is none, Å."""
         sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
         return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the species."""
+        return [m.name for m in self.species]
 
     @property
     def residue_names(self) -> np.ndarray:
@@ -154,17 +159,17 @@ def build(scene: MolecularScene) -> System:
         notes=list(charges.notes) if charges else [],
     )
     _set_momenta(system, arrangement)
-    system.notes += [
+    system.notes.extend(
         f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
         for m in species
         if m.mixing not in (None, scene.forces.mixing)
-    ]
+    )
     if scene.structure is not None:
         system.notes.append(
             f"{n} molecules read from {scene.structure.file}; atoms against rigid templates: "
             f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
         )
-        system.notes += [f"{scene.structure.file}: {note}" for note in arrangement.notes]
+        system.notes.extend(f"{scene.structure.file}: {note}" for note in arrangement.notes)
         if faults := overlaps(system):
             raise StructureError(str(scene.path(scene.structure.file)), faults)
     return system

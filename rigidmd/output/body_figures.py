@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.output.folder import whole_file
+from rigidmd.core.files import whole_file
 from rigidmd.output.report import COOL, FAINT, INK, WARM
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)

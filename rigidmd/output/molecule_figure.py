@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
 from rigidmd.molecules import Molecule
-from rigidmd.output.folder import whole_file
 from rigidmd.output.molecule_report import COVALENT, bonds, short_source
 from rigidmd.output.report import COOL, FAINT, INK
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.output.folder import whole_file
+from rigidmd.core.files import whole_file
 
 
 def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.build.system import System
+from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
-from rigidmd.output.folder import whole_file
 from rigidmd.units import KJ_PER_MOL
 
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"

@@ -7,7 +7,8 @@ from pathlib import Path
 import tomli_w
 
 from rigidmd.build.system import System
-from rigidmd.output.folder import SCENE_FILE, whole_file
+from rigidmd.core.files import whole_file
+from rigidmd.output.folder import SCENE_FILE
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rigidmd.core.files import whole_file
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
-from rigidmd.output.folder import whole_file
 from rigidmd.output.report import COOL, FAINT, INK, WARM
 
 FILES = ("stability.csv", "stability.html", "stability.md")

@@ -13,10 +13,10 @@ from MDAnalysis.coordinates.memory import MemoryReader
 from rigidmd.build.body import BodySystem
 from rigidmd.build.cells import angles_deg
 from rigidmd.build.system import System
+from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.forces.space import cell_of
-from rigidmd.output.folder import whole_file
 
 LARGEST_IN_XTC = 2e7  # Å: whole thousandths of a nm in 32 bits
 

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from math import nan
 
 import numba
@@ -10,7 +11,8 @@ import numpy as np
 from rigidmd.build.relief import Relief, relieve
 from rigidmd.build.system import build
 from rigidmd.core.schemes import Scheme
-from rigidmd.core.state import NOW, Load, State
+from rigidmd.core.state import NOW, Load, State, state_of
+from rigidmd.core.state_file import write_state
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.errors import SceneError, SimulationError
@@ -37,8 +39,7 @@ class MolecularSimulation(Simulation):
 
     def __init__(self, scene: MolecularScene, *arguments, **options):
         super().__init__(scene, *arguments, **options)
-        self.system = build(scene)
-        self._asked = scene
+        self._built = build(scene)
         self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
         self._reset()
 
@@ -49,9 +50,10 @@ class MolecularSimulation(Simulation):
         return observe(self.system, self.engine, self.state, step)
 
     def _reset(self) -> None:
+        self.system = self._built  # a run may have decided what its scene leaves open
+        self.scene = self.system.scene
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
-        self.scene = self.system.scene = self._asked  # a run may have decided what it leaves open
         numba.set_num_threads(self.threads)
 
     def _file_names(self) -> list[str]:
@@ -61,6 +63,12 @@ class MolecularSimulation(Simulation):
         output = self.scene.output
         names = [SCENE_FILE, output.topology, "log.csv", "final.npz", "energy.png", "summary.json", LAST_GOOD_STATE]
         return [*names, *input_names(self.scene).values(), *([output.trajectory] if output.trajectory else [])]
+
+    def start_from(self, state: State) -> None:
+        """Let runs begin at the positions and momenta of a state of one's own, as they are: no overlaps are relieved."""
+        begun = state_of(*state[:5])
+        self._built = replace(self._built, state=begun, from_lattice=False)
+        self._reset()
 
     def start(self) -> tuple[Observation, Relief | None]:
         """The moment before the first step: what `run` starts from, measured, and the relief it took to get there."""
@@ -164,7 +172,8 @@ class MolecularSimulation(Simulation):
         self._choices[k] = f"{integrator} at {timestep:g} fs chosen: {reason}"
         stages = list(self.scene.stages)
         stages[k] = stage.decided(integrator, timestep)
-        self.scene = self.system.scene = self.scene.model_copy(update={"stages": tuple(stages)})
+        self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
+        self.system = replace(self.system, scene=self.scene)
         if self.folder is not None:
             from rigidmd.output.scene_file import write_scene
 
@@ -291,9 +300,8 @@ class MolecularSimulation(Simulation):
         if self.folder is None:
             return
         from rigidmd.output.report import draw_energy, write_summary
-        from rigidmd.output.state import write_state
 
-        write_state(self.folder / "final.npz", self.system, self.state)
+        self._write_state("final.npz", self.state)
         results.files.append(self.folder / "final.npz")
         if self.scene.output.figure and len(results.samples.rows) > 1:
             draw_energy(self.folder / "energy.png", self.system, results.samples, results.summary)
@@ -308,13 +316,14 @@ class MolecularSimulation(Simulation):
             states.append((f"at step {self._last_good[0]}, ", self._last_good[2]))
         return watch.explained(self.system, error, states, dt, self._stable.get(self._stage))
 
+    def _write_state(self, name: str, state: State) -> None:
+        write_state(self.folder / name, state, self.system.names, self.system.model.species)
+
     def _save(self) -> str:
         if self.folder is None or self._last_good is None:
             return ""
-        from rigidmd.output.state import write_state
-
         step, time, state = self._last_good
-        write_state(self.folder / LAST_GOOD_STATE, self.system, state)
+        self._write_state(LAST_GOOD_STATE, state)
         return f". Last good state, of step {step} ({time:g} ps): {self.folder / LAST_GOOD_STATE}"
 
     def introduction(self) -> str:

@@ -8,8 +8,8 @@ import numpy as np
 
 from rigidmd.build.system import build
 from rigidmd.core.state import State
+from rigidmd.core.state_file import write_state
 from rigidmd.measure.stability import REFUSED, RIGHT, TOLD, Finding, Outcome, longest_step
-from rigidmd.output.state import write_state
 from rigidmd.scene import Scene
 from rigidmd.simulation import Simulation
 from rigidmd.stability.cases import case
@@ -112,7 +112,8 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "start.npz"
             template = data | {"start": {"temperature_K": 0.0}}
-            write_state(path, build(Scene.from_dict(template)), state)
+            system = build(Scene.from_dict(template))
+            write_state(path, state, system.names, system.model.species)
             started = data | {"structure": {"file": path.name, "velocities": velocities}}
             results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
         told = energy_error(results)

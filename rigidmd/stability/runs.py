@@ -147,8 +147,7 @@ def simulate(data: dict, state: State | None = None) -> Results:
     """Run a scene of molecules, from a state of its own where one is given."""
     simulation = Simulation(Scene.from_dict(data))
     if state is not None:
-        simulation.system.state, simulation.system.from_lattice = state.copy(), False
-        simulation.system.state.time[0] = 0.0
+        simulation.start_from(state)
     return simulation.run()
 
 

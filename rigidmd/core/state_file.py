@@ -1,0 +1,76 @@
+"""A state on disk, every bit of it: `final.npz`. The one function that writes it, and the one that reads it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.files import whole_file
+from rigidmd.core.state import State, state_of
+from rigidmd.errors import StructureError
+
+#: Of the files. Version 1 (rigidmd 0.1) did not say its version and held no step, books and bath.
+SCHEMA = 2
+NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
+
+
+class Saved(NamedTuple):
+    """What a file holds."""
+
+    state: State
+    names: list[str]  # of species
+    species: np.ndarray  # (n,) index into the names
+
+
+def write_state(path: Path, state: State, names: list[str], species: np.ndarray) -> None:
+    """Write a state of molecules with the names of their species (n,) index. No pickle in it. Raises OutputError."""
+    with whole_file(path) as temporary:
+        np.savez(temporary, schema=SCHEMA, species_names=np.array(names), species=species, **state._asdict())
+
+
+def read_state(path: Path) -> Saved:
+    """Read a state back, to the bit. Raises StructureError with all that is wrong with the file."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        schema = int(arrays.pop("schema", 1))
+        names = [str(name) for name in arrays.pop("species_names")]
+        species = arrays["species"]
+    except FileNotFoundError:
+        raise StructureError(str(path), ["there is no such file"]) from None
+    except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user
+        raise StructureError(str(path), [f"is not a state that rigidmd wrote: {error}"]) from None
+    if schema > SCHEMA:
+        fault = f"was written by a later rigidmd (version {schema} of the format; this one reads up to {SCHEMA})"
+        raise StructureError(str(path), [fault])
+    example = state_of()
+    if schema == 1:
+        arrays = {key: arrays[key] for key in ("species", *State._fields[:5]) if key in arrays}
+        arrays |= {key: getattr(example, key) for key in State._fields[5:]}
+    if missing := [key for key in State._fields if key not in arrays]:
+        raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])
+    if bad := _damaged(arrays, names):
+        raise StructureError(str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"])
+    kinds = (getattr(example, key).dtype for key in State._fields)
+    state = State(*(np.array(arrays[key], kind) for key, kind in zip(State._fields, kinds, strict=True)))
+    return Saved(state, names, species)
+
+
+def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
+    """Arrays with a shape or values that no state has."""
+    n = len(arrays["species"]) if arrays["species"].ndim else 0
+    m = n if len(np.atleast_1d(arrays["rotation"])) else 0
+    shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3), "rotation": (m, 3, 3)}
+    shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (2,)}
+    bad = {key for key, shape in shapes.items() if arrays[key].shape != shape or arrays[key].dtype.kind not in "fi"}
+    finite = [key for key in (*shapes, "bath") if key not in (*bad, "cell")]
+    bad |= {key for key in finite if not np.isfinite(arrays[key]).all()}
+    if "species" not in bad and not (
+        arrays["species"].dtype.kind == "i" and np.isin(arrays["species"], np.arange(len(names))).all()
+    ):
+        bad.add("species")
+    if "rotation" not in bad and m:
+        gap = np.swapaxes(arrays["rotation"], 1, 2) @ arrays["rotation"] - np.eye(3)
+        if np.abs(gap).max() > NOT_A_ROTATION:
+            bad.add("rotation")
+    return bad
