@@ -216,7 +216,7 @@ def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
         folder.mkdir()
         os.utime(folder, (1e9, 1e9))
     subprocess.run(
-        [sys.executable, "-c", "import rigidmd.jit"], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
+        [sys.executable, "-c", "import rigidmd.compile"], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
     )
     assert [folder.exists() for folder in old] == [True, False, True]
 

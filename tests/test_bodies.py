@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from conftest import BODIES, ROOT, move
 
+from rigidmd.compile import kernel
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SimulationError
-from rigidmd.jit import kernel
 from rigidmd.mechanics.flight import Pinned
 from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
 from rigidmd.mechanics.rotor import ExactRotor, split_rotor, turn

@@ -14,10 +14,10 @@ from conftest import ROOT, built, move, small_scene
 from numba import types
 
 from rigidmd.build.system import build
+from rigidmd.compile import SIMD_BITS, Parcel, kernel
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.forces import lanes, pairs
 from rigidmd.forces.neighbors import BUILDS
-from rigidmd.jit import SIMD_BITS, Parcel, kernel
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
 W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}

@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from rigidmd.jit import kernel
+from rigidmd.compile import kernel
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.inertia import kind_of_body, principal_frame
 from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations

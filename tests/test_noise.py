@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from rigidmd.compile import kernel
 from rigidmd.dynamics.noise import BATH, LATTICE, MOMENTA, Key, chi_square, key_of, normals, philox, uniforms
-from rigidmd.jit import kernel
 
 
 def words(*values):

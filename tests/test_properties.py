@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rigidmd.compile import kernel
 from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
-from rigidmd.jit import kernel
 from rigidmd.mechanics.inertia import inertia_tensor, principal_frame
 from rigidmd.mechanics.rotation import (
     from_euler_angles,

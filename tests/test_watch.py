@@ -385,7 +385,7 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
         "from typing import NamedTuple\nclass Term(NamedTuple):\n    k: float\n"
     )
     (tmp_path / "shared.py").write_text(
-        "from rigidmd.jit import kernel\n@kernel(outer=True)\ndef first(term):\n    return term[0]\n"
+        "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef first(term):\n    return term[0]\n"
     )
     said = []
     for script, path in (
@@ -407,7 +407,7 @@ def test_threads_are_there_for_code_that_comes_from_the_cache(tmp_path):
     """Numba forgets that code starts threads where it calls what itself came from the cache; it ended in a crash."""
     (tmp_path / "shared.py").write_text(
         "import numba, numpy as np\n"
-        "from rigidmd.jit import call, kernel, opened, packed, work\n"
+        "from rigidmd.compile import call, kernel, opened, packed, work\n"
         "@kernel(parallel=True, outer=True)\n"
         "def fill(x):\n    for n in numba.prange(len(x)):\n        x[n] = n\n"
         "@work()\n"

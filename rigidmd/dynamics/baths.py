@@ -7,9 +7,9 @@ its random numbers are counted by the step, from `draw` on, see `noise`.
 from math import exp, inf, sqrt
 from typing import NamedTuple
 
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import HEAT, NOW
 from rigidmd.dynamics.noise import Key, chi_square, normals
-from rigidmd.jit import implements, is_a, kernel
 
 
 class NoBath(NamedTuple):

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import kernel
 from rigidmd.core.state import OK, Load, State, no_load
 from rigidmd.forces.terms import load_bodies
-from rigidmd.jit import kernel
 
 #: The difference is taken over this fraction of tau a. Over the whole of it, as others do (Wisdom, Holman & Touma
 #: 1996), the kick is no gradient of a potential in order tau²; this much smaller, that is below what is left of the

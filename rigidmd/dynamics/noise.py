@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.jit import kernel
+from rigidmd.compile import kernel
 
 #: Purposes, each with its own stream, so that one more draw here changes nothing there.
 LATTICE, MOMENTA, BATH = 1, 2, 3

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
+from rigidmd.compile import kernel
 from rigidmd.core.schemes import DOP853, FORMULATIONS, RADAU, RK4, Solver
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
 from rigidmd.dynamics.body import relative_motion
@@ -20,7 +21,6 @@ from rigidmd.errors import SimulationError
 from rigidmd.forces.frame import frame_rate
 from rigidmd.forces.resistance import braking
 from rigidmd.forces.terms import load_bodies, total_power
-from rigidmd.jit import kernel
 from rigidmd.mechanics.flight import along, inertial_mass
 from rigidmd.mechanics.odes import (
     EulerAngles,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import PAIR_FLAGS, kernel
 from rigidmd.forces.lanes import bits, lane_count, larger, load, lowest_bit, width_of
-from rigidmd.jit import PAIR_FLAGS, kernel
 
 
 class BoxTree(NamedTuple):

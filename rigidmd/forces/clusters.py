@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import BLOCKS, PAIR_FLAGS, kernel
 from rigidmd.forces.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
 from rigidmd.forces.sites import place
-from rigidmd.jit import BLOCKS, PAIR_FLAGS, kernel
 
 SERIAL_SITES = 1000  # up to this many there is one block, and no thread is started
 

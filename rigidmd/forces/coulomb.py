@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.forces import pairs
 from rigidmd.forces.lanes import inverse_root, load, zeros
 from rigidmd.forces.truncation import SWITCHES, Name, Polynomial, Shape, ended, ending, shape_of
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
 
 

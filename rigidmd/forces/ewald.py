@@ -21,13 +21,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
+from rigidmd.compile import BLOCKS, PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
 from rigidmd.forces.space import follow_cell, volume_of
 from rigidmd.forces.terms import Setup
-from rigidmd.jit import BLOCKS, PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.units import COULOMB
 
 WIDTH = lane_count(np.float64)

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import ASK, OK
 from rigidmd.forces.terms import Setup, add_forces, power
-from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.course import Course, value
 from rigidmd.mechanics.flight import along
 

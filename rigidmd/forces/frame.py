@@ -8,7 +8,7 @@ The acceleration of the origin is a uniform field.
 from math import sqrt
 from typing import NamedTuple
 
-from rigidmd.jit import implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.mechanics.course import Course, value
 from rigidmd.mechanics.rotor import sine_and_versine, turned
 

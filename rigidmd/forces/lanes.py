@@ -17,7 +17,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-from rigidmd.jit import PAIR_FLAGS, SIMD_BITS, implements
+from rigidmd.compile import PAIR_FLAGS, SIMD_BITS, implements
 
 FLAGS = tuple(sorted(PAIR_FLAGS))
 COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.integrate import quad
 
+from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.forces import pairs
 from rigidmd.forces.lanes import inverse, inverse_root, load, zeros
 from rigidmd.forces.truncation import (
@@ -20,7 +21,6 @@ from rigidmd.forces.truncation import (
     ending,
     shape_of,
 )  # fmt: skip
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
 

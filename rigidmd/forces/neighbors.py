@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import PAIR_FLAGS, Code, call, call_blocks, kernel, opened, packed, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, OK
 from rigidmd.errors import SimulationError
 from rigidmd.forces.boxes import BoxTree, box_tree, grow, within_reach
@@ -46,7 +47,6 @@ from rigidmd.forces.lanes import (
 )  # fmt: skip
 from rigidmd.forces.sites import BodySites, CentralSites
 from rigidmd.forces.space import follow_cell
-from rigidmd.jit import PAIR_FLAGS, Code, call, call_blocks, kernel, opened, packed, task
 
 IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach

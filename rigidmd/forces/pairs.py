@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.state import EXAMPLE, LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces import neighbors, terms
 from rigidmd.forces.lanes import (
@@ -46,7 +47,6 @@ from rigidmd.forces.neighbors import (
 )  # fmt: skip
 from rigidmd.forces.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
 from rigidmd.forces.terms import Setup
-from rigidmd.jit import PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 
 
 class Sums(NamedTuple):

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from rocket_fft import c2c, c2r, r2c
 
+from rigidmd.compile import BLOCKS, PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.ewald import add_wave_virial, invert_cell
@@ -30,7 +31,6 @@ from rigidmd.forces.sites import BodySites, CentralSites, load_from_sites, place
 from rigidmd.forces.space import follow_cell
 from rigidmd.forces.splines import aliases, weights
 from rigidmd.forces.terms import Setup
-from rigidmd.jit import BLOCKS, PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 
 SERIAL_POINTS = 16**3  # up to this many grid points there is one block, and no thread is started
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import WORK
 from rigidmd.forces.frame import frame_rate
-from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.flight import Pinned, along, inertial_mass
 from rigidmd.mechanics.rotor import NoRotor, moments
 

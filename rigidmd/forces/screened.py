@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erfc, ive
 
+from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.forces import pairs
 from rigidmd.forces.lanes import inverse_root, load, polynomial, zeros
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.units import COULOMB
 
 #: Largest error of a polynomial, relative to the function at r = 0, by the precision of the lanes: less than rounding

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange, types
 
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.forces.lanes import lane_count, width_of
-from rigidmd.jit import implements, is_a, kernel
 
 # Up to this many molecules loops over molecules stay on one thread. Measured, two threads: starting them costs about
 # 40 µs, placing the sites of a water 9.5 ns; so placing alone would gain only beyond some 8000 molecules. The bound is

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import literal_unroll
 
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import OK
-from rigidmd.jit import implements, is_a, kernel
 
 
 class Setup(NamedTuple):

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from math import inf
 from typing import Literal, NamedTuple, get_args
 
+from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.forces.lanes import larger
-from rigidmd.jit import PAIR_FLAGS, implements, is_a, kernel
 
 Name = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 NAMES: tuple[str, ...] = get_args(Name)

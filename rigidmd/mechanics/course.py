@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.jit import kernel
+from rigidmd.compile import kernel
 
 
 class Course(NamedTuple):

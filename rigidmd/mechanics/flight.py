@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.jit import implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.mechanics.rotor import turn_alone
 
 

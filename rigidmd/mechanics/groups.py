@@ -5,7 +5,7 @@ One body at a time, each part waits for the one before it; a water takes two and
 
 import numpy as np
 
-from rigidmd.jit import implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.mechanics.rotor import SHORT, SplitRotor, series_of_square, turn, turned
 
 GROUP = 128  # bodies; what is kept of them stays in the fastest cache

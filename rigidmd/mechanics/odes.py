@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.jit import implements, is_a
+from rigidmd.compile import implements, is_a
 from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import WORK
-from rigidmd.jit import implements, is_a, kernel
 from rigidmd.mechanics.course import Course, rate, value
 
 

@@ -65,7 +65,7 @@ class MolecularSimulation(Simulation):
         return [*names, *input_names(self.scene).values(), *([output.trajectory] if output.trajectory else [])]
 
     def start_from(self, state: State) -> None:
-        """Let runs begin at the positions and momenta of a state of one's own, as they are: no overlaps are relieved."""
+        """Let runs begin at positions and momenta of one's own, as they are: no overlaps are relieved."""
         begun = state_of(*state[:5])
         self._built = replace(self._built, state=begun, from_lattice=False)
         self._reset()

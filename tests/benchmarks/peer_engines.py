@@ -66,7 +66,7 @@ class Rigidmd:
     @staticmethod
     def version() -> str:
         import rigidmd
-        from rigidmd.jit import source_digest
+        from rigidmd.compile.cache import source_digest
 
         return f"rigidmd {rigidmd.__version__} (sources {source_digest()[:8]})"
 

@@ -49,8 +49,8 @@ from scipy.special import erfc
 
 from rigidmd import Scene, Simulation
 from rigidmd.build.system import build
+from rigidmd.compile.cache import cache_folder
 from rigidmd.forces.ewald import in_energy_units, intramolecular_energy
-from rigidmd.jit import cache_folder
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import align

@@ -1,0 +1,26 @@
+"""The door to Numba: how kernels are compiled, cached and called by address, and vectors.
+
+What a term's author needs is here by name; `lanes` has the vectors.
+"""
+
+from rigidmd.compile import threads  # noqa: F401  (before Numba is loaded)
+from rigidmd.compile.code import Code, Parcel, Task, call, call_blocks, opened, packed, task
+from rigidmd.compile.kernels import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile.machine import BLOCKS, SIMD_BITS
+
+__all__ = [
+    "BLOCKS",
+    "PAIR_FLAGS",
+    "SIMD_BITS",
+    "Code",
+    "Parcel",
+    "Task",
+    "call",
+    "call_blocks",
+    "implements",
+    "is_a",
+    "kernel",
+    "opened",
+    "packed",
+    "task",
+]

@@ -1,0 +1,70 @@
+"""Where compiled code is kept.
+
+Numba's disk cache looks only at the file of the function itself; a change in a helper in another file would leave
+callers running old code. So the cache lives in a folder named by a digest of every source that compiled code can come
+from: any change of one of them starts a new folder. `RIGIDMD_CACHE` names another place for it.
+"""
+
+import atexit
+import contextlib
+import functools
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numba
+
+from rigidmd.compile.machine import SIMD_BITS
+
+PACKAGE = Path(__file__).parent.parent
+#: Files and folders that compiled code comes from; tests/test_rooms.py sees that no other file has a kernel.
+COMPILED = ("errors.py", "units.py", "core", "compile", "mechanics", "forces", "dynamics", "engines")
+UNUSED_AFTER_DAYS = 30.0
+
+
+@functools.cache
+def source_digest() -> str:
+    """Hexadecimal digest of the sources of compiled code, of Numba's version and of the width of vectors."""
+    digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS}".encode())
+    for path in sorted(path for name in COMPILED for path in _sources(PACKAGE / name)):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _sources(place: Path) -> list[Path]:
+    return [place] if place.is_file() else list(place.rglob("*.py"))
+
+
+@functools.cache
+def cache_folder() -> str:
+    """A writable folder for compiled code; caches of older sources that nobody used for a month are removed.
+
+    Nothing is read, made or removed before the first kernel is compiled.
+    """
+    if named := os.environ.get("RIGIDMD_CACHE"):
+        base = Path(named)
+    else:
+        import platformdirs
+
+        base = Path(platformdirs.user_cache_path("rigidmd"))
+    folder = base / f"kernels-{source_digest()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            numba.get_num_threads()
+    except OSError:
+        own = tempfile.mkdtemp(prefix="rigidmd-cache-")  # a read-only home: compile, keep it for this process only
+        atexit.register(shutil.rmtree, own, ignore_errors=True)
+        return own
+    for old in base.iterdir():
+        with contextlib.suppress(OSError):
+            ours = re.fullmatch(r"kernels-[0-9a-f]{16}", old.name) and old.is_dir()
+            if ours and time.time() - old.stat().st_mtime > UNUSED_AFTER_DAYS * 86400:
+                shutil.rmtree(old)
+    return str(folder)

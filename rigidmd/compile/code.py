@@ -1,0 +1,190 @@
+"""Machine code behind addresses, each of which carries the type that it was compiled for."""
+
+import hashlib
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.errors import TypingError
+from numba.core.imputils import impl_ret_borrowed
+from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
+
+from rigidmd.compile.kernels import kernel, options_of
+from rigidmd.compile.numba_private import callback, uncounted
+
+ADDRESS = ir.IntType(8).as_pointer()
+
+
+class Parcel(types.Type):
+    """Numba type of the address of a value of any type."""
+
+    def __init__(self, content):
+        self.content = content
+        super().__init__(f"parcel({content})")
+
+
+@register_model(Parcel)
+class _ParcelModel(models.PrimitiveModel):
+    def __init__(self, manager, parcel):
+        super().__init__(manager, parcel, ADDRESS)
+
+
+@intrinsic
+def packed(typing, content):
+    """The parcel of a value, to be opened before the calling function returns."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), ADDRESS)
+
+    return Parcel(content)(content), emit
+
+
+@intrinsic
+def opened(typing, parcel):
+    """The value in a parcel."""
+
+    def emit(context, builder, signature, arguments):
+        kind = context.get_value_type(parcel.content).as_pointer()
+        content = builder.load(builder.bitcast(arguments[0], kind))
+        return impl_ret_borrowed(context, builder, parcel.content, content)
+
+    return parcel.content(parcel), emit
+
+
+class Task:
+    """A function of (parcel, block) that compiled code calls by its address, see `Code`.
+
+    What is called by name is compiled again with every caller, and the callers' callers: the pair loop five times on
+    its way up to the loop over steps, and that for every kind of scene. By address it is compiled once.
+    """
+
+    def __init__(self, function, **options):
+        self.function, self.options = function, options
+        self.compiled = {}
+
+    def address(self, parcel: Parcel) -> int:
+        """Where the machine code for a parcel of this type is; compiled, or taken from the cache."""
+        if parcel not in self.compiled:
+            # Code from the cache that starts threads needs them to be there. Numba sees to that, but loses sight of it
+            # where what was compiled called something that itself came from the cache; that ended in a crash.
+            numba.get_num_threads()
+            code = callback(self.function, (parcel, types.intp), self.options)
+            self.compiled[parcel] = code
+        return self.compiled[parcel].address
+
+
+def task(*, fastmath=False, counted=True):
+    """Make a `Task` of a function, with options as those of `kernel`."""
+    return lambda function: Task(function, **options_of(fastmath, False), **uncounted(counted))
+
+
+class Code:
+    """Machine code of tasks, by name, each for contents of one type, which `call` and `call_blocks` hold it to.
+
+    Code(fill=(_fill, pairs), place=(_place, (pairs, sites, state))) compiles the tasks, or takes them from the cache.
+    """
+
+    def __init__(self, **tasks: tuple[Task, object]):
+        parcels = {name: Parcel(numba.typeof(content)) for name, (_, content) in tasks.items()}
+        self._addresses = np.array([tasks[name][0].address(parcel) for name, parcel in parcels.items()], np.uintp)
+        self.table = self._addresses.ctypes.data
+        self.numba_type = CodeType(tuple(parcels.items()))
+
+
+class CodeType(types.Type):
+    """Numba type of a `Code`: which tasks it has, and what each may be called with."""
+
+    def __init__(self, parcels: tuple[tuple[str, Parcel], ...]):
+        self.parcels = parcels
+        # a digest: the name is part of that of every function that is compiled for it
+        super().__init__(f"code({hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]})")
+
+    def place(self, name: str, parcel: Parcel) -> int:
+        """Which of its addresses is that of a task. Raises TypeError where it was compiled for something else."""
+        names = [known for known, _ in self.parcels]
+        if name not in names:
+            raise TypingError(f"there is no machine code of {name}; there is that of {', '.join(names)}")
+        if self.parcels[names.index(name)][1] != parcel:
+            raise TypingError(f"{name} was compiled for {self.parcels[names.index(name)][1]}, not for {parcel}")
+        return names.index(name)
+
+
+@typeof_impl.register(Code)
+def _typeof_code(value, context):
+    return value.numba_type
+
+
+@register_model(CodeType)
+class _CodeModel(models.PrimitiveModel):
+    def __init__(self, manager, code):
+        super().__init__(manager, code, ir.IntType(64))
+
+
+@unbox(CodeType)
+def _unbox_code(kind, value, context):
+    table = context.pyapi.object_getattr_string(value, "table")
+    address = context.pyapi.long_as_ulonglong(table)
+    context.pyapi.decref(table)
+    return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
+
+
+@intrinsic(prefer_literal=True)
+def _address_of(typing, code, name, parcel):
+    """Where the machine code of a task is."""
+    if not isinstance(name, types.StringLiteral):
+        raise TypingError("the name of a task must be a literal")
+    place = code.place(name.literal_value, parcel)
+
+    def emit(context, builder, signature, arguments):
+        table = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.load(builder.gep(table, [ir.IntType(64)(place)]))
+
+    return types.intp(code, name, parcel), emit
+
+
+@intrinsic
+def _jump(typing, address, parcel, block):
+    """Call what is at an address."""
+
+    def emit(context, builder, signature, arguments):
+        kind = ir.FunctionType(ir.VoidType(), [ADDRESS, ir.IntType(64)])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, parcel, types.intp), emit
+
+
+@kernel(parallel=True)
+def _jump_threaded(address, parcel, blocks):
+    for block in numba.prange(blocks):
+        _jump(address, parcel, block)
+
+
+@kernel
+def _jump_blocks(address, parcel, blocks):
+    if blocks == 1:
+        _jump(address, parcel, 0)
+    else:
+        _jump_threaded(address, parcel, blocks)
+
+
+def call(code, name, parcel):
+    """Call a task by its name, which is a literal, for block 0. What it was not compiled for does not compile."""
+    raise TypeError("compiled code only")
+
+
+def call_blocks(code, name, parcel, blocks):
+    """Call a task for every block, on all threads if there are several."""
+    raise TypeError("compiled code only")
+
+
+@overload(call, prefer_literal=True, jit_options=options_of(False, True))
+def _call(code, name, parcel):
+    return lambda code, name, parcel: _jump(_address_of(code, name, parcel), parcel, 0)
+
+
+@overload(call_blocks, prefer_literal=True, jit_options=options_of(False, True))
+def _call_blocks(code, name, parcel, blocks):
+    return lambda code, name, parcel, blocks: _jump_blocks(_address_of(code, name, parcel), parcel, blocks)
