@@ -1,9 +1,5 @@
 """Bad input: each gets one message that says what, where and what to do; no traceback, nothing half-written."""
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from conftest import ROOT, small_scene
@@ -208,17 +204,6 @@ def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tm
     (project / "scene.toml").write_text(GOOD)
     assert main(["run", str(project / "scene.toml"), "-o", str(project), "--force"]) == 2
     assert (project / "scene.toml").read_text() == GOOD
-
-
-def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
-    old = [tmp_path / "thesis", tmp_path / "kernels-0123456789abcdef", tmp_path / "0123456789abcdef"]
-    for folder in old:
-        folder.mkdir()
-        os.utime(folder, (1e9, 1e9))
-    subprocess.run(
-        [sys.executable, "-c", "import rigidmd.compile"], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
-    )
-    assert [folder.exists() for folder in old] == [True, False, True]
 
 
 def test_an_earlier_run_is_kept_when_the_new_scene_is_bad(capsys, tmp_path):

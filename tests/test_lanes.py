@@ -1,6 +1,5 @@
 """Vectors: what they compute, that pair loops are made of them, and what float32 in their place costs."""
 
-import ast
 import os
 import platform
 import re
@@ -114,35 +113,6 @@ for precision in ("double", "mixed"):
     state = Simulation(scene).run().state
     print(hashlib.sha256(b"".join(a.tobytes() for a in state)).hexdigest())
 """
-
-
-def compiled_functions():
-    """(name, tree, whether it is a work or inlined, whether it has fastmath) of all compiled functions of the package."""
-    for path in (ROOT / "rigidmd").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
-                call = mark if isinstance(mark, ast.Call) else ast.Call(mark, [], [])
-                kind = getattr(call.func, "id", "")
-                if kind in ("kernel", "work", "implements"):
-                    keys = {key.arg: ast.unparse(key.value) for key in call.keywords}
-                    name = ast.unparse(call.args[0]).rpartition(".")[2] if kind == "implements" else node.name
-                    fast = "fastmath" in keys or (kind == "implements" and len(call.args) > 1)
-                    yield name, node, kind == "work" or keys.get("inline") == "True", fast
-
-
-def test_what_has_fastmath_is_never_called_by_name():
-    """A second copy of it, compiled by itself, may add in another order, and which copy runs depends on the process."""
-    found = list(compiled_functions())
-    fast = {name for name, _, _, has in found if has}
-    assert {"pair", "block_forces", "radial"} <= fast
-    while more := {
-        name
-        for name, tree, _, _ in found
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and ast.unparse(call.func).rpartition(".")[2] in fast and name not in fast
-    }:
-        fast |= more
-    assert [name for name, _, inlined, _ in found if name in fast and not inlined] == []
 
 
 def test_the_same_bits_for_any_number_of_threads():

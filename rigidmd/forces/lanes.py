@@ -2,7 +2,7 @@
 
 Lanes of float32 or float64 follow `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
 from and stored to contiguous arrays. Everything is portable LLVM; it becomes AVX-512, AVX2, SSE or NEON. How many lanes
-a vector has is chosen for the machine (jit.SIMD_BITS): 16 float32 with AVX-512, 8 with AVX2, 4 else; half as many
+a vector has is chosen for the machine (machine.SIMD_BITS): 16 float32 with AVX-512, 8 with AVX2, 4 else; half as many
 float64.
 
 The same functions take scalars, so that a formula written once serves pair loops and single numbers.

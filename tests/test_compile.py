@@ -1,0 +1,204 @@
+"""The door to Numba: what we assume of it beyond its promises, addresses and their types, the cache, and the rules that
+sources keep."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pytest
+from conftest import ROOT
+from numba import types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.errors import TypingError
+from numba.core.registry import CPUDispatcher
+
+from rigidmd.compile import Code, call, call_blocks, kernel, opened, packed, task
+from rigidmd.compile.cache import cache_folder
+from rigidmd.compile.numba_private import Index, Inner, Kernel, callback
+
+# --- what Numba does not promise -------------------------------------------------------------------------------------
+
+
+@kernel(outer=True)
+def doubled(x):
+    return _twice(x)
+
+
+@kernel
+def _twice(x):
+    return x + x
+
+
+@kernel(outer=True, counted=False)
+def first_of(values):
+    part = values[1:]
+    return part[0]
+
+
+def test_a_cache_takes_its_folder_from_the_configuration_when_it_is_made():
+    before = numba.config.CACHE_DIR
+    assert doubled(2.0) == 4.0
+    assert before == numba.config.CACHE_DIR
+    assert doubled._cache.cache_path.startswith(cache_folder())
+    assert isinstance(doubled._cache, FunctionCache)
+
+
+def test_the_index_of_a_cache_may_be_of_our_class():
+    assert doubled(2.0) == 4.0
+    assert issubclass(Index, IndexDataCacheFile)
+    assert type(doubled._cache._cache_file) is Index
+    names = os.listdir(doubled._cache.cache_path)
+    assert any(re.fullmatch(r"test_compile\.doubled-\d+\.py\d+\.\d+\.nbc\.[0-9a-f]{16}", name) for name in names)
+
+
+def test_a_dispatcher_opens_its_cache_only_to_compile():
+    @kernel(outer=True)
+    def unused(x):
+        return x
+
+    assert isinstance(unused, CPUDispatcher) and type(unused) is Kernel
+    assert "_opened" not in vars(unused)
+
+
+def test_an_inner_kernel_has_no_wrapper_and_says_so():
+    assert type(_twice) is Inner
+    with pytest.raises(TypeError, match=r"_twice is for compiled code; for Python it has to be a kernel\(outer=True\)"):
+        _twice(2.0)
+    doubled(1.0)
+    _twice.compile((types.float64,))
+
+    def has_wrapper(dispatcher):
+        return ["cpython" in found.library.get_llvm_str() for found in dispatcher.overloads.values()]
+
+    assert not any(has_wrapper(_twice)) and all(has_wrapper(doubled))
+
+
+def test_references_are_not_counted_where_it_is_asked_for():
+    assert first_of(np.arange(3.0)) == 1.0
+    assert not any("NRT_incref" in str(o.library.get_llvm_str()) for o in first_of.overloads.values())
+
+
+def test_a_callback_is_compiled_for_given_types_and_cached():
+    code = callback(lambda x, k: None, (types.float64, types.intp), {})
+    assert code.address and type(code._cache._cache_file) is Index
+
+
+# --- addresses -------------------------------------------------------------------------------------------------------
+
+
+class Content(NamedTuple):
+    """What a kernel is given: an array, and code for it."""
+
+    values: np.ndarray
+    code: Code
+
+
+@task(counted=False)
+def _add(parcel, block):
+    values, x = opened(parcel)
+    values[block] += x
+
+
+@kernel(outer=True)
+def add_once_and_in_blocks(content, blocks):
+    call(content.code, "add", packed((content.values, 1.0)))
+    call_blocks(content.code, "add", packed((content.values, 2.0)), blocks)
+
+
+@kernel(outer=True)
+def call_what_is_not_there(content):
+    call(content.code, "subtract", packed((content.values, 1.0)))
+
+
+def content_of(values):
+    return Content(values, Code(add=(_add, (np.zeros(3), 0.0))))
+
+
+def test_a_task_is_called_by_its_address():
+    content = content_of(np.zeros(5))
+    add_once_and_in_blocks(content, 5)
+    assert content.values.tolist() == [3, 2, 2, 2, 2]
+
+
+@pytest.mark.parametrize("strange", [np.zeros((4, 4)).T[1], np.zeros(4, np.float32), np.zeros((2, 2))])
+def test_an_address_is_not_called_with_what_it_was_not_compiled_for(strange):
+    with pytest.raises(TypingError, match="add was compiled for parcel"):
+        add_once_and_in_blocks(content_of(strange), 2)
+
+
+def test_a_task_that_is_not_there_is_named():
+    with pytest.raises(TypingError, match="there is no machine code of subtract; there is that of add"):
+        call_what_is_not_there(content_of(np.zeros(2)))
+
+
+# --- the cache -------------------------------------------------------------------------------------------------------
+
+
+def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
+    old = [tmp_path / "thesis", tmp_path / "kernels-0123456789abcdef", tmp_path / "0123456789abcdef"]
+    for folder in old:
+        folder.mkdir()
+        os.utime(folder, (1e9, 1e9))
+    asked = "from rigidmd.compile.cache import cache_folder; cache_folder()"
+    subprocess.run([sys.executable, "-c", asked], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True)
+    assert [folder.exists() for folder in old] == [True, False, True]
+
+
+def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):
+    asked = "import rigidmd.forces.terms, rigidmd.dynamics.advance, rigidmd.dynamics.noise"
+    environment = os.environ | {"RIGIDMD_CACHE": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-c", asked], env=environment, cwd=ROOT, check=True)
+    assert not (tmp_path / "cache").exists()
+
+
+# --- rules that sources keep -----------------------------------------------------------------------------------------
+
+
+def compiled_functions():
+    """(name, tree, whether it is a task or inlined, whether it has fastmath, the options) of all compiled functions."""
+    for path in (ROOT / "rigidmd").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+                call = mark if isinstance(mark, ast.Call) else ast.Call(mark, [], [])
+                kind = getattr(call.func, "id", "")
+                if kind in ("kernel", "task", "implements"):
+                    keys = {key.arg: ast.unparse(key.value) for key in call.keywords}
+                    name = ast.unparse(call.args[0]).rpartition(".")[2] if kind == "implements" else node.name
+                    fast = "fastmath" in keys or (kind == "implements" and len(call.args) > 1)
+                    yield name, node, kind == "task" or keys.get("inline") == "True", fast, keys
+
+
+def test_what_has_fastmath_is_never_called_by_name():
+    """A second copy of it, compiled by itself, may add in another order, and which copy runs depends on the process."""
+    found = list(compiled_functions())
+    fast = {name for name, _, _, has, _ in found if has}
+    assert {"pair", "block_forces", "radial"} <= fast
+    while more := {
+        name
+        for name, tree, *_ in found
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and ast.unparse(call.func).rpartition(".")[2] in fast and name not in fast
+    }:
+        fast |= more
+    assert [name for name, _, inlined, *_ in found if name in fast and not inlined] == []
+
+
+def test_loops_without_counted_references_take_elements_by_their_index():
+    """Iterating over a view of an array, uncounted, ended in a crash; over ranges and tuples it is safe."""
+    uncounted = [(name, tree) for name, tree, *_, keys in compiled_functions() if keys.get("counted") == "False"]
+    assert {"block_forces", "place_block", "update_list"} <= {name for name, _ in uncounted}
+    strange = []
+    for name, tree in uncounted:
+        for node in ast.walk(tree):
+            over = node.iter if isinstance(node, ast.For) else None
+            if isinstance(over, ast.Call) and ast.unparse(over.func) == "enumerate":
+                over = over.args[0]
+            if over is not None and not isinstance(over, ast.Tuple):
+                safe = isinstance(over, ast.Call) and ast.unparse(over.func) in ("range", "literal_unroll")
+                strange += [] if safe else [f"{name}: for ... in {ast.unparse(over)}"]
+    assert strange == []
