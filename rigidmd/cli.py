@@ -2,17 +2,19 @@
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 EXAMPLES = """examples:
-  rigidmd check systems/water.toml          what would happen, without running
-  rigidmd run systems/water.toml            run it, into runs/water
-  rigidmd run systems/water.toml --set stages.1.timestep_fs=4 -o runs/water4
-  rigidmd energy systems/water.toml --unit kcal/mol
-  rigidmd run systems/heavy_top_3.toml      one body: a top, with figures of its motion
+  rigidmd new water                         copy a scene to start from: water.toml
+  rigidmd check water.toml                  what would happen, without running
+  rigidmd run water.toml                    run it, into runs/water
+  rigidmd run water.toml --set stages.1.timestep_fs=4 -o runs/water4
+  rigidmd energy water.toml --unit kcal/mol
+  rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
 """
 
 
@@ -52,6 +54,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    _command(commands, "examples", _examples, "list the scenes that come with rigidmd", "rigidmd examples")
+    new = _command(
+        commands, "new", _new, "copy a scene that comes with rigidmd, to start from", "rigidmd new water -o mine.toml"
+    )
+    new.add_argument("name", metavar="NAME", help="which scene; `rigidmd examples` lists them")
+    new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml)")
+    new.add_argument("--force", action="store_true", help="replace that file")
 
     run = _command(commands, "run", _run, "run a scene", "rigidmd run systems/water.toml -o runs/water")
     _scene_arguments(run)
@@ -172,6 +182,39 @@ def _read_scene(options: argparse.Namespace, **more):
     return Scene.read(options.scene, overrides | more)
 
 
+def _examples(options: argparse.Namespace) -> int:
+    from rigidmd.shipped import examples
+
+    found = examples()
+    width = max(len(example.name) for example in found)
+    for title, is_body in (("molecules", False), ("one body", True)):
+        print(f"{title}:")
+        for example in found:
+            if example.is_body == is_body:
+                print(f"  {example.name:<{width}}  {example.about}")
+        print()
+    print("`rigidmd new NAME` copies one into the working directory, to start from")
+    return 0
+
+
+def _new(options: argparse.Namespace) -> int:
+    from rigidmd.shipped import copy_example, find_example, series_of
+
+    example = find_example(options.name)
+    path = Path(options.output or f"{example.name}.toml")
+    written = copy_example(example, path, options.force)
+    if example.name != options.name:
+        print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
+    print(f"{path}: {example.about}")
+    if beside := [str(file) for file in written[1:]]:
+        print(f"beside it, read by it: {', '.join(beside)}")
+    print("next:")
+    print(f"  rigidmd check {shlex.quote(str(path))}    says what would happen, and runs nothing")
+    print(f"  rigidmd run {shlex.quote(str(path))}      runs it, into {Path('runs') / path.stem}")
+    print("its comment says what to look at; `rigidmd schema` lists every key")
+    return 0
+
+
 def _run(options: argparse.Namespace) -> int:
     scene = _read_scene(options)
     if options.threads is not None:
@@ -269,8 +312,6 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _precision(options: argparse.Namespace) -> int:
-    import shlex
-
     from tqdm import tqdm
 
     from rigidmd.errors import SceneError
@@ -306,7 +347,6 @@ def _precision(options: argparse.Namespace) -> int:
 
 def _stability(options: argparse.Namespace) -> int:
     import platform
-    import shlex
 
     from tqdm import tqdm
 
