@@ -15,6 +15,7 @@ EXAMPLES = """examples:
   rigidmd run water.toml --set stages.1.timestep_fs=4 -o runs/water4
   rigidmd energy water.toml --unit kcal/mol
   rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
+  rigidmd help                              the chapters of the documentation
 """
 
 
@@ -140,6 +141,10 @@ def _parser() -> argparse.ArgumentParser:
         "print the JSON schema of scenes, for editors",
         "rigidmd schema > scene.schema.json",
     )
+    chapters = _command(
+        commands, "help", _help, "list the chapters of the documentation, or print one", "rigidmd help water | less"
+    )
+    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="print this one")
     return parser
 
 
@@ -211,7 +216,7 @@ def _new(options: argparse.Namespace) -> int:
     print("next:")
     print(f"  rigidmd check {shlex.quote(str(path))}    says what would happen, and runs nothing")
     print(f"  rigidmd run {shlex.quote(str(path))}      runs it, into {Path('runs') / path.stem}")
-    print("its comment says what to look at; `rigidmd schema` lists every key")
+    print("its comment says what to look at; `rigidmd help manual` describes every table")
     return 0
 
 
@@ -399,6 +404,20 @@ def _schema(options: argparse.Namespace) -> int:
     from rigidmd.scene import schema
 
     print(json.dumps(_strict(schema()), indent=2, allow_nan=False))
+    return 0
+
+
+def _help(options: argparse.Namespace) -> int:
+    from rigidmd.shipped import chapter_text, contents
+
+    if options.chapter is not None:
+        print(chapter_text(options.chapter))
+        return 0
+    found = contents()
+    width = max(map(len, found))
+    print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` tells of a command):")
+    for name, about in found.items():
+        print(f"  {name:<{width}}  {about}")
     return 0
 
 

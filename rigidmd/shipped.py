@@ -1,4 +1,4 @@
-"""What travels with the package for people: scenes to start from."""
+"""What travels with the package for people: scenes to start from, and the chapters of the documentation."""
 
 import difflib
 import re
@@ -14,6 +14,10 @@ PACKAGE = Path(__file__).parent
 
 #: In a wheel the scenes lie inside the package; in a checkout, and in an editable install of one, beside it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
+DOCS = PACKAGE / "docs"
+
+#: In the order in which they are listed.
+CHAPTERS = ("top", "water", "molecule", "extending", "manual", "benchmarks", "validation", "changelog")
 
 
 class Example(NamedTuple):
@@ -81,3 +85,19 @@ def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
         except OSError as error:
             raise OutputError(f"{target} cannot be written: {error.strerror}") from None
     return [path, *inputs]
+
+
+def contents() -> dict[str, str]:
+    """Chapters of the documentation: name -> what it is about, the first line under its title."""
+    return {name: (DOCS / f"{name}.md").read_text(encoding="utf-8").splitlines()[2] for name in CHAPTERS}
+
+
+def chapter_text(name: str) -> str:
+    """A chapter as plain text: without its comments, pictures by name and path. Raises Faults."""
+    if name not in CHAPTERS:
+        near = difflib.get_close_matches(name, CHAPTERS, 1, 0.5)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise Faults("help", [f"there is no chapter {name!r}; {hint}there are {', '.join(CHAPTERS)}"])
+    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
+    return re.sub(r"!\[([^\]]*)\]\((?:\.\./)*([^)]*)\)", r"[picture: \1, \2]", text).rstrip()
