@@ -338,9 +338,12 @@ def test_readme_is_a_first_page_and_leads_to_every_chapter():
         assert f"(rigidmd/docs/{name}.md)" in text
 
 
-def test_the_version_is_the_same_wherever_it_is_said():
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+def test_author_and_version_are_the_same_wherever_they_are_said():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version, (author,) = project["version"], project["authors"]
     text = README.read_text(encoding="utf-8")
+    assert f"{author['name']}, *rigidmd" in text
+    assert f"{{{{{author['name']}}}}}" in text
     assert f"version {version}," in text
     assert f"version = {{{version}}}" in text
     assert f"\n## {version}" in (DOCS / "changelog.md").read_text(encoding="utf-8")
