@@ -138,6 +138,13 @@ def test_an_unknown_integrator_lists_the_names_once(capsys, tmp_path):
         assert message.count("kahan_li_8") == 1
 
 
+def test_an_unknown_integrator_of_the_command(capsys, tmp_path):
+    (tmp_path / "good.toml").write_text(GOOD)
+    assert main(["precision", str(tmp_path / "good.toml"), "--integrators", "velocity_verlet,SRKN6"]) == 2
+    message = capsys.readouterr().err
+    assert "--integrators: there is no SRKN6; did you mean srkn_6? (known: velocity_verlet" in message
+
+
 def test_the_command_and_the_scene_suggest_the_same_model(capsys, tmp_path):
     scene = refused(capsys, tmp_path, GOOD.replace("spce", "SPC/E"))
     assert main(["models", "SPC/E"]) == 2

@@ -130,8 +130,8 @@ def _read_molecules(
     matched = match(atoms, species, across, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
-        why = _strange_masses(atoms, species) or _other_units(atoms, species)
-        raise StructureError(str(path), matched[:MOST_NAMED] + more + why)
+        faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        raise StructureError(str(path), faults)
     notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]
@@ -153,8 +153,8 @@ def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]
     """Refuse names of atom types that are in no molecule of the scene."""
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
     faults = [
-        f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules{meant(name, known)}; "
-        f"there are {', '.join(known)}"
+        f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
+        f"{', '.join(known)}{meant(name, known)}"
         for number, name in atom_types.items()
         if name not in (*known, "X")
     ]
@@ -191,7 +191,7 @@ def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> li
             own = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
             mass = float(molecule.masses[site])
             for i in own[np.abs(atoms.masses[own] - mass) > SAME_MASS * mass]:
-                other[f"{atoms.names[i]} {atoms.masses[i]:g} u, {molecule.site_names[site]} {mass:g} u"] = None
+                other[f"{atoms.names[i]} {atoms.masses[i]:g} against {molecule.site_names[site]} {mass:g} u"] = None
     if not other:
         return []
     return [f"masses of the scene count, not those of the file ({'; '.join(other)}): masses_u changes them"]

@@ -327,7 +327,7 @@ def _lammps_atoms(
             raise StructureError(str(path), faults)
     names = labels if atom_types is None else atom_types
     masses = atoms.get_masses() if listed else None
-    element = {} if masses is None else {t: _element_of_mass(mass) for t, mass in zip(types, masses, strict=True)}
+    element = {} if masses is None else {t: element_of_mass(mass) for t, mass in zip(types, masses, strict=True)}
     result = _from_ase(
         path,
         atoms,
@@ -342,7 +342,7 @@ def _lammps_atoms(
     return result
 
 
-def _element_of_mass(mass: float) -> str:
+def element_of_mass(mass: float) -> str:
     """The element, or heavy hydrogen, that weighs so much (u); "" if none does: several atoms as one, say."""
     from ase.data import atomic_masses, chemical_symbols
 

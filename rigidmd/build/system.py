@@ -219,7 +219,9 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site,
             faults.append(f"atom {name}: no entry of sites{where} has this name or is called {element}")
             continue
         used.add(match.name if match else "")
-        given = next((s.mass_u for s in (match, shared) if s is not None and s.mass_u is not None), float(mass))
+        entries = [s for s in (match, shared) if s is not None]
+        given = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
+        element = next((s.element for s in entries if s.element != "X"), element)
         known = {"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
         sites.append(match.model_copy(update=known) if match else Site(**known))
     faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]

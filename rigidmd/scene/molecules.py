@@ -134,7 +134,7 @@ class Molecules(Section):
     """How many; needed unless there is a structure file"""
     frozen: Flag | tuple[ResidueNumber, ...] | str = False
     """They stay put and act on the others; not on one another, so the potential energy lacks that constant. True for
-    all, or numbers of some, [1, 2, 5] or "1-10, 15": of residues as the structure file has them, and where its
+    all, or numbers of some, [1, 2, 5] or "1-10, 15": all residues of such a number in the structure file; where its
     residues are not the molecules, or there is no file, 1, 2, ... among those of this species"""
 
     @field_validator("frozen")
