@@ -147,7 +147,7 @@ def toml_fault(error: tomllib.TOMLDecodeError, text: str) -> str:
     line = text.splitlines()[number - 1] if place else ""
     # tomllib stops at the word, or within it: after the inf of "infinite"
     bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
-    if not bare:
+    if not bare or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # the head of a table, after a list without its end
         return f"is not TOML: {error}"
     keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1]
     where = f"line {number}: {'.'.join(map(str, keys))}: "

@@ -78,6 +78,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("count = 20", 'count = 20\nresidue_names = ["SOL", W]', ["line 7: molecules.0.residue_names: is W without quotes"]),
         ("count = 20", "count = 20\nfrozen = True", ["line 7: molecules.0.frozen: is True, must be written true"]),
         ("count = 20", "count = 20\nfrozen = null", ["line 7: molecules.0.frozen: is null", "leave the key out"]),
+        ("[start]", "[output]\npositions = [\n[start]", ["is not TOML", "line 14"]),
         ("timestep_fs = 1", "timestep_fs = 1 fs", ["is not TOML", "line 10"]),
         ("timestep_fs = 1", 'integrator = "velocity-verlet"', ["'velocity-verlet'", "did you mean velocity_verlet?"]),
         ("timestep_fs = 1", 'integrator = "verlet"', ["did you mean velocity_verlet or position_verlet?"]),
