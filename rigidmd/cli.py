@@ -176,7 +176,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KEY=VALUE",
         dest="overrides",
-        help="override a key of the scene by its dotted path (entries of lists count from 0); may be repeated",
+        help="override a key of the scene by its dotted path (entries of lists count from 0), or with nothing after = "
+        "remove it; may be repeated",
     )
 
 
@@ -311,8 +312,13 @@ def _body_energy(scene, options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     from rigidmd.build.describe import describe
+    from rigidmd.measure.stable_step import long_steps
+    from rigidmd.scene import BodyScene
 
-    print(describe(_read_scene(options)))
+    scene = _read_scene(options)
+    print(describe(scene))
+    for warning in [] if isinstance(scene, BodyScene) else long_steps(scene):
+        _warn(warning)
     return 0
 
 
@@ -403,7 +409,7 @@ def _models(options: argparse.Namespace) -> int:
 def _schema(options: argparse.Namespace) -> int:
     from rigidmd.scene import schema
 
-    print(json.dumps(_strict(schema()), indent=2, allow_nan=False))
+    print(json.dumps(schema(), indent=2, allow_nan=False))
     return 0
 
 
@@ -419,10 +425,3 @@ def _help(options: argparse.Namespace) -> int:
     for name, about in found.items():
         print(f"  {name:<{width}}  {about}")
     return 0
-
-
-def _strict(value):
-    """JSON has no infinity: a default that is infinite is left out."""
-    if isinstance(value, dict):
-        return {k: _strict(v) for k, v in value.items() if v != float("inf")}
-    return [_strict(v) for v in value] if isinstance(value, list) else value

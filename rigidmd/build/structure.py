@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.cells import angles_deg, reduced, right_angled, roomiest, standard_rotation
-from rigidmd.build.matching import Matched, massive, match
-from rigidmd.build.structure_files import Atoms, read_atoms
+from rigidmd.build.matching import NO_MASS, Matched, massive, match
+from rigidmd.build.structure_files import SAME_MASS, Atoms, read_atoms
 from rigidmd.errors import StructureError
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.molecules import Molecule
+from rigidmd.validation import meant
 
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 MOST_NAMED = 5  # how many molecules a message names before it only counts
@@ -31,6 +32,7 @@ class Arrangement(NamedTuple):
     cell: np.ndarray | None  # (3, 3), rows a along x, b in xy, c; Å
     residual_rms: float  # Å, of all atoms against their templates
     residual_max: float  # Å
+    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
     notes: tuple[str, ...] = ()  # what was made of the file beyond reading it
 
 
@@ -42,10 +44,11 @@ def read_structure(
     tolerance: float,
     frame: int | None = None,
     repeat: tuple[int, int, int] = (1, 1, 1),
+    atom_types: dict[str, str] | None = None,
 ) -> Arrangement:
     """The molecules of a structure file. Raises StructureError.
 
-    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat: see
+    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types: see
     Scene.structure.
     """
     if path.suffix == ".npz":
@@ -55,7 +58,7 @@ def read_structure(
         if periodic and wanted is None:
             _check_box(path, found.cell, [])
     else:
-        found = _read_molecules(path, species, wanted, periodic, tolerance, frame)
+        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types)
     notes = list(found.notes)
     if not periodic:
         cell = None
@@ -98,6 +101,7 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
 
     return found._replace(
         species=tiled(found.species),
+        number=tiled(found.number),
         position=(found.position + shifts[:, None]).reshape(-1, 3),
         rotation=tiled(found.rotation),
         velocity=tiled(found.velocity),
@@ -107,8 +111,11 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
     )
 
 
-def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: float, frame) -> Arrangement:
-    atoms = read_atoms(path, frame)
+def _read_molecules(
+    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types
+) -> Arrangement:
+    _check_types(path, atom_types or {}, species)
+    atoms = read_atoms(path, frame, atom_types)
     notes = list(atoms.notes)
     if atoms.cell is not None:
         cell, turn = standard_rotation(atoms.cell)
@@ -123,8 +130,9 @@ def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: floa
     matched = match(atoms, species, across, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
-        raise StructureError(str(path), matched[:MOST_NAMED] + more + _other_units(atoms, species))
-    notes += [*matched.notes, *_massless(matched, species)]
+        faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        raise StructureError(str(path), faults)
+    notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]
     return Arrangement(
@@ -136,8 +144,57 @@ def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: floa
         cell=atoms.cell,
         residual_rms=float(np.sqrt(matched.square @ sizes / sizes.sum())),
         residual_max=float(matched.deviation.max()),
+        number=matched.number,
         notes=tuple(notes),
     )
+
+
+def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
+    """Refuse names of atom types that are in no molecule of the scene."""
+    known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
+    faults = [
+        f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
+        f"{', '.join(known)}{meant(name, known)}"
+        for number, name in atom_types.items()
+        if name not in (*known, "X")
+    ]
+    if faults:
+        raise StructureError(str(path), faults)
+
+
+def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
+    """Which atoms of a file with masses weigh what no site of the scene does."""
+    if atoms.masses is None:
+        return []
+    masses = np.unique([mass for m in species for mass in m.masses[massive(m)]])
+    strange = {
+        f"{name} ({mass:g} u)": None
+        for name, mass in zip(atoms.names, atoms.masses.tolist(), strict=True)
+        if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
+    }
+    if not strange:
+        return []
+    there = ", ".join(f"{mass:g}" for mass in masses)
+    return [
+        f"its atom types {', '.join(strange)} weigh what no site of the scene's molecules does ({there} u): say what "
+        "they are by structure.atom_types, or give the molecules these masses by masses_u"
+    ]
+
+
+def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> list[str]:
+    """A note where atoms weigh other than the sites that they became."""
+    if atoms.masses is None:
+        return []
+    other = {}
+    for k, molecule in enumerate(species):
+        for s, site in enumerate(massive(molecule)):
+            own = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
+            mass = float(molecule.masses[site])
+            for i in own[np.abs(atoms.masses[own] - mass) > SAME_MASS * mass]:
+                other[f"{atoms.names[i]} {atoms.masses[i]:g} against {molecule.site_names[site]} {mass:g} u"] = None
+    if not other:
+        return []
+    return [f"masses of the scene count, not those of the file ({'; '.join(other)}): masses_u changes them"]
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
@@ -210,6 +267,7 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
     try:
         with np.load(path, allow_pickle=False) as data:
             names = [str(name) for name in data["species_names"]]
+            number = data.get("residue_number")
             arrays = {
                 key: data[key]
                 for key in ("species", "position", "velocity", "rotation", "angular_momentum_body", "cell")
@@ -226,6 +284,8 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
     shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3)}
     shapes |= {"rotation": (n, 3, 3), "angular_momentum_body": (n, 3)} if turning else {}
     bad = [k for k, shape in shapes.items() if arrays[k].shape != shape or arrays[k].dtype.kind not in "fi"]
+    if number is not None and (number.shape != (n,) or number.dtype.kind != "i"):
+        bad.append("residue_number")
     bad += [k for k, a in arrays.items() if k not in (*bad, "cell") and not np.isfinite(a).all()]
     if not bad and (arrays["species"].dtype.kind != "i" or not np.isin(arrays["species"], np.arange(len(names))).all()):
         bad.append("species")
@@ -242,4 +302,5 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
         cell=arrays["cell"] if np.isfinite(arrays["cell"]).all() else None,
         residual_rms=0.0,
         residual_max=0.0,
+        number=number,
     )

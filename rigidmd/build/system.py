@@ -68,6 +68,7 @@ class System:
     constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
     tail_pressure: float  # u/(Å ps²), all that no motion changes
     sites: Sites
+    residue_number: np.ndarray  # (n,) by which a scene may pick molecules: see Molecules.frozen
     from_lattice: bool
     cutoff: float  # Å
     left_out: list[str]
@@ -117,16 +118,17 @@ class System:
 
 def build(scene: MolecularScene) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
-    species = _species(scene)
+    species = species_of(scene)
     arrangement = _arrange(scene, species)
     space = space_of(arrangement.cell)
     cutoff = _cutoff(scene, space, species)
-    frozen = np.array([entry.frozen for entry in scene.molecules])
-    if frozen[arrangement.species].all():
+    number = _numbers(arrangement)
+    species, index, frozen = _frozen(scene, species, arrangement.species, number)
+    if frozen[index].all():
         raise SceneError(scene.source, ["molecules: all are frozen; nothing would move"])
-    model = _model(species, arrangement.species, frozen)
+    model = _model(species, index, frozen)
     turning = any(m.inertia.any() for m in species)
-    n = len(arrangement.species)
+    n = len(index)
     state = State(
         np.ascontiguousarray(arrangement.position, dtype=float),
         np.zeros((n, 3)),
@@ -146,7 +148,8 @@ def build(scene: MolecularScene) -> System:
         freedom=freedom_of(model),
         constants=constants,
         tail_pressure=tail_pressure,
-        sites=_sites(species, arrangement.species),
+        sites=_sites(species, index),
+        residue_number=number,
         from_lattice=scene.structure is None,
         cutoff=cutoff,
         left_out=_left_out(scene, terms, model, space),
@@ -156,7 +159,7 @@ def build(scene: MolecularScene) -> System:
     _set_momenta(system, arrangement)
     system.notes += [
         f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
-        for m in species
+        for m in {m.name: m for m in species}.values()
         if m.mixing not in (None, scene.forces.mixing)
     ]
     if scene.structure is not None:
@@ -170,7 +173,8 @@ def build(scene: MolecularScene) -> System:
     return system
 
 
-def _species(scene: MolecularScene) -> list[Molecule]:
+def species_of(scene: MolecularScene) -> list[Molecule]:
+    """The molecules that a scene names, in its order. Raises SceneError with every fault."""
     found, faults = [], []
     for k, entry in enumerate(scene.molecules):
         try:
@@ -215,7 +219,9 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site,
             faults.append(f"atom {name}: no entry of sites{where} has this name or is called {element}")
             continue
         used.add(match.name if match else "")
-        given = next((s.mass_u for s in (match, shared) if s is not None and s.mass_u is not None), float(mass))
+        entries = [s for s in (match, shared) if s is not None]
+        given = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
+        element = next((s.element for s in entries if s.element != "X"), element)
         known = {"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
         sites.append(match.model_copy(update=known) if match else Site(**known))
     faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]
@@ -229,7 +235,14 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         path = scene.path(scene.structure.file)
         start = scene.structure
         found = read_structure(
-            path, species, scene.box.cell, scene.box.periodic, start.tolerance, start.frame, start.repeat
+            path,
+            species,
+            scene.box.cell,
+            scene.box.periodic,
+            start.tolerance,
+            start.frame,
+            start.repeat,
+            start.atom_types,
         )
         faults = []
         for k, entry in enumerate(scene.molecules):
@@ -259,6 +272,44 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         residual_rms=0.0,
         residual_max=0.0,
     )
+
+
+def _numbers(arrangement: Arrangement) -> np.ndarray:
+    """Numbers (n,) of residues, or else 1, 2, ... among the molecules of each species."""
+    if arrangement.number is not None:
+        return arrangement.number
+    found = np.zeros(len(arrangement.species), int)
+    for k in np.unique(arrangement.species):
+        own = arrangement.species == k
+        found[own] = np.arange(1, own.sum() + 1)
+    return found
+
+
+def _frozen(
+    scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
+) -> tuple[list[Molecule], np.ndarray, np.ndarray]:
+    """Species, index (n,) into them, and which are frozen; one of which some molecules are frozen becomes two."""
+    species, index, faults = list(species), index.copy(), []
+    frozen = [entry.frozen is True for entry in scene.molecules]
+    for k, entry in enumerate(scene.molecules):
+        own = index == k
+        chosen = np.zeros(len(index), bool)
+        for first, last in entry.frozen_spans:
+            here = own & (first <= number) & (number <= last)
+            if not here.any() or last > number[own].max():
+                there = f"they have {number[own].min()} to {number[own].max()}" if own.any() else "there are none"
+                asked = f"{first}" if first == last else f"{first}-{last}"
+                faults.append(f"molecules.{k}.frozen: no {species[k].name} has the number {asked}; {there}")
+            chosen |= here
+        if chosen.any() and (chosen == own).all():
+            frozen[k] = True
+        elif chosen.any():
+            index[chosen] = len(species)
+            species.append(species[k])
+            frozen.append(True)
+    if faults:
+        raise SceneError(scene.source, faults)
+    return species, index, np.array(frozen)
 
 
 def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> float:

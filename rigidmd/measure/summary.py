@@ -1,6 +1,7 @@
 """The figures a run is judged by, as one dictionary with units in its keys."""
 
 import platform
+from collections import Counter
 from importlib.metadata import version
 from math import isnan, sqrt
 
@@ -50,7 +51,7 @@ def summarise(
         "seed": scene.seed,
         "interrupted": interrupted,
         "molecules": len(system.model.species),
-        "species": {m.name: int((system.model.species == k).sum()) for k, m in enumerate(system.species)},
+        "species": dict(Counter(system.species[k].name for k in system.model.species)),
         "sites": len(system.sites.molecule),
         "degrees_of_freedom": system.freedom.total,
         "degrees_of_freedom_translation": system.freedom.translation,

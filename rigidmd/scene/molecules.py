@@ -1,5 +1,6 @@
 """The scene of molecules: species, box, forces, stages."""
 
+import re
 from math import cos, inf, pi, radians, sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,6 +20,9 @@ TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 MOST_STEPS = 1e12
 
+#: Endings of LAMMPS' data files.
+LAMMPS_DATA = (".data", ".lmp", ".lammps")
+
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
 
@@ -26,6 +30,7 @@ Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
+ResidueNumber = Annotated[int, Strict(), Field(ge=0)]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
 #: Keys of `Forces` that only some kinds of electrostatics know.
@@ -57,6 +62,15 @@ class Structure(Section):
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
     """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
+    atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
+    """Of LAMMPS' data files: what each atom type is, { 1 = "O", 2 = "H" }, by a site's name or an element, X without
+    mass. When not given, labels in the file tell, and else masses"""
+
+    @model_validator(mode="after")
+    def _has_types(self):
+        if self.atom_types is not None and not self.file.lower().endswith(LAMMPS_DATA):
+            raise ValueError(f"atom_types are of LAMMPS' data files ({' '.join(LAMMPS_DATA)}), not of {self.file}")
+        return self
 
 
 class Box(Section):
@@ -118,8 +132,29 @@ class Molecules(Section):
     """Residue names by which structure files may call this species"""
     count: Count | None = None
     """How many; needed unless there is a structure file"""
-    frozen: Flag = False
-    """They stay put and act on the others; not on one another, so the potential energy lacks that constant"""
+    frozen: Flag | tuple[ResidueNumber, ...] | str = False
+    """They stay put and act on the others; not on one another, so the potential energy lacks that constant. True for
+    all, or numbers of some, [1, 2, 5] or "1-10, 15": all residues of such a number in the structure file; where its
+    residues are not the molecules, or there is no file, 1, 2, ... among those of this species"""
+
+    @field_validator("frozen")
+    @classmethod
+    def _are_numbers(cls, frozen: bool | tuple[int, ...] | str):
+        if frozen == ():
+            raise ValueError("is empty: list the numbers of molecules, or leave it out")
+        if isinstance(frozen, str):
+            if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", frozen):
+                raise ValueError(f"is {frozen!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
+            if turned := [f"{first}-{last}" for first, last in _spans(frozen) if first > last]:
+                raise ValueError(f"is {frozen!r}: {', '.join(turned)} ends before it begins")
+        return frozen
+
+    @property
+    def frozen_spans(self) -> list[tuple[int, int]]:
+        """First and last of the numbers of frozen molecules; none where all or none are."""
+        if isinstance(self.frozen, bool):
+            return []
+        return _spans(self.frozen) if isinstance(self.frozen, str) else [(number, number) for number in self.frozen]
 
     @field_validator("model")
     @classmethod
@@ -146,6 +181,12 @@ class Molecules(Section):
         if self.sites is not None and self.file is None and self.name is None:
             raise ValueError("a molecule of one's own needs a name")
         return self
+
+
+def _spans(text: str) -> list[tuple[int, int]]:
+    """First and last number of each part of "1-10, 15"."""
+    ends = [[int(number) for number in part.split("-")] for part in text.split(",")]
+    return [(numbers[0], numbers[-1]) for numbers in ends]
 
 
 class UnlikePair(Section):
@@ -256,6 +297,13 @@ class Stage(Section):
     """With auto: largest error of Q (of X in Å, of points) at the end of the pilot run, ten radians of libration"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
+
+    @field_validator("ensemble", mode="before")
+    @classmethod
+    def _is_there(cls, ensemble: Any):
+        if isinstance(ensemble, str) and ensemble.lower() in ("npt", "nph"):
+            raise ValueError(f"is {ensemble!r}, must be 'nve' or 'nvt': there is no pressure coupling yet")
+        return ensemble
 
     @model_validator(mode="after")
     def _makes_sense(self):
