@@ -57,7 +57,10 @@ def _of_pressure(system: System) -> dict[str, str]:
     constant = f"{system.tail_pressure / BAR:.10g} bar"
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if "lennard_jones_tail" in system.constants:
-        return {"virial": f"{virial}, without the tail correction", "pressure": f"{pressure} + {constant} of the tail"}
+        return {
+            "virial": f"{virial}, without the tail correction",
+            "pressure": f"{pressure}, and {constant} of the tail",
+        }
     if "coulomb_frozen" in system.constants:
-        pressure += f" + {constant}, which takes out what frozen molecules do to one another"
+        pressure += f", and {constant}, which takes out what frozen molecules do to one another"
     return {"virial": virial, "pressure": pressure}
