@@ -152,7 +152,7 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
         raise SceneError(scene.source, [f"{asked} with a cut-off of {cutoff:g} Å; take a longer one"])
     beyond = real_error(charges, alpha, cutoff, volume)
     reciprocal = 2 * pi * np.linalg.inv(cell).T
-    grid, order = _grid_along(scene, basis, cell), forces.pme_order
+    grid, order = _given_grid(scene, basis, cell), forces.pme_order
     if forces.electrostatics == "pme":
         if grid is None or order is None:
             found = mesh_for(charges, alpha, cell, share, order, grid)
@@ -185,19 +185,17 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
     return Settings(alpha, over, None, None, beyond, wave_error(charges, alpha, radius_of(over.total, volume), volume))
 
 
-def _grid_along(scene: MolecularScene, basis: np.ndarray, cell: np.ndarray) -> tuple[int, int, int] | None:
-    """The grid of a scene along the edges of the cell (3, 3) that stands for its own. Raises SceneError."""
+def _given_grid(scene: MolecularScene, basis: np.ndarray, cell: np.ndarray) -> tuple[int, int, int] | None:
+    """The grid that a scene gives, if it is one of the cell (3, 3) that stands for its own too. Raises SceneError."""
     grid = scene.forces.pme_grid
-    if grid is None or len(set(grid)) == 1:
+    if grid is None or len(set(grid)) == 1 or np.array_equal(basis, ewald.AS_GIVEN):
         return grid
-    if (np.abs(basis).sum(axis=1) > 1).any():
-        fault = (
-            f"forces.pme_grid = {list(grid)} counts points along edges of a cell that leans by more than half an edge; "
-            f"the box is that with {edges_in_words(cell)} ({basis_in_words(basis)}), where these are no grid. "
-            "Describe the box by that cell, or give three equal numbers, or leave pme_grid out"
-        )
-        raise SceneError(scene.source, [fault])
-    return tuple(int(n) for n in np.abs(basis) @ grid)
+    fault = (
+        f"forces.pme_grid = {list(grid)} counts points along edges of a cell that leans too much; the box is that with "
+        f"{edges_in_words(cell)}, {basis_in_words(basis)}, and has its own edges. Describe the box by that cell, or "
+        "give three equal numbers, or leave pme_grid out"
+    )
+    raise SceneError(scene.source, [fault])
 
 
 def _ewald(
@@ -217,7 +215,7 @@ def _ewald(
         over = ewald.ewald_sum(charge, alpha, space, charged.sites, settings.waves)
         most = " ".join(map(str, settings.waves.most))
         how = f"{settings.waves.total} waves, |n| up to {most}"
-        if forces.ewald_k_max is not None and (np.abs(basis).sum(axis=1) > 1).any():
+        if forces.ewald_k_max is not None and not np.array_equal(basis, ewald.AS_GIVEN):
             how += "; these are the waves that ewald_k_max means in the cell that was described"
     else:
         from rigidmd.forces.pme import pme  # rocket-fft is for scenes with PME only
