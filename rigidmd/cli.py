@@ -269,6 +269,8 @@ def _energy(options: argparse.Namespace) -> int:
         return 0
     relieved = f", after {found['relief_steps']} steps of overlap relief" if found["relief_steps"] else ""
     print(f"{scene.name}: energies of the start, {found['molecules']} molecules{relieved}")
+    for note in found["notes"]:
+        print(f"  {note}")
     for name, value in [*found["components"].items(), ("potential", found["potential"])]:
         print(f"  {name.replace('_', ' '):<22}{value:>22.10g} {unit}")
     print(f"  {'kinetic':<22}{found['kinetic']:>22.10g} {unit}")
@@ -277,6 +279,8 @@ def _energy(options: argparse.Namespace) -> int:
         print(f"  {'pressure':<22}{found['pressure_bar']:>22.10g} bar")
     force, molecule = found["largest_force_per_A"], found["largest_force_molecule"]
     print(f"  {'largest force':<22}{force:>22.10g} {unit}/Å on molecule {molecule}")
+    for name, text in found["meaning"].items():
+        print(f"  {name.replace('_', ' ')}: {text}")
     if options.accuracy:
         error = found["accuracy"]
         print(f"Coulomb forces on sites, held against {error['reference']}")

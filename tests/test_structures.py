@@ -12,7 +12,7 @@ from conftest import small_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigidmd.build.cells import pairs_within, standard_rotation
+from rigidmd.build.cells import basis_in_words, basis_of, pairs_within, reduced, standard_rotation
 from rigidmd.build.structure import read_structure
 from rigidmd.build.structure_files import element_of, element_of_mass, read_geometry
 from rigidmd.build.system import build
@@ -22,6 +22,7 @@ from rigidmd.molecules import Molecule, Site, load_model, molecule, with_masses
 from rigidmd.output.state import write_state
 from rigidmd.output.trajectory import TrajectoryFile, write_topology
 from rigidmd.scene import Scene
+from rigidmd.scene.molecules import Box
 from rigidmd.units import GRAM_PER_CM3
 
 TOLERANCE = 0.15
@@ -442,6 +443,55 @@ def test_the_standard_orientation_keeps_the_lattice():
     same, rotation = standard_rotation(np.diag([3.0, 4.0, 5.0]))
     assert np.array_equal(same, np.diag([3.0, 4.0, 5.0]))
     assert np.array_equal(rotation, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("angles", "told"),
+    [
+        ((90.0, 60.0, 90.0), ""),  # 36 cos 60° is 18.000000000000004
+        ((60.0, 60.0, 60.0), ""),
+        ((90.0, 59.995, 90.0), ""),  # 60.00 as files print it
+        ((90.0, 120.0, 90.0), ""),
+        ((90.0, 59.0, 90.0), "c' = c - a"),
+        ((90.0, 120.5, 90.0), "c' = c + a"),
+        ((60.0, 59.0, 58.0), "b' = b - a, c' = c - a"),
+        ((25.0, 30.0, 30.0), "b' = b - a, c' = c - b"),
+    ],
+)
+def test_a_cell_leans_by_half_an_edge_as_far_as_files_tell(angles, told):
+    cell = Box(lengths_A=36.0, angles_deg=angles).cell
+    other = reduced(cell)
+    basis = basis_of(other, cell)
+    assert basis_in_words(basis) == told
+    assert np.array_equal(other, cell) == (not told)
+    assert basis @ cell == pytest.approx(other, abs=1e-12)
+    assert abs(np.linalg.det(basis)) == pytest.approx(1)
+    assert (np.abs(other - np.diag(np.diag(other))) <= 0.5001 * np.diag(other)).all()
+
+
+def test_what_was_made_of_a_cell_is_said(tmp_path):
+    truth = Truth(["spce"] * 4, 5)
+    text = xyz(wrapped(truth.atoms(), truth.cell), truth.cell * [[1], [1], [-1]])
+    assert any("left-handed: -c stands for c" in note for note in read(tmp_path, text, "a.xyz").notes)
+    nearly = truth.cell.copy()
+    nearly[2, 0] = 1e-5 * nearly[2, 2]
+    told = read(tmp_path, xyz(wrapped(truth.atoms(), truth.cell), nearly), "b.xyz").notes
+    assert told == ("its angles of 90, 89.99943, 90° were taken for right ones",)
+
+
+def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
+    """The state has the box as it was described anew; the scene still has its own words for it."""
+    box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
+    system = build(small_scene({"argon": 4}, None, box=box))
+    assert any(
+        "box: its lattice is described by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes
+    )
+    write_state(tmp_path / "final.npz", system, system.state)
+    data = {"box": box, "structure": {"file": "final.npz"}, "molecules": [{"model": "argon"}],
+            "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
+    again = build(Scene.from_dict(data, tmp_path))
+    assert not any("box counts" in note for note in again.notes)
+    assert any("the scene's box: its lattice is described by" in note and "c' = c - a" in note for note in again.notes)
 
 
 def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):

@@ -5,16 +5,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.cells import angles_deg, reduced, right_angled, roomiest, standard_rotation
+from rigidmd.build.cells import (
+    angles_deg,
+    basis_in_words,
+    basis_of,
+    edges_in_words,
+    reduced,
+    right_angled,
+    roomiest,
+    same_lattice,
+    standard_rotation,
+)
 from rigidmd.build.matching import NO_MASS, Matched, massive, match
 from rigidmd.build.structure_files import SAME_MASS, Atoms, read_atoms
 from rigidmd.errors import StructureError
+from rigidmd.forces.ewald import AS_GIVEN
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.molecules import Molecule
 from rigidmd.validation import meant
 
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 MOST_NAMED = 5  # how many molecules a message names before it only counts
+ROUNDING = 1e-12  # of the longest edge: what turning a cell leaves
 SAME_BOX = 1e-4  # boxes of file and scene that differ by less, relatively, are the same as printed
 #: Units in which files are given by mistake, in Å.
 OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
@@ -34,6 +46,7 @@ class Arrangement(NamedTuple):
     residual_max: float  # Å
     number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
     notes: tuple[str, ...] = ()  # what was made of the file beyond reading it
+    basis: np.ndarray = AS_GIVEN  # (3, 3) integers: the edges of the cell in those of the cell that was described
 
 
 def read_structure(
@@ -64,31 +77,40 @@ def read_structure(
         cell = None
     elif wanted is not None:
         cell = wanted
-        if found.cell is not None and np.abs(found.cell - cell).max() > SAME_BOX * cell.max():
+        if found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
             notes.append("the scene's box counts, not that of the file")
     else:
         cell = found.cell
     found = found._replace(cell=cell, notes=tuple(notes))
     if repeat != (1, 1, 1):
         found = _repeated(found, repeat)
-    return found if found.cell is None else _reduced(found, wanted is None)
+    return leaning_less(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
 
 
-def _reduced(found: Arrangement, may_turn: bool) -> Arrangement:
-    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off."""
+def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
+    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off.
+
+    whose : the lattice, in words
+    """
+    if found.cell is None:
+        return found
     cell, turn = roomiest(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
     if np.array_equal(cell, found.cell):
         return found
-    lengths, angles = (np.linalg.norm(cell, axis=1), angles_deg(cell))
-    told = f"edges {', '.join(f'{x:.4f}' for x in lengths)} Å, angles {', '.join(f'{x:.4g}' for x in angles)}°"
+    basis = basis_of(cell @ turn, found.cell)
+    told = (
+        f"{whose} lattice is described by the cell with {edges_in_words(cell)}, {basis_in_words(basis)}, "
+        f"in place of {edges_in_words(found.cell)}"
+    )
     if np.array_equal(turn, np.eye(3)):
-        return found._replace(cell=cell, notes=(*found.notes, f"its lattice is described by the cell with {told}"))
+        return found._replace(cell=cell, notes=(*found.notes, told), basis=basis)
     return found._replace(
         cell=cell,
         position=found.position @ turn.T,
         rotation=turn @ found.rotation,
         velocity=None if found.velocity is None else found.velocity @ turn.T,
-        notes=(*found.notes, f"its lattice is described by the cell with {told}, turned, contents included"),
+        notes=(*found.notes, f"{told}; turned, contents included"),
+        basis=basis,
     )
 
 
@@ -123,7 +145,15 @@ def _read_molecules(
             velocity = None if atoms.velocity is None else atoms.velocity @ turn.T
             atoms = atoms._replace(position=atoms.position @ turn.T, velocity=velocity)
             notes.append("its cell was turned, contents included, so that a is along x and b in the xy plane")
-        atoms = atoms._replace(cell=np.diag(np.linalg.norm(cell, axis=1)) if right_angled(cell) else cell)
+        if np.linalg.det(atoms.cell) < 0:
+            notes.append("its cell is left-handed: -c stands for c, which leaves the lattice as it is")
+        if right_angled(cell):
+            upright = np.diag(np.linalg.norm(cell, axis=1))
+            if np.abs(upright - cell).max() > ROUNDING * cell.max():
+                told = ", ".join(f"{x:.7g}" for x in angles_deg(cell))
+                notes.append(f"its angles of {told}° were taken for right ones")
+            cell = upright
+        atoms = atoms._replace(cell=cell)
     if periodic and wanted is None:
         _check_box(path, atoms.cell, notes)
     across = atoms.cell if atoms.cell is not None or not periodic else wanted

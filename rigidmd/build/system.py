@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.cells import reduced
 from rigidmd.build.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
 from rigidmd.build.overlaps import overlaps
-from rigidmd.build.structure import Arrangement, read_structure
+from rigidmd.build.structure import Arrangement, leaning_less, read_structure
 from rigidmd.build.structure_files import read_geometry
 from rigidmd.dynamics.advance import Model
 from rigidmd.errors import Faults, SceneError, StructureError
@@ -137,7 +136,7 @@ def build(scene: MolecularScene) -> System:
         np.zeros(1),
         np.zeros(1),
     )
-    terms, constants, tail_pressure, charges = _terms(scene, species, model, space, cutoff, state)
+    terms, constants, tail_pressure, charges = _terms(scene, species, model, space, cutoff, state, arrangement.basis)
     system = System(
         scene=scene,
         species=species,
@@ -170,6 +169,8 @@ def build(scene: MolecularScene) -> System:
         system.notes += [f"{scene.structure.file}: {note}" for note in arrangement.notes]
         if faults := overlaps(system):
             raise StructureError(str(scene.path(scene.structure.file)), faults)
+    else:
+        system.notes += [f"box: {note}" for note in arrangement.notes]
     return system
 
 
@@ -262,16 +263,17 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         cell = np.eye(3) * np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))
     rng = np.random.default_rng([scene.seed, STREAM_LATTICE])
     n = sum(counts)
-    return Arrangement(
+    found = Arrangement(
         species=np.repeat(np.arange(len(species)), counts),
         position=lattice(n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
         velocity=None,
         angular_momentum_body=None,
-        cell=reduced(cell) if scene.box.periodic else None,
+        cell=cell if scene.box.periodic else None,
         residual_rms=0.0,
         residual_max=0.0,
     )
+    return leaning_less(found, "its", may_turn=False)
 
 
 def _numbers(arrangement: Arrangement) -> np.ndarray:
@@ -414,7 +416,13 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
 
 
 def _terms(
-    scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float, state: State
+    scene: MolecularScene,
+    species: list[Molecule],
+    model: Model,
+    space: Space,
+    cutoff: float,
+    state: State,
+    basis: np.ndarray,
 ) -> tuple[dict[str, NamedTuple], dict[str, float], float, Electrostatics | None]:
     """Terms by name, constant energies by name, tail pressure, what charges are."""
     forces = scene.forces
@@ -455,7 +463,7 @@ def _terms(
     if forces.electrostatics != "none" and any(len(c) for c in chosen):
         sites = _taking_part(species, index, chosen)
         charged = Charged(species, index, frozen[index], chosen, sites, _groups(sites, frozen[index]))
-        found = electrostatics(scene, charged, space, cutoff, start, state)
+        found = electrostatics(scene, charged, space, cutoff, start, state, basis)
         terms |= found.terms
         constants |= found.constants
         tail_pressure += found.pressure
@@ -481,6 +489,8 @@ def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) ->
         out.append("periodic images: there is no box")
     if all(stage.ensemble == "nve" for stage in scene.stages):
         out.append("thermostat: every stage is nve")
+    if scene.run.remove_momentum_interval_ps is False:
+        out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
     if not scene.forces.tail_correction:
         out.append("tail correction: not asked for")
     return out

@@ -19,6 +19,7 @@ WITH_VELOCITIES = (".trr", ".nc")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 MOST_STEPS = 1e12
+REMOVE_MOMENTUM_EVERY = 1.0  # ps, with pme: in it 216 waters at an accuracy of 1e-4 gained 26 u Å/ps; thermal were 980
 
 #: Endings of LAMMPS' data files.
 LAMMPS_DATA = (".data", ".lmp", ".lammps")
@@ -40,6 +41,7 @@ ELECTROSTATIC_KEYS = {
     "ewald_accuracy": ("ewald", "pme"),
     "ewald_alpha_per_A": ("ewald", "pme"),
     "ewald_surface_permittivity": ("ewald", "pme"),
+    "ewald_truncation": ("ewald", "pme"),
     "ewald_k_max": ("ewald",),
     "ewald_k2_max": ("ewald",),
     "ewald_k_radius_per_A": ("ewald",),
@@ -206,8 +208,9 @@ class Forces(Section):
     cutoff_A: Positive | None = None
     """Cut-off between sites; 9 Å in a periodic box, none without one"""
     truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
-    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. What
-    ewald and pme leave to pairs only has its energy shifted to 0 there, unless plain"""
+    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. The
+    energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. What ewald and
+    pme leave to pairs ends as ewald_truncation says"""
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
     and smooth_switch, at 0.6 of the cut-off"""
@@ -216,7 +219,7 @@ class Forces(Section):
     pairs: tuple[UnlikePair, ...] = ()
     """Parameters of particular pairs, in place of the mixing rule"""
     tail_correction: Flag = False
-    """Add the energy and pressure of Lennard-Jones beyond the cut-off"""
+    """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` is with it, `virial` without"""
     electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
     """How charges act: ewald and pme with all periodic images, the others within the cut-off; none ignores them"""
     reaction_field_permittivity: Permittivity = inf
@@ -228,17 +231,22 @@ class Forces(Section):
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
-    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each"""
+    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each, of the cell as box or file describe it"""
     ewald_k2_max: Count | None = None
     """Of ewald: largest n_x² + n_y² + n_z² besides"""
     ewald_k_radius_per_A: Positive | None = None
     """Of ewald: largest length of k"""
+    ewald_truncation: Literal["plain", "shift"] | None = None
+    """Of ewald and pme: whether the energy of what they leave to pairs, erfc(alpha r)/r, is shifted to 0 at the
+    cut-off; forces are the same. When not given: plain where `truncation` is plain, else shift. coulomb_self then also
+    holds -erfc(alpha R)/(2 R) times the square of each molecule's charge, R the cut-off: nothing for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
     """Of pme: order of the B-splines, 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """Of pme: grid points along each edge"""
+    """Of pme: grid points along each edge of the cell as box or file describe it; three equal ones if it leans by more
+    than half an edge, as another cell stands for it then"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.6
     """Extra radius of the neighbour list; speed only, never the result"""
 
@@ -258,6 +266,12 @@ class Forces(Section):
         if settled and self.ewald_alpha_per_A is not None and "ewald_accuracy" in self.model_fields_set:
             raise ValueError("ewald_accuracy would do nothing: alpha and what goes with it are all given")
         return self
+
+    @property
+    def shifts_ewald(self) -> bool:
+        """Whether the real-space energy of an Ewald sum is shifted to 0 at the cut-off."""
+        usual = "plain" if self.truncation == "plain" else "shift"
+        return (self.ewald_truncation or usual) == "shift"
 
     @property
     def gives_waves(self) -> bool:
@@ -354,6 +368,14 @@ class Stage(Section):
         return self.name or self.ensemble
 
 
+class Throughout(Section):
+    """What holds for all stages."""
+
+    remove_momentum_interval_ps: Interval | Literal[False] | None = None
+    """Time between removals of the total momentum; false for never. When not given: 1 ps with pme, whose forces do not
+    add up to zero exactly, and never otherwise. Its energy is booked like the heat of a thermostat"""
+
+
 class Output(Section):
     """What is written, all into the run's own folder."""
 
@@ -409,8 +431,18 @@ class MolecularScene(Scene):
     forces: Forces = Forces()
     start: Start = Start()
     stages: tuple[Stage, ...] = Field(min_length=1)
+    run: Throughout = Throughout()
     output: Output = Output()
     watch: Watch = Watch()
+
+    @property
+    def removes_momentum_every(self) -> float | None:
+        """Time between removals of the total momentum, ps; None for never."""
+        asked = self.run.remove_momentum_interval_ps
+        if asked is not None:
+            return asked or None
+        held = any(species.frozen for species in self.molecules)
+        return REMOVE_MOMENTUM_EVERY if self.forces.electrostatics == "pme" and not held else None
 
     @property
     def inputs(self) -> dict[str, Path]:
@@ -447,6 +479,11 @@ class MolecularScene(Scene):
             faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot warm what is at rest")
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             faults.append("forces.tail_correction is that of a liquid all around; with frozen molecules leave it out")
+        if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
+            faults.append(
+                "run.remove_momentum_interval_ps: frozen molecules hold the others, and no total momentum is kept; "
+                "leave it out"
+            )
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from rigidmd.build.momenta import Removed
 from rigidmd.build.relief import Relief, relieve
 from rigidmd.build.system import build
 from rigidmd.dynamics.engine import Engine
@@ -16,6 +17,7 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.terms import Load, State
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
+from rigidmd.measure.meanings import meanings
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
@@ -108,6 +110,7 @@ class MolecularSimulation(Simulation):
         self._last_good: tuple[int, float, State] | None = None
         self._thermal = 0.0
         self._thermostats = [self._thermostat(k) for k in range(len(self.scene.stages))]
+        self._removed = [Removed() for _ in self.scene.stages]
 
     def _thermostat(self, k: int) -> NamedTuple:
         stage = self.scene.stages[k]
@@ -125,9 +128,10 @@ class MolecularSimulation(Simulation):
         )
 
     def _heat(self, k: int) -> float:
-        """Energy that the thermostat of a stage has put in so far."""
+        """Energy that the thermostat of a stage has put in so far, less what went with the total momentum."""
         thermostat = self._thermostats[k]
-        return float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
+        heat = float(thermostat.heat[0]) if isinstance(thermostat, VelocityRescaling) else 0.0
+        return heat - self._removed[k].energy
 
     def _durations(self) -> list[float]:
         return [stage.duration_ps for stage in self.scene.stages]
@@ -136,6 +140,8 @@ class MolecularSimulation(Simulation):
         if self.scene.stages[k].is_open:
             self._choose(k)
         self._stage = k
+        if self.scene.removes_momentum_every is not None:
+            self._removed[k].remove(self.system.model, self.state.velocity)
         self._estimate(k)
         # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
         self.engine = Engine(self.system.model, self.system.terms)
@@ -178,7 +184,15 @@ class MolecularSimulation(Simulation):
     def _advance(self, k: int, steps: int, done: int) -> None:
         stage = self.scene.stages[k]
         dt = stage.timestep_fs * FEMTOSECOND
-        self.engine.advance(self.state, stage.scheme, dt, steps, self._thermostats[k], done)
+        interval = self.scene.removes_momentum_every
+        every = steps + done if interval is None else max(1, round(interval / dt))
+        end = done + steps
+        while done < end:
+            to = min(end, done + every - done % every)
+            self.engine.advance(self.state, stage.scheme, dt, to - done, self._thermostats[k], done)
+            done = to
+            if interval is not None and done % every == 0:
+                self._removed[k].remove(self.system.model, self.state.velocity)
 
     def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
         results.samples = Samples()
@@ -292,7 +306,7 @@ class MolecularSimulation(Simulation):
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
         results.summary = summarise(
             self.system, results.samples, self.state, self._relief, self.threads, prepared, wall, computing,
-            self._interrupted, self._choices, self._stable, self._warnings,
+            self._interrupted, self._choices, self._stable, self._warnings, self._removed,
         )  # fmt: skip
         if self.folder is None:
             return
@@ -350,6 +364,7 @@ class MolecularSimulation(Simulation):
             "unit": unit,
             "molecules": len(self.system.model.species),
             "relief_steps": relief.steps if relief else 0,
+            "notes": list(self.system.notes),
             "components": {name: energy / size for name, energy in seen.components.items()},
             "potential": seen.potential / size,
             "kinetic": seen.kinetic / size,
@@ -358,6 +373,7 @@ class MolecularSimulation(Simulation):
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
             "largest_force_per_A": force / size,
             "largest_force_molecule": molecule + 1,
+            "meaning": meanings(self.system),
         }
         if measure_accuracy:
             error = accuracy(self.system, self.state)
