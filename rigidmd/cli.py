@@ -2,17 +2,20 @@
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 EXAMPLES = """examples:
-  rigidmd check systems/water.toml          what would happen, without running
-  rigidmd run systems/water.toml            run it, into runs/water
-  rigidmd run systems/water.toml --set stages.1.timestep_fs=4 -o runs/water4
-  rigidmd energy systems/water.toml --unit kcal/mol
-  rigidmd run systems/heavy_top_3.toml      one body: a top, with figures of its motion
+  rigidmd new water                         copy a scene to start from: water.toml
+  rigidmd check water.toml                  what would happen, without running
+  rigidmd run water.toml                    run it, into runs/water
+  rigidmd run water.toml --set stages.1.timestep_fs=4 -o runs/water4
+  rigidmd energy water.toml --unit kcal/mol
+  rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
+  rigidmd help                              the chapters of the documentation
 """
 
 
@@ -52,6 +55,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    _command(commands, "examples", _examples, "list the scenes that come with rigidmd", "rigidmd examples")
+    new = _command(
+        commands, "new", _new, "copy a scene that comes with rigidmd, to start from", "rigidmd new water -o mine.toml"
+    )
+    new.add_argument("name", metavar="NAME", help="which scene; `rigidmd examples` lists them")
+    new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml)")
+    new.add_argument("--force", action="store_true", help="replace that file")
 
     run = _command(commands, "run", _run, "run a scene", "rigidmd run systems/water.toml -o runs/water")
     _scene_arguments(run)
@@ -130,6 +141,10 @@ def _parser() -> argparse.ArgumentParser:
         "print the JSON schema of scenes, for editors",
         "rigidmd schema > scene.schema.json",
     )
+    chapters = _command(
+        commands, "help", _help, "list the chapters of the documentation, or print one", "rigidmd help water | less"
+    )
+    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="print this one")
     return parser
 
 
@@ -161,7 +176,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KEY=VALUE",
         dest="overrides",
-        help="override a key of the scene by its dotted path (entries of lists count from 0); may be repeated",
+        help="override a key of the scene by its dotted path (entries of lists count from 0), or with nothing after = "
+        "remove it; may be repeated",
     )
 
 
@@ -170,6 +186,39 @@ def _read_scene(options: argparse.Namespace, **more):
 
     overrides = dict(parse_override(text) for text in options.overrides)
     return Scene.read(options.scene, overrides | more)
+
+
+def _examples(options: argparse.Namespace) -> int:
+    from rigidmd.shipped import examples
+
+    found = examples()
+    width = max(len(example.name) for example in found)
+    for title, is_body in (("molecules", False), ("one body", True)):
+        print(f"{title}:")
+        for example in found:
+            if example.is_body == is_body:
+                print(f"  {example.name:<{width}}  {example.about}")
+        print()
+    print("`rigidmd new NAME` copies one into the working directory, to start from")
+    return 0
+
+
+def _new(options: argparse.Namespace) -> int:
+    from rigidmd.shipped import copy_example, find_example, series_of
+
+    example = find_example(options.name)
+    path = Path(options.output or f"{example.name}.toml")
+    written = copy_example(example, path, options.force)
+    if example.name != options.name:
+        print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
+    print(f"{path}: {example.about}")
+    if beside := [str(file) for file in written[1:]]:
+        print(f"beside it, read by it: {', '.join(beside)}")
+    print("next:")
+    print(f"  rigidmd check {shlex.quote(str(path))}    says what would happen, and runs nothing")
+    print(f"  rigidmd run {shlex.quote(str(path))}      runs it, into {Path('runs') / path.stem}")
+    print("its comment says what to look at; `rigidmd help manual` describes every table")
+    return 0
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -220,6 +269,8 @@ def _energy(options: argparse.Namespace) -> int:
         return 0
     relieved = f", after {found['relief_steps']} steps of overlap relief" if found["relief_steps"] else ""
     print(f"{scene.name}: energies of the start, {found['molecules']} molecules{relieved}")
+    for note in found["notes"]:
+        print(f"  {note}")
     for name, value in [*found["components"].items(), ("potential", found["potential"])]:
         print(f"  {name.replace('_', ' '):<22}{value:>22.10g} {unit}")
     print(f"  {'kinetic':<22}{found['kinetic']:>22.10g} {unit}")
@@ -228,6 +279,8 @@ def _energy(options: argparse.Namespace) -> int:
         print(f"  {'pressure':<22}{found['pressure_bar']:>22.10g} bar")
     force, molecule = found["largest_force_per_A"], found["largest_force_molecule"]
     print(f"  {'largest force':<22}{force:>22.10g} {unit}/Å on molecule {molecule}")
+    for name, text in found["meaning"].items():
+        print(f"  {name.replace('_', ' ')}: {text}")
     if options.accuracy:
         error = found["accuracy"]
         print(f"Coulomb forces on sites, held against {error['reference']}")
@@ -263,14 +316,17 @@ def _body_energy(scene, options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     from rigidmd.build.describe import describe
+    from rigidmd.measure.stable_step import long_steps
+    from rigidmd.scene import BodyScene
 
-    print(describe(_read_scene(options)))
+    scene = _read_scene(options)
+    print(describe(scene))
+    for warning in [] if isinstance(scene, BodyScene) else long_steps(scene):
+        _warn(warning)
     return 0
 
 
 def _precision(options: argparse.Namespace) -> int:
-    import shlex
-
     from tqdm import tqdm
 
     from rigidmd.errors import SceneError
@@ -306,7 +362,6 @@ def _precision(options: argparse.Namespace) -> int:
 
 def _stability(options: argparse.Namespace) -> int:
     import platform
-    import shlex
 
     from tqdm import tqdm
 
@@ -358,12 +413,19 @@ def _models(options: argparse.Namespace) -> int:
 def _schema(options: argparse.Namespace) -> int:
     from rigidmd.scene import schema
 
-    print(json.dumps(_strict(schema()), indent=2, allow_nan=False))
+    print(json.dumps(schema(), indent=2, allow_nan=False))
     return 0
 
 
-def _strict(value):
-    """JSON has no infinity: a default that is infinite is left out."""
-    if isinstance(value, dict):
-        return {k: _strict(v) for k, v in value.items() if v != float("inf")}
-    return [_strict(v) for v in value] if isinstance(value, list) else value
+def _help(options: argparse.Namespace) -> int:
+    from rigidmd.shipped import chapter_text, contents
+
+    if options.chapter is not None:
+        print(chapter_text(options.chapter))
+        return 0
+    found = contents()
+    width = max(map(len, found))
+    print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` tells of a command):")
+    for name, about in found.items():
+        print(f"  {name:<{width}}  {about}")
+    return 0

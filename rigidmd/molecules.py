@@ -1,6 +1,5 @@
 """Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds the published ones."""
 
-import difflib
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import Kind, principal_frame, rotational_freedom
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
-from rigidmd.validation import NonNegative, Number, Positive, Section, Vector, faults_of
+from rigidmd.validation import NonNegative, Number, Positive, Section, Vector, faults_of, meant, toml_fault
 
 MODELS = Path(__file__).parent / "models"
 
@@ -308,9 +307,7 @@ def model_fault(name: str) -> str:
     known = available_models()
     if name in known:
         return ""
-    near = [model for model in known if model.startswith(name)] or difflib.get_close_matches(name, known, 1, 0.4)
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
-    return f"there is no model {name!r}; {hint}`rigidmd models` lists all {len(known)}"
+    return f"there is no model {name!r}{meant(name, known) or ';'} `rigidmd models` lists all {len(known)}"
 
 
 def load_model(name: str) -> Molecule:
@@ -345,7 +342,9 @@ def _read(path: Path, kind: type[Section]) -> Section:
         return kind.model_validate(tomllib.loads(text))
     except OSError as error:
         raise MoleculeError(str(path), [f"cannot be read: {error.strerror}"]) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise MoleculeError(str(path), [f"is not TOML: {error}"]) from None
+    except tomllib.TOMLDecodeError as error:
+        raise MoleculeError(str(path), [toml_fault(error, text)]) from None
     except ValidationError as error:
         raise MoleculeError(str(path), faults_of(error, kind, text)) from None

@@ -2,7 +2,8 @@
 
 import difflib
 import re
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -14,6 +15,9 @@ NonNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Strict(), Field(gt=0)]
 Flag = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
+
+#: More names than this that begin or end alike say nothing of which was meant.
+MOST_MEANT = 8
 
 
 class Section(BaseModel):
@@ -35,18 +39,29 @@ def faults_of(
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
             keys = keys[:-1]  # an entry that a list lacks: the list is what is wrong
         path = ".".join(str(key) for key in keys)
-        line = line_of(keys, text)
-        where = (f"line {line}: " if line else "") + (path or "scene")
-        if any(f"{path}.".startswith(f"{key}.") for key in overridden):
-            where = f"--set {path}"
-        faults.setdefault((where, path), []).append(_sentence(detail, keys, model))
+        faults.setdefault((place(keys, text, overridden), path), []).append(_sentence(detail, keys, model))
     # A value that may be several things gets one complaint from pydantic for each of them: say them as one. What is
     # wrong inside a value says more than that the whole is wrong.
     return [
-        f"{where}: {' or '.join(dict.fromkeys(sentences))}"
+        f"{where}: {_either(list(dict.fromkeys(sentences)))}"
         for (where, path), sentences in faults.items()
         if not any(other.startswith(path + ".") for _, other in faults)
     ]
+
+
+def _either(sentences: list[str]) -> str:
+    """Sentences as one: "is 1, must be a list" and "is 1, must be a table" say that it is 1 once."""
+    begin, must, _ = sentences[0].partition(", must be ")
+    return " or ".join([sentences[0], *(sentence.removeprefix(begin + must) for sentence in sentences[1:])])
+
+
+def place(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
+    """Where a key of a scene was given: by line, or on the command line."""
+    path = ".".join(map(str, keys))
+    if any(f"{path}.".startswith(f"{key}.") for key in overridden):
+        return f"--set {path}"
+    line = line_of(keys, text)
+    return (f"line {line}: " if line else "") + (path or "scene")
 
 
 def _is_union_branch(key: Any) -> bool:
@@ -60,7 +75,9 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
-            return "unknown key" + _suggestion(str(keys[-1]), _known_keys(model, keys[:-1]))
+            known = _known_keys(model, keys[:-1])
+            listed = f"; known here: {', '.join(known)}" if known else ""
+            return "unknown key" + (meant(str(keys[-1]), known) or listed)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "missing":
@@ -83,7 +100,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
             return f"is {shown}, must be a text in quotes"
         case "literal_error":
             wanted = context["expected"]
-            return f"is {shown}, must be {wanted}" + _suggestion(str(value), re.findall(r"'([^']*)'", wanted))
+            return f"is {shown}, must be {wanted}" + meant(str(value), re.findall(r"'([^']*)'", wanted))
         case "too_short":
             least = context["min_length"]
             return f"has {context['actual_length']} entries, needs at least {least}"
@@ -102,12 +119,44 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     return f"is {shown}: {detail['msg']}"
 
 
-def _suggestion(name: str, known: list[str]) -> str:
-    """'; did you mean ...?' for the nearest known name (one with a forgotten unit suffix first), or all of them."""
-    near = [key for key in known if key.startswith(name + "_")] or difflib.get_close_matches(name, known, 1, 0.6)
-    if near:
-        return f"; did you mean {near[0]}?"
-    return f"; known here: {', '.join(known)}" if known else ""
+def meant(name: str, known: Iterable[str]) -> str:
+    """'; did you mean ...?' for what may have been meant by a name that is not known; empty where nothing is like it.
+
+    Known names that are the same but for case and punctuation; else those that it begins, as where a unit is
+    forgotten, or ends; else the one spelled most like it.
+    """
+    plain = {key: _plain(key) for key in known}
+    asked = _plain(name)
+    near = [key for key, letters in plain.items() if letters == asked]
+    near = near or [key for key, letters in plain.items() if asked and letters.startswith(asked)]
+    near = near or [key for key, letters in plain.items() if asked and letters.endswith(asked)]
+    if not near or len(near) > MOST_MEANT:
+        alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
+        near = [key for key, letters in plain.items() if letters in alike]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\W_]", "", name).lower()
+
+
+def toml_fault(error: tomllib.TOMLDecodeError, text: str) -> str:
+    """What is wrong with a text that is not TOML; of a value without quotes, its line and key."""
+    place = re.search(r"at line (\d+), column (\d+)", str(error))
+    number, column = map(int, place.groups()) if place else (0, 0)
+    line = text.splitlines()[number - 1] if place else ""
+    # tomllib stops at the word, or within it: after the inf of "infinite"
+    bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
+    if not bare or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # the head of a table, after a list without its end
+        return f"is not TOML: {error}"
+    keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1]
+    where = f"line {number}: {'.'.join(map(str, keys))}: "
+    match bare:
+        case "True" | "False":
+            return f"{where}is {bare}, must be written {bare.lower()}"
+        case "None" | "null":
+            return f"{where}is {bare}, which TOML does not have: leave the key out"
+    return f'{where}is {bare} without quotes; a text needs them: "{bare}"'
 
 
 def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
@@ -130,6 +179,17 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def line_of(keys: list, text: str) -> int | None:
     """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; None if nowhere."""
     found = None
+    for number, table, entry in _lines(text):
+        if entry:
+            if keys[: len(table) + len(entry)] == [*table, *entry]:
+                return number
+        elif keys[: len(table)] == table:
+            found = number
+    return found
+
+
+def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
+    """Lines (from 1) of a TOML text that open a table or set a key: the table's path, and the key's in it or []."""
     table: list = []
     counts: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), 1):
@@ -141,11 +201,8 @@ def line_of(keys: list, text: str) -> int | None:
         elif header := re.match(r"\s*\[\s*([\w.\"-]+)\s*\]", line):
             name = header[1]
         else:
-            if (entry := re.match(r"\s*([\w.\"-]+)\s*=", line)) and keys[: len(table) + 1] == [
-                *table,
-                *entry[1].split("."),
-            ]:
-                return number
+            if entry := re.match(r"\s*([\w.\"-]+)\s*=", line):
+                yield number, table, entry[1].split(".")
             continue
         table = []
         parts = name.split(".")
@@ -153,6 +210,4 @@ def line_of(keys: list, text: str) -> int | None:
             table.append(part)
             if (index := counts.get(".".join(parts[:depth]))) is not None:
                 table.append(index)
-        if keys[: len(table)] == table:
-            found = number
-    return found
+        yield number, table, []

@@ -8,11 +8,12 @@ import numba
 import numpy as np
 import pytest
 from conftest import ROOT, built, shaken, small_scene
-from reference import KE, EwaldOracle, nearest
+from reference import KE, EwaldOracle, Oracle, nearest
 from scipy.special import erfc, hyp1f1
 
 from rigidmd.build.describe import describe
 from rigidmd.build.system import build
+from rigidmd.cli import main
 from rigidmd.dynamics.engine import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import sum_of, waves
@@ -22,10 +23,11 @@ from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector
+from rigidmd.output.report import summary_text
 from rigidmd.scene import Scene
 from rigidmd.scene.molecules import Box
 from rigidmd.simulation import Every, Simulation
-from rigidmd.units import BOLTZMANN, COULOMB, KJ_PER_MOL
+from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
 BOXES = [{"lengths_A": [13.0, 12.5, 15.0]}, {"lengths_A": [13.0, 14.0, 15.0], "angles_deg": [75.0, 100.0, 65.0]}]
 TIGHT = {"cutoff_A": 6.4, "ewald_alpha_per_A": 0.9}  # erfc is 3e-16 at the cut-off
@@ -293,6 +295,118 @@ def test_ewald_is_the_oracle_term_by_term(limit, box):
     assert "coulomb_background" not in found
 
 
+@pytest.mark.parametrize("angle", [60.0, 59.0])
+@pytest.mark.parametrize("limit", [
+    {"ewald_k_max": [5, 4, 7]},
+    {"ewald_k_max": [5, 7, 4], "ewald_k2_max": 30},
+    {"ewald_k_max": [3, 7, 4], "ewald_k_radius_per_A": 0.8},
+])  # fmt: skip
+def test_waves_are_those_of_the_cell_that_was_described(limit, angle):
+    """36 cos 60° is 18.000000000000004, and 59° leans by more than half an edge: another cell stands for it."""
+    box = {"lengths_A": 36.0, "angles_deg": [90.0, angle, 90.0]}
+    forces = {"cutoff_A": 10.0, "electrostatics": "ewald", "ewald_alpha_per_A": 0.285, "truncation": "plain"}
+    system, engine, state = shaken(build(small_scene({"spce": 10}, None, box=box, forces=forces | limit)), 4)
+    cell, most = Box(**box).cell, np.array(limit["ewald_k_max"])
+    reciprocal = 2 * np.pi * np.linalg.inv(cell).T
+    square, radius = limit.get("ewald_k2_max", np.inf), limit.get("ewald_k_radius_per_A", np.inf)
+
+    def inside(n):
+        short = (n**2).sum(axis=1) <= square
+        return (np.abs(n) <= most).all(axis=1) & short & (((n @ reciprocal) ** 2).sum(axis=1) <= radius**2)
+
+    x, q, owner = charged_sites(system, state)
+    seen = observe(system, engine, state)
+    assert seen.components["coulomb_reciprocal"] == pytest.approx(
+        EwaldOracle(x, q, owner, cell, 0.285, 10.0, inside).reciprocal, rel=1e-11
+    )
+    described = any("box: its lattice is described by" in note and "c' = c - a" in note for note in system.notes)
+    assert described == (angle == 59.0)
+
+
+def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
+    """The cell of the file stands 2 Å high; turned, it is a cube, and waves are still those of the file's cell."""
+    cell = 14.0 * np.array([[1.0, 0, 0], [2.0, 1.0, 0], [2.0, 1.0, 1.0]])
+    cell = cell @ from_vector(np.array([0.3, -0.5, 0.2])).T
+    rows = "\n".join(f"{name} {x} {y} {z}" for name, x, y, z in (("Na", 1.0, 2.0, 3.0), ("Cl", 4.0, 9.5, 2.5)))
+    lattice = " ".join(f"{edge:.15g}" for edge in np.ravel(cell))
+    (tmp_path / "salt.xyz").write_text(f'2\nLattice="{lattice}"\n{rows}\n')
+    ions = [
+        {"name": name, "sites": [{"name": name, "element": name, "mass_u": 30.0, "charge_e": charge, "sigma_A": 2.0,
+         "epsilon_K": 50.0, "position_A": [0.0, 0.0, 0.0]}]}
+        for name, charge in (("Na", 1.0), ("Cl", -1.0))
+    ]  # fmt: skip
+    data = {
+        "structure": {"file": "salt.xyz"},
+        "molecules": ions,
+        "forces": {"cutoff_A": 6.0, "electrostatics": "ewald", "ewald_alpha_per_A": 0.4, "ewald_k_max": [4, 2, 3]},
+        "start": {"temperature_K": 100.0},
+        "stages": [{"duration_ps": 1.0}],
+    }
+    system = build(Scene.from_dict(data, tmp_path))
+    assert cell_of(system.space) == pytest.approx(14.0 * np.eye(3))
+    assert any("turned, contents included" in note for note in system.notes)
+    inside = lambda n: (np.abs(n) <= (4, 2, 3)).all(axis=1)  # noqa: E731
+    oracle = EwaldOracle([[1, 2, 3], [4, 9.5, 2.5]], [1, -1], [0, 1], cell, 0.4, 6.0, inside)
+    found = observe(system, system.engine(), system.state).components
+    assert found["coulomb_reciprocal"] == pytest.approx(oracle.reciprocal, rel=1e-9)
+    data["forces"] = {"cutoff_A": 6.0, "electrostatics": "pme", "pme_grid": [16, 20, 24]}
+    with pytest.raises(
+        SceneError, match=r"pme_grid = \[16, 20, 24\] counts points .*edges 14.0000, 14.0000, 14.0000 Å"
+    ):
+        build(Scene.from_dict(data, tmp_path))
+    data["forces"]["pme_grid"] = [20, 20, 20]
+    assert any("grid 20 x 20 x 20" in note for note in build(Scene.from_dict(data, tmp_path)).notes)
+
+
+def test_a_cell_described_anew_is_said_by_every_command(tmp_path, capsys):
+    (tmp_path / "leaning.toml").write_text("""
+[box]
+lengths_A = 36
+angles_deg = [90, 59, 90]
+[[molecules]]
+model = "argon"
+count = 5
+[start]
+temperature_K = 100
+[[stages]]
+duration_ps = 0.004
+""")
+    told = (
+        "its lattice is described by the cell with edges 36.0000, 36.0000, 35.4545 Å, angles 90, 119.5, 90°, "
+        "c' = c - a, in place of edges 36.0000, 36.0000, 36.0000 Å, angles 90, 59, 90°"
+    )
+    scene = str(tmp_path / "leaning.toml")
+    for arguments in (["check"], ["energy"], ["energy", "--json"], ["run", "-o", str(tmp_path / "out")]):
+        assert main([arguments[0], scene, *arguments[1:]]) == 0
+        out = capsys.readouterr().out
+        assert told in (out if "--json" not in arguments else "".join(json.loads(out)["notes"]))
+    assert told in (tmp_path / "out" / "summary.json").read_text()
+
+
+@pytest.mark.parametrize("ewald", ["plain", "shift", None])
+@pytest.mark.parametrize("truncation", ["plain", "shift"])
+def test_lennard_jones_and_real_space_end_apart(truncation, ewald):
+    """RASPA's sums have the one shifted and the other plain."""
+    cutoff, alpha = 6.0, 0.3
+    forces = {"cutoff_A": cutoff, "electrostatics": "ewald", "ewald_alpha_per_A": alpha, "truncation": truncation}
+    forces |= {"ewald_truncation": ewald} if ewald else {}
+    scene = small_scene({}, None, molecules=SALT, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=forces)
+    system, engine, state = shaken(build(scene), 8)
+    x, q, owner = charged_sites(system, state)
+    oracle = EwaldOracle(x, q, owner, cell_of(system.space), alpha, cutoff, lambda n: n[:, 0] == n[:, 0])
+    found = observe(system, engine, state)
+    shift = erfc(alpha * cutoff) / cutoff if (ewald or truncation) == "shift" else 0.0
+    pairs = sum(oracle.q[i] * oracle.q[j] for i, j, r, same in oracle.pairs() if not same and r < cutoff)
+    net = np.bincount(owner, oracle.q)
+    assert found.components["coulomb_real"] == pytest.approx(oracle.real - shift * pairs, rel=1e-10)
+    assert found.components["coulomb_self"] == pytest.approx(oracle.self - 0.5 * shift * net @ net, rel=1e-11)
+    # without its charges the oracle of laws that end is one of Lennard-Jones
+    laws = Oracle(system)
+    laws.charge = np.zeros_like(laws.charge)
+    lj = laws.energy(state.position, state.rotation)[0]
+    assert found.components["lennard_jones"] == pytest.approx(lj, rel=1e-10)
+
+
 def test_only_the_energy_is_shifted_where_real_space_ends():
     cutoff, alpha = 6.0, 0.4
     found = {}
@@ -525,6 +639,62 @@ def test_same_bits_for_any_number_of_threads(method, precision):
     assert seen[0] == seen[1]
 
 
+# --- what the figures hold -----------------------------------------------------------------------------------------
+
+
+def test_what_energy_says_of_its_figures():
+    """The words of `rigidmd energy` beside the numbers that they are about."""
+    forces = {"cutoff_A": 6.0, "electrostatics": "ewald", "tail_correction": True}
+    for molecules, net in (([SALT[1]], 0.0), (SALT, 6.0)):
+        scene = small_scene({}, None, molecules=molecules, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=forces)
+        simulation = Simulation(scene)
+        found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")
+        said, system = found["meaning"], simulation.system
+        law = system.terms["coulomb_real"].law
+        assert ("(sum of q)² of each molecule" in said["coulomb_self"]) == (net > 0)
+        own = -law.alpha / np.sqrt(np.pi) * (system.of_sites(lambda m: m.charges) ** 2).sum()
+        own -= 0.5 * erfc(law.alpha * 6.0) / 6.0 * net
+        assert found["components"]["coulomb_self"] * KJ_PER_MOL == pytest.approx(KE * own, rel=1e-9)
+        assert "less its value at the cut-off" in said["coulomb_real"]
+        assert "without the tail correction" in said["virial"]
+        translation = observe(system, simulation.engine, simulation.state).kinetic_translation / KJ_PER_MOL
+        bar = (2 * translation + found["virial"]) * KJ_PER_MOL / (3 * 13 * 14 * 15) / BAR
+        tail = system.tail_pressure / BAR
+        assert tail < -1
+        assert found["pressure_bar"] - bar == pytest.approx(tail, rel=1e-6)
+        assert f", and {tail:.10g} bar of the tail" in said["pressure"]
+
+
+@pytest.mark.parametrize(
+    ("truncation", "words"),
+    [
+        ("plain", "q q (1/r + k r²) up to the cut-off"),
+        ("switch", "q q (1/r + k r²) up to the cut-off, less its value at the cut-off, times switch from 5.4 Å on"),
+        ("force_switch", "q q (1/r + k r²) up to the cut-off, its force switched off from 5.4 Å on"),
+    ],
+)
+def test_what_energy_says_of_a_reaction_field(truncation, words, capsys, tmp_path):
+    scene = tmp_path / "a.toml"
+    scene.write_text(f"""
+[box]
+lengths_A = 13
+[[molecules]]
+model = "spce"
+count = 8
+[forces]
+cutoff_A = 6
+truncation = "{truncation}"
+[start]
+temperature_K = 300
+[[stages]]
+duration_ps = 1
+""")
+    assert main(["energy", str(scene)]) == 0
+    told = capsys.readouterr().out
+    assert f"  coulomb: {words}\n" in told
+    assert "  virial: sum of F·R over molecules\n" in told
+
+
 # --- runs ------------------------------------------------------------------------------------------------------------
 
 
@@ -554,6 +724,36 @@ def test_energy_errors_of_pme_are_of_order_2(model):
     """The energy that the grid gives is kept: its fluctuation falls with the square of the step."""
     spread = [np.std(conserved(nve(model, dt, 0.4))[1]) for dt in (2.0, 1.0)]
     assert np.log2(spread[0] / spread[1]) == pytest.approx(2, abs=0.25)
+
+
+def coarse(**more):
+    """Forty waters on a grid so coarse that the total momentum soon shows."""
+    data = {
+        "box": {"lengths_A": 13.0},
+        "molecules": [{"model": "spce", "count": 40}],
+        "start": {"temperature_K": 298.0},
+        "forces": {"cutoff_A": 6.0, "truncation": "smooth_switch", "electrostatics": "pme", "ewald_accuracy": 3e-3},
+        "stages": [{"duration_ps": 0.2, "timestep_fs": 1.0}, {"duration_ps": 0.1, "timestep_fs": 1.0}],
+        "output": {"trajectory": False, "log_interval_ps": 0.01},
+    }
+    return Simulation(Scene.from_dict(data | more)).run()
+
+
+def test_total_momentum_is_taken_out_at_steps_that_the_scene_decides():
+    """Whatever is looked at, and with its energy booked; reported in the summary, whose notes say where it shows."""
+    often = {"run": {"remove_momentum_interval_ps": 0.05}}
+    found = coarse(**often)
+    seldom = coarse(**often, output={"trajectory": False, "log_interval_ps": 0.03})
+    assert found.state.velocity.tobytes() == seldom.state.velocity.tobytes()
+    kept = coarse(run={"remove_momentum_interval_ps": False})
+    removed = found.summary["momentum_removed"]
+    assert removed["times"] == 2 + 6 and removed["interval_ps"] == 0.05
+    assert 0 < removed["largest_u_A_ps"] < kept["momentum"].max()
+    assert found["momentum"][-1] < 1e-9 < kept["momentum"][-1]
+    assert (found["momentum"][found["step"] % 50 == 0] < 1e-9).all()
+    assert kept.summary["momentum_removed"] is None
+    assert "taken out every 0.05 ps, 8 times" in summary_text(found.summary)
+    assert coarse().summary["momentum_removed"]["times"] == 2  # 1 ps, the usual interval: where stages begin
 
 
 @pytest.mark.slow
@@ -611,6 +811,9 @@ def test_liquid_spce_is_the_published_one():
         ({"electrostatics": "ewald", "pme_order": 4}, "pme_order would do nothing"),
         ({"electrostatics": "pme", "damping_per_A": 0.1}, "damping_per_A would do nothing"),
         ({"electrostatics": "ewald", "reaction_field_permittivity": 80.0}, "reaction_field_permittivity would do nothing"),
+        ({"ewald_truncation": "plain"}, "ewald_truncation would do nothing with electrostatics = 'reaction_field'"),
+        ({"electrostatics": "damped_shifted_force", "ewald_truncation": "shift"}, "ewald_truncation would do nothing"),
+        ({"electrostatics": "pme", "ewald_truncation": "switch"}, "ewald_truncation: is 'switch', must be 'plain' or 'shift'"),
         ({"electrostatics": "ewald", "ewald_k2_max": 9}, "ewald_k2_max needs ewald_k_max"),
         ({"electrostatics": "ewald", "ewald_k_max": 9, "ewald_k2_max": 9, "ewald_k_radius_per_A": 1.0}, "not both"),
         ({"electrostatics": "ewald", "ewald_k_radius_per_A": 1e3}, "more than 1000 waves along an edge"),
@@ -666,6 +869,7 @@ def test_scenes_without_pme_need_no_fourier_transforms():
 import sys
 sys.modules["rocket_fft"] = None  # an import of it fails
 from rigidmd.build.system import build
+from rigidmd.cli import main
 from rigidmd.scene import Scene
 for forces in ({}, {"electrostatics": "ewald", "cutoff_A": 6.0}):
     data = {"box": {"lengths_A": 18.1}, "molecules": [{"model": "spce", "count": 9}], "forces": forces,

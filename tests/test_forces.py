@@ -70,7 +70,8 @@ def test_a_box_with_unequal_edges_and_many_cells():
     assert energies(engine, state)["lennard_jones"] == pytest.approx(expected, rel=1e-9)
 
 
-SLANTED = [[60.0, 60.0, 60.0], [70.0, 100.0, 50.0], [120.0, 110.0, 95.0], [35.0, 60.0, 80.0]]
+BEYOND_HALF = [80.0, np.degrees(np.arccos(0.50008 * 20 / 24)), np.degrees(np.arccos(0.50008 * 20 / 17))]  # as printed
+SLANTED = [[60.0, 60.0, 60.0], [70.0, 100.0, 50.0], [120.0, 110.0, 95.0], [35.0, 60.0, 80.0], BEYOND_HALF]
 
 
 @pytest.mark.parametrize("skin", [0.3, 3.0])
@@ -81,6 +82,7 @@ def test_slanted_boxes(angles, skin):
     forces = ended("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
     system = build(small_scene({"spce": 20, "nitrogen": 15}, None, box=box, forces=forces))
     engine, state, oracle = system.engine(), system.state.copy(), Oracle(system)
+    assert (cell_of(system.space)[1, 0] > 10.0) == (angles is BEYOND_HALF)
     rng = np.random.default_rng(3)
     state.position[:] += rng.normal(size=state.position.shape)
     state.position[:] += rng.integers(-3, 4, state.position.shape) @ cell_of(system.space)

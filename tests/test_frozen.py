@@ -5,6 +5,8 @@ import pytest
 from conftest import built, move, shaken, small_scene
 from reference import Oracle
 
+from rigidmd.build.describe import describe
+from rigidmd.build.momenta import mobile
 from rigidmd.build.system import build
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SceneError
@@ -169,6 +171,122 @@ def test_a_scene_in_which_nothing_would_move_is_refused():
             {}, 20.0, forces={"tail_correction": True},
             molecules=[{"model": "argon", "count": 3}, {"model": "nitrogen", "count": 3, "frozen": True}],
         )  # fmt: skip
+
+
+def test_some_molecules_of_a_species_freeze_as_a_species_of_their_own_would():
+    """The same molecules as one species of which some are frozen, and as two: the same bits."""
+    two = [{"model": "spce", "count": 20}, {"model": "spce", "name": "ice", "count": 6, "frozen": True}]
+    one = [{"model": "spce", "count": 26, "frozen": "21-24, 25, 26"}]
+    found = []
+    for molecules in (two, one):
+        system, engine, state = shaken(
+            build(small_scene({}, 16.0, molecules=molecules, forces={"cutoff_A": 7.9})), 3, 0.2
+        )
+        assert system.freedom == (60, 60)
+        assert (mobile(system.model) == (np.arange(26) < 20)).all()
+        assert not (state.velocity[20:].any() or state.angular_momentum_body[20:].any())
+        move(engine, state, VERLET, 0.0002, 20)
+        found.append((state, observe(system, engine, state)))
+    (a, seen_a), (b, seen_b) = found
+    for name in ("position", "rotation", "velocity", "angular_momentum_body"):
+        assert (getattr(a, name) == getattr(b, name)).all()
+    assert (seen_a.potential, seen_a.energy) == (seen_b.potential, seen_b.energy)
+    assert [m.name for m in system.species] == ["spce", "spce"]
+    assert set(system.residue_names) == {"SOL"}
+
+
+def test_describe_tells_which_are_frozen():
+    text = describe(small_scene({}, 20.0, molecules=[{"model": "spce", "count": 10, "frozen": [2, 3, 7]}]))
+    assert "  7 spce: asymmetric" in text
+    assert "  3 spce: asymmetric" in text
+    assert text.count("frozen") == 1
+    assert "degrees of freedom: 42 = 21 translation + 21 rotation" in text
+
+
+def frozen_of(scene):
+    """Indices of the molecules that do not move, from 0."""
+    return np.flatnonzero(~mobile(build(scene).model)).tolist()
+
+
+def gro(atoms, edge=30.0):
+    """(residue number, residue name, atom name, position in Å)"""
+    lines = [
+        f"{n:5d}{residue:<5}{name:>5}{k:5d}" + "".join(f"{c / 10:8.3f}" for c in x)
+        for k, (n, residue, name, x) in enumerate(atoms, 1)
+    ]
+    return "\n".join(["t", str(len(atoms)), *lines, f"{edge / 10:.3f} {edge / 10:.3f} {edge / 10:.3f}"]) + "\n"
+
+
+SPOTS = 5.0 * np.array(list(np.ndindex(4, 4, 4))) + 2.0
+#: Argon and krypton in turns, as the file counts residues: 7, 8, 9, 10, ...
+MIXED = [(7 + k, name, name.capitalize(), SPOTS[k]) for k, name in enumerate(["AR", "KR"] * 4)]
+
+
+def noble(folder, name, text, frozen, **more):
+    (folder / name).write_text(text)
+    molecules = [{"model": "argon", "frozen": frozen}, {"model": "krypton"}]
+    return small_scene({}, None, folder, molecules=molecules, box={}, structure={"file": name} | more)
+
+
+def test_molecules_are_picked_by_their_residue_numbers(tmp_path):
+    assert frozen_of(noble(tmp_path, "a.gro", gro(MIXED), [7, 11])) == [0, 4]
+    assert frozen_of(noble(tmp_path, "a.gro", gro(MIXED), "8-12")) == [2, 4]  # of argon only
+    assert frozen_of(noble(tmp_path, "a.gro", gro(MIXED), "7-9, 13")) == [0, 2, 6]
+    with pytest.raises(SceneError, match=r"molecules.0.frozen: no argon has the number 8; they have 7 to 13"):
+        build(noble(tmp_path, "a.gro", gro(MIXED), [8]))
+    twice = frozen_of(noble(tmp_path, "a.gro", gro(MIXED), [9], repeat=(1, 2, 1)))
+    assert twice == [2, 10]  # in each copy of the cell
+    lines = [
+        f"ATOM  {k + 1:5d} {atom:<4} {name:<4}A{number:4d}    {x[0]:8.3f}{x[1]:8.3f}{x[2]:8.3f}  1.00  0.00          {atom:>2}"
+        for k, (number, name, atom, x) in enumerate(MIXED)
+    ]
+    text = "\n".join(["CRYST1   30.000   30.000   30.000  90.00  90.00  90.00 P 1           1", *lines, "END"]) + "\n"
+    assert frozen_of(noble(tmp_path, "a.pdb", text, [7, 11])) == [0, 4]
+
+
+def test_without_residues_molecules_are_counted_within_their_species(tmp_path):
+    rows = [f"{name} {x[0]} {x[1]} {x[2]}" for _, _, name, x in MIXED]
+    text = "\n".join([str(len(rows)), 'Lattice="30 0 0 0 30 0 0 0 30"', *rows]) + "\n"
+    assert frozen_of(noble(tmp_path, "a.xyz", text, [1, 3])) == [0, 4]
+    assert frozen_of(noble(tmp_path, "a.xyz", text, "2-4")) == [2, 4, 6]
+    one = [(1, "", name, x) for _, _, name, x in MIXED]  # one residue of no name around all of them
+    assert frozen_of(noble(tmp_path, "b.gro", gro(one), [4])) == [6]
+    lattice = [{"model": "argon", "count": 4, "frozen": [1, 4]}, {"model": "krypton", "count": 3, "frozen": [2]}]
+    assert frozen_of(small_scene({}, 20.0, molecules=lattice)) == [0, 3, 5]
+
+
+def test_all_numbers_of_a_species_are_all_of_it():
+    molecules = [{"model": "argon", "count": 4, "frozen": "1-4"}, {"model": "krypton", "count": 3}]
+    system = build(small_scene({}, 20.0, molecules=molecules))
+    assert [m.name for m in system.species] == ["argon", "krypton"]
+    assert (system.model.inverse_mass == 0).tolist() == [True, False]
+    molecules[1]["frozen"] = [1, 2, 3]
+    with pytest.raises(SceneError, match="all are frozen"):
+        build(small_scene({}, 20.0, molecules=molecules))
+    with pytest.raises(SceneError, match="with frozen molecules leave it out"):
+        small_scene({}, 20.0, forces={"tail_correction": True}, molecules=molecules[:1])
+
+
+def test_a_restart_freezes_the_same_molecules(tmp_path):
+    """Though its residues were not counted from 1, and the saved state has no residues."""
+    scene = noble(tmp_path, "a.gro", gro(MIXED), [7, 11])
+    results = Simulation(scene, tmp_path / "out").run()
+    assert results.summary["species"] == {"argon": 4, "krypton": 4}
+    with np.load(tmp_path / "out" / "final.npz") as saved:
+        assert saved["species_names"].tolist() == ["argon", "krypton"]
+        assert saved["species"].tolist() == [0, 1] * 4
+        assert saved["residue_number"].tolist() == list(range(7, 15))
+        still = saved["position"][[0, 4]]
+    assert [residue.resname for residue in results.universe().residues] == ["AR", "KR"] * 4
+    again = Scene.read(
+        tmp_path / "out" / "scene.toml",
+        {"structure.file": str(tmp_path / "out" / "final.npz"), "structure.velocities": True, "start": None},
+    )
+    system = build(again)
+    assert frozen_of(again) == [0, 4]
+    assert (system.state.position[[0, 4]] == still).all()
+    assert not system.state.velocity[[0, 4]].any()
+    assert system.state.velocity[[1, 2, 3]].all()
 
 
 def pair_energy(system, sigma, epsilon, r):

@@ -18,6 +18,7 @@ ROOMS = [
     ("build",),
     ("measure",),
     ("output",),
+    ("shipped",),
     ("simulation",),
     ("stability",),
     ("cli", "__main__"),

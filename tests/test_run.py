@@ -14,13 +14,17 @@ import pytest
 from conftest import MOLECULES, ROOT, small_scene
 
 import rigidmd
+from rigidmd.build.describe import describe
 from rigidmd.build.system import build
 from rigidmd.cli import main
 from rigidmd.core.state import State
+from rigidmd.dynamics.engine import Engine
+from rigidmd.errors import SceneError
 from rigidmd.output.log import COLUMNS
 from rigidmd.output.report import summary_text
 from rigidmd.scene import Scene
 from rigidmd.simulation import Every, Simulation
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 
 @pytest.mark.parametrize("path", MOLECULES, ids=lambda path: path.stem)
@@ -193,6 +197,56 @@ def test_the_topology_is_the_first_frame_relief_included(tmp_path):
     first = mda.Universe(str(tmp_path / "out" / "topology.gro")).atoms.positions
     assert first == pytest.approx(universe.trajectory[0].positions, abs=0.011)
     assert main(["energy", str(ROOT / "systems" / "water_nitrogen.toml"), "--json"]) == 0
+
+
+def argon(**more):
+    return small_scene({"argon": 20}, 25.0, stages=[{"duration_ps": 0.1}], output={"log_interval_ps": 0.01}, **more)
+
+
+@pytest.mark.parametrize("interval", [0.02, False])
+def test_energy_that_goes_with_the_total_momentum_is_booked(interval, monkeypatch):
+    """Molecules that something pushes all the same way: momentum and its energy go, the conserved energy keeps them."""
+    advance, pushes = Engine.advance, []
+
+    def pushed(self, state, scheme, dt, steps, *more):
+        advance(self, state, scheme, dt, steps, *more)
+        if steps:
+            pushes.append(steps)
+            state.velocity[:, 0] += 0.01 * steps
+
+    monkeypatch.setattr(Engine, "advance", pushed)
+    results = Simulation(argon(run={"remove_momentum_interval_ps": interval})).run()
+    mass = float(results.system.model.mass[results.system.model.species].sum())
+    assert sum(pushes) == 50
+    if interval:  # ten steps of 0.01 Å/ps at a time, in two halves between which the log looks
+        each = 0.5 * mass * 0.1**2
+        assert results["momentum"][::2].max() < 1e-9 * mass
+        assert results.summary["momentum_removed"]["times"] == 1 + 5
+        assert results.summary["momentum_removed"]["largest_u_A_ps"] == pytest.approx(0.1 * mass)
+        assert results.summary["momentum_removed"]["energy_kJ_mol"] == pytest.approx(5 * each / KJ_PER_MOL)
+        assert results["conserved"] - results["energy"] == pytest.approx(each * (np.arange(11) // 2), rel=1e-9)
+        assert not any("drift together" in note for note in results.summary["notes"])
+    else:
+        assert results["conserved"].tobytes() == results["energy"].tobytes()
+        gain = mass * 0.5**2 / (57 * BOLTZMANN)
+        said = next(note for note in results.summary["notes"] if "drift together" in note)
+        assert f"which adds {gain:.2g} K to T_trans; run.remove_momentum_interval_ps takes" in said
+
+
+def test_when_total_momentum_is_taken_out():
+    pme = {"electrostatics": "pme", "cutoff_A": 9.0}
+    frozen = [{"model": "spce", "count": 2}, {"model": "argon", "count": 2, "frozen": True}]
+    assert argon().removes_momentum_every is None
+    assert argon(forces=pme).removes_momentum_every == 1.0
+    assert argon(forces=pme | {"electrostatics": "ewald"}).removes_momentum_every is None
+    assert argon(forces=pme, run={"remove_momentum_interval_ps": False}).removes_momentum_every is None
+    assert small_scene({}, 25.0, molecules=frozen, forces=pme).removes_momentum_every is None
+    assert small_scene({"argon": 3}, None).removes_momentum_every is None
+    with pytest.raises(SceneError, match="frozen molecules hold the others"):
+        small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
+    text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
+    assert "total momentum: taken out every 0.2 ps" in text
+    assert "run.remove_momentum_interval_ps is false" in describe(argon(run={"remove_momentum_interval_ps": False}))
 
 
 def test_input_files_of_one_name_are_kept_apart(tmp_path):

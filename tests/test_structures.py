@@ -1,5 +1,6 @@
 """Structure files as people have them: read rightly, or refused with one clear message."""
 
+import re
 from math import inf
 from pathlib import Path
 
@@ -11,16 +12,17 @@ from conftest import small_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigidmd.build.cells import pairs_within, standard_rotation
+from rigidmd.build.cells import basis_in_words, basis_of, pairs_within, reduced, standard_rotation
 from rigidmd.build.structure import read_structure
-from rigidmd.build.structure_files import element_of, read_geometry
+from rigidmd.build.structure_files import element_of, element_of_mass, read_geometry
 from rigidmd.build.system import build
 from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.molecules import Molecule, Site, load_model, molecule
+from rigidmd.molecules import Molecule, Site, load_model, molecule, with_masses
 from rigidmd.output.trajectory import TrajectoryFile, write_topology
 from rigidmd.scene import Scene
+from rigidmd.scene.molecules import Box
 from rigidmd.units import GRAM_PER_CM3
 
 TOLERANCE = 0.15
@@ -443,6 +445,55 @@ def test_the_standard_orientation_keeps_the_lattice():
     assert np.array_equal(rotation, np.eye(3))
 
 
+@pytest.mark.parametrize(
+    ("angles", "told"),
+    [
+        ((90.0, 60.0, 90.0), ""),  # 36 cos 60° is 18.000000000000004
+        ((60.0, 60.0, 60.0), ""),
+        ((90.0, 59.995, 90.0), ""),  # 60.00 as files print it
+        ((90.0, 120.0, 90.0), ""),
+        ((90.0, 59.0, 90.0), "c' = c - a"),
+        ((90.0, 120.5, 90.0), "c' = c + a"),
+        ((60.0, 59.0, 58.0), "b' = b - a, c' = c - a"),
+        ((25.0, 30.0, 30.0), "b' = b - a, c' = c - b"),
+    ],
+)
+def test_a_cell_leans_by_half_an_edge_as_far_as_files_tell(angles, told):
+    cell = Box(lengths_A=36.0, angles_deg=angles).cell
+    other = reduced(cell)
+    basis = basis_of(other, cell)
+    assert basis_in_words(basis) == told
+    assert np.array_equal(other, cell) == (not told)
+    assert basis @ cell == pytest.approx(other, abs=1e-12)
+    assert abs(np.linalg.det(basis)) == pytest.approx(1)
+    assert (np.abs(other - np.diag(np.diag(other))) <= 0.5001 * np.diag(other)).all()
+
+
+def test_what_was_made_of_a_cell_is_said(tmp_path):
+    truth = Truth(["spce"] * 4, 5)
+    text = xyz(wrapped(truth.atoms(), truth.cell), truth.cell * [[1], [1], [-1]])
+    assert any("left-handed: -c stands for c" in note for note in read(tmp_path, text, "a.xyz").notes)
+    nearly = truth.cell.copy()
+    nearly[2, 0] = 1e-5 * nearly[2, 2]
+    told = read(tmp_path, xyz(wrapped(truth.atoms(), truth.cell), nearly), "b.xyz").notes
+    assert told == ("its angles of 90, 89.99943, 90° were taken for right ones",)
+
+
+def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
+    """The state has the box as it was described anew; the scene still has its own words for it."""
+    box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
+    system = build(small_scene({"argon": 4}, None, box=box))
+    assert any(
+        "box: its lattice is described by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes
+    )
+    write_state(tmp_path / "final.npz", system.saved(system.state))
+    data = {"box": box, "structure": {"file": "final.npz"}, "molecules": [{"model": "argon"}],
+            "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
+    again = build(Scene.from_dict(data, tmp_path))
+    assert not any("box counts" in note for note in again.notes)
+    assert any("the scene's box: its lattice is described by" in note and "c' = c - a" in note for note in again.notes)
+
+
 def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
     cell = [[12.0, 0, 0], [9.0, 11.0, 0], [-8.0, 7.0, 12.0]]
     truth = Truth(["spce"] * 8, 6, cell=cell)
@@ -691,6 +742,122 @@ def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
         assert any("does not say its units" in note for note in found.notes)
 
 
+def repartitioned(truth, labels=("", ""), section="") -> str:
+    """Data of waters with mass moved from oxygen to hydrogen, as for long time steps."""
+    text = lammps(truth, "x, units = real", 1.0).replace("3 atom types", "2 atom types").replace("3 39.948\n", "")
+    words = [f" # {label}" if label else "" for label in labels]
+    text = text.replace("1 15.9994", f"1 9.9994{words[0]}").replace("2 1.008", f"2 4.00794{words[1]}")
+    return text.replace("Masses", f"{section}Masses")
+
+
+def test_lammps_atom_types_by_name(tmp_path):
+    truth = Truth(["spce"] * 4, 12)
+    text = repartitioned(truth)
+    with pytest.raises(
+        StructureError,
+        match=r"atom types 1 \(9.9994 u\), 2 \(4.00794 u\) weigh .* \(1.008, 15.9994 u\): .*structure.atom_types",
+    ):
+        read(tmp_path, text, "a.data")
+    ways = [
+        (text, {"1": "O", "2": "H"}),
+        (text, {"1": "OW", "2": "HW1"}),
+        (text.replace("2 4.00794\n", "2 4.00794 # He\n"), {"1": "O", "2": "H"}),  # the scene counts for more
+        (repartitioned(truth, ("O", "H")), None),
+        (repartitioned(truth, ("OW", "HW2")), None),
+        (repartitioned(truth, section="Atom Type Labels\n\n1 OW\n2 HW1\n\n"), None),
+    ]
+    helium = ion("He", 4.0026)  # weighs as much as this hydrogen, and counts for less than its name
+    begun = repartitioned(truth, ("Oxygen", "HW"))  # names that only begin like elements count for less than masses
+    for file, atom_types, others in [(*way, [helium]) for way in ways] + [(begun, None, [])]:
+        found = read(tmp_path, file, "a.data", ["spce", *others], atom_types=atom_types)
+        same_molecules(found, truth, [SPECIES["spce"]], 1e-6)
+        assert any("masses of the scene count, not those of the file" in note for note in found.notes)
+    found = read(tmp_path, text.replace("9.9994", "15.9994").replace("4.00794", "1.008"), "a.data")
+    assert not any("masses" in note for note in found.notes)
+    heavy = with_masses(SPECIES["spce"], {"O": 9.9994, "H": 4.00794})
+    assert len(read(tmp_path, text, "a.data", [heavy]).species) == 4  # or by masses that the scene has too
+
+
+def test_the_element_of_a_site_counts_for_more_than_that_of_its_file(tmp_path):
+    """A united atom weighs as much as oxygen does."""
+    lines = [
+        "x",
+        "",
+        "1 atoms",
+        "1 atom types",
+        "",
+        "Masses",
+        "",
+        "1 16.043",
+        "",
+        "Atoms # atomic",
+        "",
+        "1 1 0.0 0.0 0.0",
+    ]
+    (tmp_path / "methane.data").write_text("\n".join(lines) + "\n")
+    site = {"name": "1", "sigma_A": 3.73, "epsilon_K": 148.0}
+    for entry, element in ((site, "O"), (site | {"element": "C"}, "C")):
+        molecules = [{"file": "methane.data", "sites": [entry], "count": 5}]
+        assert build(small_scene({}, 20.0, tmp_path, molecules=molecules)).species[0].elements == (element,)
+
+
+def test_lammps_atom_types_without_masses_and_with_massless_sites(tmp_path):
+    truth = Truth(["tip4p2005", "argon", "tip4p2005"], 12)
+    text = lammps(truth, "x, units = real", 1.0).replace("3 atom types", "4 atom types")
+    begin, end = text.index("Masses"), text.index("Atoms #")
+    text = text[:begin] + text[end:]
+    numbers = {"O": 1, "H": 2, "X": 3, "Ar": 4}
+    for i, (_, element, *_) in enumerate(truth.atoms(), 1):
+        text = re.sub(rf"^({i} \d+) \d+ 0.0 ", rf"\1 {numbers[element]} 0.0 ", text, flags=re.MULTILINE)
+    with pytest.raises(StructureError, match=r"no section Masses.*name them by structure.atom_types"):
+        read(tmp_path, text, "a.data", ["tip4p2005", "argon"])
+    for massless in ("MW", "X"):
+        atom_types = {"1": "O", "2": "H", "3": massless, "4": "Ar"}
+        found = read(tmp_path, text, "a.data", ["tip4p2005", "argon"], atom_types=atom_types)
+        same_molecules(found, truth, [SPECIES["tip4p2005"], SPECIES["argon"]], 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("atom_types", "message"),
+    [
+        ({"1": "O"}, r"structure.atom_types does not say what type 2 is"),
+        ({"1": "O", "2": "H", "7": "H", "OW": "O"}, r"structure.atom_types: there is no type 7, OW; there are 1, 2"),
+        ({"1": "O", "2": "hw1"}, r"structure.atom_types.2 = 'hw1' is no site or element .* there are OW, HW1, HW2, O, H; did you mean HW1\?"),
+        ({"1": "H", "2": "O"}, r"molecule 1 .* has atoms H O2, expected spce \(O H2\)"),
+    ],
+)  # fmt: skip
+def test_atom_types_that_do_not_fit_the_file(atom_types, message, tmp_path):
+    with pytest.raises(StructureError, match=message):
+        read(tmp_path, repartitioned(WATERS), "a.data", atom_types=atom_types)
+
+
+def test_atom_types_of_a_scene(tmp_path):
+    (tmp_path / "a.data").write_text(repartitioned(Truth(["spce"] * 8, 5)))
+    structure = {"file": "a.data", "atom_types": {"1": "O", "2": "H"}}
+    scene = small_scene(
+        {}, None, tmp_path, molecules=[{"model": "spce"}], box={}, structure=structure, forces={"cutoff_A": 6.0}
+    )
+    assert len(build(scene).model.species) == 8
+
+
+@pytest.mark.parametrize(
+    ("mass", "element"),
+    [
+        (1.008, "H"),
+        (2.014, "D"),
+        (3.016, "T"),
+        (4.0026, "He"),
+        (15.9994, "O"),
+        (15.035, ""),
+        (9.9994, ""),
+        (22.99, "Na"),
+    ],
+)
+def test_elements_by_mass(mass, element):
+    """What weighs as nothing does, a united atom for one, is no element."""
+    assert element_of_mass(mass) == element
+
+
 def test_lammps_sites_of_almost_no_mass(tmp_path):
     truth = Truth(["tip4p2005"] * 3, 12)
     text = lammps(truth, "x, units = real", 1.0).replace("3 39.948", "3 1e-10")
@@ -720,7 +887,7 @@ def test_what_this_engine_writes_it_reads(ending, tmp_path):
         file.write(state, float(k), k)
     file.close()
     write_topology(tmp_path / "t.gro", system, moved, wrapped=True)
-    write_state(tmp_path / "t.npz", moved, system.names, system.model.species)
+    write_state(tmp_path / "t.npz", system.saved(moved))
     for name, frame, error in ((f"t.{ending}", -1, 2e-3), ("t.gro", None, 0.02), ("t.npz", None, 0.0)):
         found = read_structure(tmp_path / name, system.species, None, True, TOLERANCE, frame)
         step = found.position - moved.position

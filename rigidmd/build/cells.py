@@ -9,6 +9,9 @@ RIGHT = np.radians(1e-3)
 #: A cell whose vectors lie closer to the standard orientation than this fraction of its longest edge is left as it is.
 ORIENTED = 1e-6
 
+#: A cell may lean by this fraction of an edge more than half of it and stay as it is: 36 cos 60° is 18.000000000000004,
+#: and files print vectors to 1e-4 Å, angles to 0.01 degrees. Lists of neighbours are right for any lean.
+HALF_AS_PRINTED = 1e-4
 #: How much longer a cut-off another choice of edges must allow before a cell is turned for it.
 ROOMIER = 1.1
 
@@ -28,12 +31,43 @@ def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reduced(cell: np.ndarray) -> np.ndarray:
-    """The same lattice by a cell (3, 3) in standard orientation that leans by no more than half an edge."""
+    """The same lattice by a cell (3, 3) in standard orientation that leans by no more than half an edge, as printed."""
     cell = cell.copy()
-    cell[2] -= np.rint(cell[2, 1] / cell[1, 1]) * cell[1]
-    cell[2] -= np.rint(cell[2, 0] / cell[0, 0]) * cell[0]
-    cell[1] -= np.rint(cell[1, 0] / cell[0, 0]) * cell[0]
+    for k, along in ((2, 1), (2, 0), (1, 0)):
+        edges = cell[k, along] / cell[along, along]
+        if abs(edges) > 0.5 + HALF_AS_PRINTED:
+            cell[k] -= np.rint(edges) * cell[along]
     return cell
+
+
+def basis_of(cell: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """Integers U (3, 3): the edges of a cell (3, 3) are U times those of a given cell of the same lattice."""
+    return np.rint(cell @ np.linalg.inv(given)).astype(int)
+
+
+def same_lattice(cell: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
+    """Whether two cells (3, 3) describe one lattice, but for a fraction of the longest component of the second."""
+    basis = basis_of(cell, other)
+    whole = round(abs(np.linalg.det(basis))) == 1
+    return whole and bool(np.abs(basis @ other - cell).max() <= tolerance * np.abs(other).max())
+
+
+def edges_in_words(cell: np.ndarray) -> str:
+    """Lengths and angles of a cell (3, 3)."""
+    lengths = ", ".join(f"{x:.4f}" for x in np.linalg.norm(cell, axis=1))
+    return f"edges {lengths} Å, angles {', '.join(f'{x:.4g}' for x in angles_deg(cell))}°"
+
+
+def basis_in_words(basis: np.ndarray) -> str:
+    """The edges a', b', c' that are not a, b, c, as "c' = c - a"."""
+    told = []
+    for k, row in enumerate(basis):
+        parts = [(n, i) for i, n in enumerate(row) if n]
+        parts.sort(key=lambda part: part[1] != k)
+        if parts != [(1, k)]:
+            sums = " ".join(f"{'-' if n < 0 else '+'} {'' if abs(n) == 1 else abs(n)}{'abc'[i]}" for n, i in parts)
+            told.append(f"{'abc'[k]}' = {sums.removeprefix('+ ')}")
+    return ", ".join(told)
 
 
 def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -95,6 +95,8 @@ def _molecules(system: System) -> str:
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if any(stage.ensemble == "nvt" for stage in scene.stages):
         lines.append("  thermostat: velocity rescaling, in the nvt stages only")
+    if (interval := scene.removes_momentum_every) is not None:
+        lines.append(f"  total momentum: taken out every {interval:g} ps")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")

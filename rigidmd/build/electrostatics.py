@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.build.cells import basis_in_words, edges_in_words
 from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces import ewald
@@ -73,9 +74,19 @@ class Electrostatics(NamedTuple):
 
 
 def electrostatics(
-    scene: MolecularScene, charged: Charged, space: Space, cutoff: float, start: float, state: State
+    scene: MolecularScene,
+    charged: Charged,
+    space: Space,
+    cutoff: float,
+    start: float,
+    state: State,
+    basis: np.ndarray,
 ) -> Electrostatics:
-    """What the charges of a scene add. start : where a switch of the reaction field begins, Å. Raises SceneError."""
+    """What the charges of a scene add. Raises SceneError.
+
+    start : where a switch of the reaction field begins, Å
+    basis (3, 3) : integers, the edges of the box in those of the cell that was described, whose waves a scene counts
+    """
     forces = scene.forces
 
     def between_pairs(law: NamedTuple) -> NamedTuple:
@@ -90,7 +101,7 @@ def electrostatics(
         law = damped_shifted_force(charge, cutoff, forces.damping_per_A)
         own = charged.each(lambda q, x: damped_self_energy(law._replace(charge=q), x))
         return Electrostatics({"coulomb": between_pairs(law)}, {"damped_self": own})
-    return _ewald(scene, charged, space, cutoff, between_pairs, state)
+    return _ewald(scene, charged, space, cutoff, between_pairs, state, basis)
 
 
 def electrostatic_faults(scene: MolecularScene, space: Space, cutoff: float) -> list[str]:
@@ -125,7 +136,7 @@ class Settings(NamedTuple):
     wave_error: float
 
 
-def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: float) -> Settings:
+def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: float, basis: np.ndarray) -> Settings:
     """What the scene gives, and what follows from the accuracy it asks for."""
     forces, volume, cell = scene.forces, space.volume, cell_of(space)
     charges = charges_of(
@@ -141,7 +152,7 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
         raise SceneError(scene.source, [f"{asked} with a cut-off of {cutoff:g} Å; take a longer one"])
     beyond = real_error(charges, alpha, cutoff, volume)
     reciprocal = 2 * pi * np.linalg.inv(cell).T
-    grid, order = forces.pme_grid, forces.pme_order
+    grid, order = _given_grid(scene, basis, cell), forces.pme_order
     if forces.electrostatics == "pme":
         if grid is None or order is None:
             found = mesh_for(charges, alpha, cell, share, order, grid)
@@ -163,13 +174,28 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
             fault = f"forces.ewald_k_radius_per_A = {radius:g} is more than {MOST_WAVES} waves along an edge of the box"
             raise SceneError(scene.source, [fault])
         over = (
-            ewald.waves(most, forces.ewald_k2_max) if radius is None else ewald.waves_within(reciprocal, radius, most)
+            ewald.waves(most, forces.ewald_k2_max, basis)
+            if radius is None
+            else ewald.waves_within(reciprocal, radius, most, basis)
         )
         if over.total == 0:
             raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no wave at all"])
     else:
         over = waves_for(charges, alpha, reciprocal, share)
     return Settings(alpha, over, None, None, beyond, wave_error(charges, alpha, radius_of(over.total, volume), volume))
+
+
+def _given_grid(scene: MolecularScene, basis: np.ndarray, cell: np.ndarray) -> tuple[int, int, int] | None:
+    """The grid that a scene gives, if it is one of the cell (3, 3) that stands for its own too. Raises SceneError."""
+    grid = scene.forces.pme_grid
+    if grid is None or len(set(grid)) == 1 or np.array_equal(basis, ewald.AS_GIVEN):
+        return grid
+    fault = (
+        f"forces.pme_grid = {list(grid)} counts points along edges of a cell that leans too much; the box is that with "
+        f"{edges_in_words(cell)}, {basis_in_words(basis)}, and has its own edges. Describe the box by that cell, or "
+        "give three equal numbers, or leave pme_grid out"
+    )
+    raise SceneError(scene.source, [fault])
 
 
 def _ewald(
@@ -179,17 +205,18 @@ def _ewald(
     cutoff: float,
     between_pairs: Callable[[NamedTuple], NamedTuple],
     state: State,
+    basis: np.ndarray,
 ) -> Electrostatics:
-    settings = _settings(scene, charged, space, cutoff)
+    settings = _settings(scene, charged, space, cutoff, basis)
     forces, alpha = scene.forces, settings.alpha
     charge = ewald.in_energy_units(charged.charge_e)
-    law = screened_coulomb(
-        charged.charge_e, cutoff, alpha, forces.truncation != "plain", FIT_SHARE * settings.real_error
-    )
+    law = screened_coulomb(charged.charge_e, cutoff, alpha, forces.shifts_ewald, FIT_SHARE * settings.real_error)
     if settings.grid is None:
         over = ewald.EwaldSum(alpha, charge, charged.sites, settings.waves)
         most = " ".join(map(str, settings.waves.most))
         how = f"{settings.waves.total} waves, |n| up to {most}"
+        if forces.ewald_k_max is not None and not np.array_equal(basis, ewald.AS_GIVEN):
+            how += "; these are the waves that ewald_k_max means in the cell that was described"
     else:
         from rigidmd.forces.pme import Pme  # rocket-fft is for scenes with PME only
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.build.cells import pairs_within
-from rigidmd.build.structure_files import Atoms, element_of
+from rigidmd.build.structure_files import SAME_MASS, Atoms, element_of
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
 
@@ -17,8 +17,6 @@ from rigidmd.molecules import Molecule
 BOND_REACH = 1.25
 #: Partial assignments tried before a molecule's atoms count as fitting in no order.
 MOST_TRIES = 20_000
-#: Masses nearer than this fraction are one element.
-SAME_MASS = 0.01
 #: u; what engines that know no massless sites give them instead is less.
 NO_MASS = 0.1
 MOST_LISTED = 6  # atoms of a molecule that a message lists
@@ -44,6 +42,7 @@ class Matched(NamedTuple):
     square: np.ndarray  # (n,) Å²
     massless: Counter  # how many atoms without mass the file has, by name
     notes: list[str]
+    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
 
 
 def massive(molecule: Molecule) -> np.ndarray:
@@ -60,7 +59,8 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
     by_residue = _attempt(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
     if isinstance(by_residue, Matched):
-        return by_residue
+        numbers = [atoms.residue[run[0]][0] for run in runs]
+        return by_residue if None in numbers else by_residue._replace(number=np.array(numbers))
     runs_by_bonds = _bonded(atoms, kinds, species, cell)
     by_bonds = _attempt(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
     if isinstance(by_bonds, Matched):
@@ -87,7 +87,8 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     """The element of every atom (or what stands for it in the templates), X for massless ones; with "?" a mere guess.
 
     An element that the file gives is believed. A name is that of a site, or begins with an element of the scene, or
-    tells nothing that counts.
+    tells nothing that counts. Where the file gives masses, a name that is that of a site or an element counts for more
+    than they do, and they for more than how any other name begins.
     """
     by_name, by_mass = {}, []
     for molecule in species:
@@ -109,8 +110,15 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
         if 0 < mass < NO_MASS:
             return "X"
         if mass > 0:
+            if name == "X" or isotope(name) in vocabulary:
+                return isotope(name)
+            if name in own_names:
+                return by_name[name]
             nearest, label = min(by_mass, key=lambda entry: abs(entry[0] - mass))
-            return label if abs(nearest - mass) <= SAME_MASS * mass else isotope(element)
+            if abs(nearest - mass) <= SAME_MASS * mass:
+                return label
+            if (guess := isotope(element_of(name, vocabulary))) in vocabulary:
+                return guess
         if name in own_names and (not element or element == "X"):
             return by_name[name]
         if element:

@@ -1,10 +1,12 @@
 """Momenta at a temperature, and the degrees of freedom that share it."""
 
+from dataclasses import dataclass
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.state import State
+from rigidmd.core.state import REST, State
 from rigidmd.dynamics.advance import Model
 from rigidmd.units import BOLTZMANN
 
@@ -13,7 +15,7 @@ AT_REST = 1e-9
 
 
 class Freedom(NamedTuple):
-    """Degrees of freedom; the three of the total momentum, which is zero and stays so, are not counted.
+    """Degrees of freedom; the three of the total momentum, which is zero and is kept so, are not counted.
 
     Among frozen molecules the total momentum is not kept, and all count.
     """
@@ -40,19 +42,36 @@ def mobile(model: Model) -> np.ndarray:
     return model.inverse_mass[model.species] > 0
 
 
-def remove_momentum(model: Model, velocity: np.ndarray) -> bool:
-    """Give every molecule the same push so that the total momentum is zero, in place; False if it was already.
+def remove_momentum(model: Model, velocity: np.ndarray) -> float:
+    """Give every molecule the same push so that the total momentum is zero, in place.
 
-    Frozen molecules hold the others: then there is nothing to remove.
+    Returns the kinetic energy that this takes, u Å²/ps²; 0 if the momentum was zero already. Frozen molecules hold the
+    others: then there is nothing to remove.
     """
     if not mobile(model).all():
-        return False
+        return 0.0
     mass = model.mass[model.species]
-    momentum = mass @ velocity
-    if np.abs(momentum).max() <= AT_REST * np.abs(mass[:, None] * velocity).sum():
-        return False
+    each = mass[:, None] * velocity
+    momentum = each.sum(axis=0)
+    if np.abs(momentum).max() <= AT_REST * np.abs(each).sum():
+        return 0.0
     velocity -= momentum / mass.sum()
-    return True
+    return float(momentum @ momentum / (2 * mass.sum()))
+
+
+@dataclass
+class Removed:
+    """What removals of the total momentum have taken out so far."""
+
+    times: int = 0
+    largest: float = 0.0  # |P|, u Å/ps
+
+    def remove(self, model: Model, state: State) -> None:
+        """Once more, in place, and book its energy."""
+        energy = remove_momentum(model, state.velocity)
+        self.times += 1
+        self.largest = max(self.largest, sqrt(2 * energy * float(model.mass[model.species].sum())))
+        state.books[REST] -= energy
 
 
 def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:

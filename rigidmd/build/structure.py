@@ -5,14 +5,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.cells import angles_deg, reduced, right_angled, roomiest, standard_rotation
-from rigidmd.build.matching import Matched, massive, match
-from rigidmd.build.structure_files import Atoms, read_atoms
+from rigidmd.build.cells import (
+    angles_deg,
+    basis_in_words,
+    basis_of,
+    edges_in_words,
+    reduced,
+    right_angled,
+    roomiest,
+    same_lattice,
+    standard_rotation,
+)
+from rigidmd.build.matching import NO_MASS, Matched, massive, match
+from rigidmd.build.structure_files import SAME_MASS, Atoms, read_atoms
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
+from rigidmd.forces.ewald import AS_GIVEN
 from rigidmd.molecules import Molecule
+from rigidmd.validation import meant
 
 MOST_NAMED = 5  # how many molecules a message names before it only counts
+ROUNDING = 1e-12  # of the longest edge: what turning a cell leaves
 SAME_BOX = 1e-4  # boxes of file and scene that differ by less, relatively, are the same as printed
 #: Units in which files are given by mistake, in Å.
 OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
@@ -30,7 +43,9 @@ class Arrangement(NamedTuple):
     cell: np.ndarray | None  # (3, 3), rows a along x, b in xy, c; Å
     residual_rms: float  # Å, of all atoms against their templates
     residual_max: float  # Å
+    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
     notes: tuple[str, ...] = ()  # what was made of the file beyond reading it
+    basis: np.ndarray = AS_GIVEN  # (3, 3) integers: the edges of the cell in those of the cell that was described
 
 
 def read_structure(
@@ -41,10 +56,11 @@ def read_structure(
     tolerance: float,
     frame: int | None = None,
     repeat: tuple[int, int, int] = (1, 1, 1),
+    atom_types: dict[str, str] | None = None,
 ) -> Arrangement:
     """The molecules of a structure file. Raises StructureError.
 
-    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat: see
+    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types: see
     Scene.structure.
     """
     if path.suffix == ".npz":
@@ -54,37 +70,46 @@ def read_structure(
         if periodic and wanted is None:
             _check_box(path, found.cell, [])
     else:
-        found = _read_molecules(path, species, wanted, periodic, tolerance, frame)
+        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types)
     notes = list(found.notes)
     if not periodic:
         cell = None
     elif wanted is not None:
         cell = wanted
-        if found.cell is not None and np.abs(found.cell - cell).max() > SAME_BOX * cell.max():
+        if found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
             notes.append("the scene's box counts, not that of the file")
     else:
         cell = found.cell
     found = found._replace(cell=cell, notes=tuple(notes))
     if repeat != (1, 1, 1):
         found = _repeated(found, repeat)
-    return found if found.cell is None else _reduced(found, wanted is None)
+    return leaning_less(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
 
 
-def _reduced(found: Arrangement, may_turn: bool) -> Arrangement:
-    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off."""
+def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
+    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off.
+
+    whose : the lattice, in words
+    """
+    if found.cell is None:
+        return found
     cell, turn = roomiest(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
     if np.array_equal(cell, found.cell):
         return found
-    lengths, angles = (np.linalg.norm(cell, axis=1), angles_deg(cell))
-    told = f"edges {', '.join(f'{x:.4f}' for x in lengths)} Å, angles {', '.join(f'{x:.4g}' for x in angles)}°"
+    basis = basis_of(cell @ turn, found.cell)
+    told = (
+        f"{whose} lattice is described by the cell with {edges_in_words(cell)}, {basis_in_words(basis)}, "
+        f"in place of {edges_in_words(found.cell)}"
+    )
     if np.array_equal(turn, np.eye(3)):
-        return found._replace(cell=cell, notes=(*found.notes, f"its lattice is described by the cell with {told}"))
+        return found._replace(cell=cell, notes=(*found.notes, told), basis=basis)
     return found._replace(
         cell=cell,
         position=found.position @ turn.T,
         rotation=turn @ found.rotation,
         velocity=None if found.velocity is None else found.velocity @ turn.T,
-        notes=(*found.notes, f"its lattice is described by the cell with {told}, turned, contents included"),
+        notes=(*found.notes, f"{told}; turned, contents included"),
+        basis=basis,
     )
 
 
@@ -97,6 +122,7 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
 
     return found._replace(
         species=tiled(found.species),
+        number=tiled(found.number),
         position=(found.position + shifts[:, None]).reshape(-1, 3),
         rotation=tiled(found.rotation),
         velocity=tiled(found.velocity),
@@ -106,8 +132,11 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
     )
 
 
-def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: float, frame) -> Arrangement:
-    atoms = read_atoms(path, frame)
+def _read_molecules(
+    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types
+) -> Arrangement:
+    _check_types(path, atom_types or {}, species)
+    atoms = read_atoms(path, frame, atom_types)
     notes = list(atoms.notes)
     if atoms.cell is not None:
         cell, turn = standard_rotation(atoms.cell)
@@ -115,15 +144,24 @@ def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: floa
             velocity = None if atoms.velocity is None else atoms.velocity @ turn.T
             atoms = atoms._replace(position=atoms.position @ turn.T, velocity=velocity)
             notes.append("its cell was turned, contents included, so that a is along x and b in the xy plane")
-        atoms = atoms._replace(cell=np.diag(np.linalg.norm(cell, axis=1)) if right_angled(cell) else cell)
+        if np.linalg.det(atoms.cell) < 0:
+            notes.append("its cell is left-handed: -c stands for c, which leaves the lattice as it is")
+        if right_angled(cell):
+            upright = np.diag(np.linalg.norm(cell, axis=1))
+            if np.abs(upright - cell).max() > ROUNDING * cell.max():
+                told = ", ".join(f"{x:.7g}" for x in angles_deg(cell))
+                notes.append(f"its angles of {told}° were taken for right ones")
+            cell = upright
+        atoms = atoms._replace(cell=cell)
     if periodic and wanted is None:
         _check_box(path, atoms.cell, notes)
     across = atoms.cell if atoms.cell is not None or not periodic else wanted
     matched = match(atoms, species, across, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
-        raise StructureError(str(path), matched[:MOST_NAMED] + more + _other_units(atoms, species))
-    notes += [*matched.notes, *_massless(matched, species)]
+        faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        raise StructureError(str(path), faults)
+    notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]
     return Arrangement(
@@ -135,8 +173,57 @@ def _read_molecules(path: Path, species, wanted, periodic: bool, tolerance: floa
         cell=atoms.cell,
         residual_rms=float(np.sqrt(matched.square @ sizes / sizes.sum())),
         residual_max=float(matched.deviation.max()),
+        number=matched.number,
         notes=tuple(notes),
     )
+
+
+def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
+    """Refuse names of atom types that are in no molecule of the scene."""
+    known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
+    faults = [
+        f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
+        f"{', '.join(known)}{meant(name, known)}"
+        for number, name in atom_types.items()
+        if name not in (*known, "X")
+    ]
+    if faults:
+        raise StructureError(str(path), faults)
+
+
+def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
+    """Which atoms of a file with masses weigh what no site of the scene does."""
+    if atoms.masses is None:
+        return []
+    masses = np.unique([mass for m in species for mass in m.masses[massive(m)]])
+    strange = {
+        f"{name} ({mass:g} u)": None
+        for name, mass in zip(atoms.names, atoms.masses.tolist(), strict=True)
+        if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
+    }
+    if not strange:
+        return []
+    there = ", ".join(f"{mass:g}" for mass in masses)
+    return [
+        f"its atom types {', '.join(strange)} weigh what no site of the scene's molecules does ({there} u): say what "
+        "they are by structure.atom_types, or give the molecules these masses by masses_u"
+    ]
+
+
+def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> list[str]:
+    """A note where atoms weigh other than the sites that they became."""
+    if atoms.masses is None:
+        return []
+    other = {}
+    for k, molecule in enumerate(species):
+        for s, site in enumerate(massive(molecule)):
+            own = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
+            mass = float(molecule.masses[site])
+            for i in own[np.abs(atoms.masses[own] - mass) > SAME_MASS * mass]:
+                other[f"{atoms.names[i]} {atoms.masses[i]:g} against {molecule.site_names[site]} {mass:g} u"] = None
+    if not other:
+        return []
+    return [f"masses of the scene count, not those of the file ({'; '.join(other)}): masses_u changes them"]
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
@@ -220,4 +307,5 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
         cell=state.cell if np.isfinite(state.cell).all() else None,
         residual_rms=0.0,
         residual_max=0.0,
+        number=saved.residue_number,
     )

@@ -16,12 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.errors import StructureError
+from rigidmd.scene.molecules import LAMMPS_DATA
 
 # ASE's velocity unit (Å sqrt(u/eV)) in Å/ps.
 ASE_VELOCITY = 98.22694788464063
 NO_VOLUME = 1e-9  # of a cell against the cube of its longest edge
 #: A column of velocities in extended XYZ that ASE keeps as it stands: programs differ in its units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
+SAME_MASS = 0.01  # masses nearer than this fraction are one element
 HEAVY_HYDROGEN = {"D": 2.014101777844, "T": 3.01604928132}  # u, AME2020; ASE has no symbols for them
 #: Names of sites without mass: M of four-site waters, L of five-site ones, and what programs call them.
 MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM|VS|XX?|Q)\d*", re.IGNORECASE)
@@ -32,22 +34,23 @@ class Atoms(NamedTuple):
 
     names: list[str]
     elements: list[str]  # "" where the format has names only; X without mass, D and T for heavy hydrogen
-    residue: list[tuple]  # (number, name) or () where the format has none
+    residue: list[tuple]  # (number or None, name, ...), what tells it from its neighbours; () where the format has none
     position: np.ndarray  # (n, 3) Å
     velocity: np.ndarray | None  # (n, 3) Å/ps; rows of NaN for atoms without one
     cell: np.ndarray | None  # (3, 3), rows a, b, c, Å
-    masses: np.ndarray | None  # (n,) u, where the file gives them in place of elements
+    masses: np.ndarray | None  # (n,) u, where the file gives them
     notes: list[str]
 
 
-def read_atoms(path: Path, frame: int | None = None) -> Atoms:
+def read_atoms(path: Path, frame: int | None = None, atom_types: dict[str, str] | None = None) -> Atoms:
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
-    frame: 1 for the first, -1 for the last; None where there must be only one.
+    frame: 1 for the first, -1 for the last; None where there must be only one. atom_types: names of the types in a
+    LAMMPS data file.
     """
     if not path.is_file():
         raise StructureError(str(path), ["there is no such file"])
-    atoms = _choose(path, _frames(path), frame)()
+    atoms = _choose(path, _frames(path, atom_types), frame)()
     if len(atoms.position) == 0:
         raise StructureError(str(path), ["holds no atoms"])
     for what, values in (("position", atoms.position), ("cell", atoms.cell)):
@@ -123,11 +126,12 @@ def _choose(path: Path, frames: list, frame: int | None):
     return frames[frame - 1 if frame > 0 else frame]
 
 
-def _frames(path: Path) -> list[Callable[[], Atoms]]:
+def _frames(path: Path, atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
     """The structures of a file, each ready to be read."""
     if reader := READERS.get(path.suffix.lower()):
         # Titles are in any encoding; what matters is ASCII.
-        return reader(path, path.read_text(encoding="utf-8", errors="replace").splitlines())
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return reader(path, lines, atom_types) if reader is _lammps else reader(path, lines)
     return [partial(_from_ase, path, atoms) for atoms in _ase(path, path)]
 
 
@@ -221,10 +225,11 @@ def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
         elements.append(symbol if _is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
         if (here := line[17:27]) != last:  # name, chain, number and insertion code: numbers alone wrap or run out
             count, last = count + 1, here
-        residue.append((count, line[17:21].strip()))
+        number = line[22:26].strip()
+        residue.append((int(number) if number.isdecimal() else None, line[17:21].strip(), count))
         lines.append(f"{line[:22]:22}{count % 10000:4d}{line[26:76]:50} X")
     found = _ase(path, io.StringIO("\n".join([*head, *lines]) + "\n"), format="proteindatabank")
-    if len({number for number, _ in residue}) == 1 and not residue[0][1]:
+    if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
     return _from_ase(path, found[0], names, elements, residue)
 
@@ -269,11 +274,13 @@ def _species_column(properties: str) -> int | None:
     return None
 
 
-def _lammps(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+def _lammps(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
     """LAMMPS data through ASE. Its first line may say the units; real and metal differ in velocities only."""
     text = "\n".join(lines) + "\n"
-    if not re.search(r"^\s*Masses\b", text, re.MULTILINE) and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
-        raise StructureError(str(path), ["has no section Masses, from which its atom types could be told"])
+    listed, labels = _lammps_types(lines)
+    if not listed and not labels and atom_types is None and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
+        fault = "has no section Masses, from which its atom types could be told: name them by structure.atom_types"
+        raise StructureError(str(path), [fault])
     units = re.search(r"\bunits\s*=?\s*(real|metal|si|cgs|electron)\b", text.split("\n", 1)[0])
     try:
         found = _ase(path, io.StringIO(text), format="lammps-data", units=units.group(1) if units else "metal")
@@ -281,17 +288,67 @@ def _lammps(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         if re.search(r"^\s*0\s+atoms\b", text, re.MULTILINE):
             return []
         raise
-    return [partial(_lammps_atoms, path, atoms, units is not None) for atoms in found]
+    return [partial(_lammps_atoms, path, atoms, listed, labels, atom_types, units is not None) for atoms in found]
 
 
-def _lammps_atoms(path: Path, atoms, units_are_known: bool) -> Atoms:
-    """Types as names, masses in place of elements, molecules as residues."""
-    residue = [(int(n), "") for n in atoms.arrays["mol-id"]] if "mol-id" in atoms.arrays else None
-    result = _from_ase(path, atoms, [str(t) for t in atoms.arrays["type"]], None, residue, atoms.get_masses())
-    if result.velocity is not None and not units_are_known:
+def _lammps_types(lines: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Of LAMMPS data the atom types in the section Masses, and what labels, or words after masses, call types."""
+    listed, labels, words, section = [], {}, {}, ""
+    for line in lines[1:]:
+        data, _, comment = line.partition("#")
+        fields = data.split()
+        if fields and all(field.isalpha() for field in fields):
+            section = " ".join(fields)
+        elif len(fields) == 2 and section == "Masses":
+            listed.append(fields[0])
+            if len(comment.split()) == 1:
+                words[fields[0]] = comment.strip()
+        elif len(fields) == 2 and section == "Atom Type Labels":
+            labels[fields[0]] = fields[1]
+    return listed, words | labels
+
+
+def _lammps_atoms(
+    path: Path, atoms, listed: list[str], labels: dict[str, str], atom_types: dict[str, str] | None, units_known: bool
+) -> Atoms:
+    """Types as names, by what the scene or else the file calls them; molecules as residues."""
+    types = [str(t) for t in atoms.arrays["type"]]
+    if atom_types is not None:
+        present = sorted({*types, *listed}, key=int)
+        unknown, unnamed = [t for t in atom_types if t not in present], [t for t in present if t not in atom_types]
+        faults = []
+        if unknown:
+            faults.append(
+                f"structure.atom_types: there is no type {', '.join(unknown)}; there are {', '.join(present)}"
+            )
+        if unnamed:
+            faults.append(f"structure.atom_types does not say what type {', '.join(unnamed)} is")
+        if faults:
+            raise StructureError(str(path), faults)
+    names = labels if atom_types is None else atom_types
+    masses = atoms.get_masses() if listed else None
+    element = {} if masses is None else {t: element_of_mass(mass) for t, mass in zip(types, masses, strict=True)}
+    result = _from_ase(
+        path,
+        atoms,
+        [names.get(t, t) for t in types],
+        [element.get(t, "") for t in types],
+        [(int(n), "") for n in atoms.arrays["mol-id"]] if "mol-id" in atoms.arrays else None,
+        masses,
+    )
+    if result.velocity is not None and not units_known:
         result.notes.append("its first line does not say its units ('units = real'): its velocities are not used")
         return result._replace(velocity=None)
     return result
+
+
+def element_of_mass(mass: float) -> str:
+    """The element, or heavy hydrogen, that weighs so much (u); "" if none does: several atoms as one, say."""
+    from ase.data import atomic_masses, chemical_symbols
+
+    known = {e: float(m) for e, m in zip(chemical_symbols, atomic_masses, strict=True) if e != "X"} | HEAVY_HYDROGEN
+    nearest = min(known, key=lambda element: abs(known[element] - mass))
+    return nearest if abs(known[nearest] - mass) <= SAME_MASS * mass else ""
 
 
 # by ourselves
@@ -353,7 +410,7 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
             velocity[k - first - 2] = found
         names.append(line[10:15].strip())
         number = line[:5].strip()
-        residue.append((int(number) if number.isdigit() else 0, line[5:10].strip()))
+        residue.append((int(number) if number.isdecimal() else None, line[5:10].strip()))
     xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
     cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     return Atoms(
@@ -443,7 +500,5 @@ READERS = {
     ".ent": _pdb,
     ".xyz": _xyz,
     ".extxyz": _xyz,
-    ".lmp": _lammps,
-    ".lammps": _lammps,
-    ".data": _lammps,
+    **dict.fromkeys(LAMMPS_DATA, _lammps),
 }

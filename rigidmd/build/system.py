@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.cells import reduced
 from rigidmd.build.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
 from rigidmd.build.lattice import lattice
 from rigidmd.build.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
 from rigidmd.build.overlaps import overlaps
-from rigidmd.build.structure import Arrangement, read_structure
+from rigidmd.build.structure import Arrangement, leaning_less, read_structure
 from rigidmd.build.structure_files import read_geometry
 from rigidmd.core.state import State, state_of
+from rigidmd.core.state_file import Saved
 from rigidmd.dynamics.advance import Model
 from rigidmd.dynamics.engine import Engine
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
@@ -68,6 +68,7 @@ class System:
     constant_pressure: float  # u/(Å ps²), that no motion changes
     tail: Tail | None  # what is missing beyond the cut-off, where it is asked for
     sites: Sites
+    residue_number: np.ndarray  # (n,) by which a scene may pick molecules: see Molecules.frozen
     from_lattice: bool
     cutoff: float  # Å
     left_out: list[str]
@@ -85,10 +86,11 @@ class System:
         sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
         return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the species."""
-        return [m.name for m in self.species]
+    def saved(self, state: State) -> Saved:
+        """A state with what a file of it says besides. Species that are there twice, frozen and free, are one there."""
+        names = list(dict.fromkeys(m.name for m in self.species))
+        index = np.array([names.index(m.name) for m in self.species])
+        return Saved(state, names, index[self.model.species], self.residue_number)
 
     @property
     def residue_names(self) -> np.ndarray:
@@ -126,20 +128,20 @@ class System:
 
 def build(scene: MolecularScene) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
-    species = _species(scene)
+    species = species_of(scene)
     arrangement = _arrange(scene, species)
     space = space_of(arrangement.cell)
     cutoff = _cutoff(scene, space, species)
-    frozen = np.array([entry.frozen for entry in scene.molecules])
-    if frozen[arrangement.species].all():
+    number = _numbers(arrangement)
+    species, index, frozen = _frozen(scene, species, arrangement.species, number)
+    if frozen[index].all():
         raise SceneError(scene.source, ["molecules: all are frozen; nothing would move"])
-    model = _model(species, arrangement.species, frozen)
+    model = _model(species, index, frozen)
     turning = any(m.inertia.any() for m in species)
-    n = len(arrangement.species)
     state = state_of(
         position=arrangement.position, rotation=arrangement.rotation if turning else None, cell=arrangement.cell
     )
-    terms, constants, pressure, beyond, charges = _terms(scene, species, model, space, cutoff, state)
+    terms, constants, pressure, beyond, charges = _terms(scene, species, model, space, cutoff, state, arrangement.basis)
     system = System(
         scene=scene,
         species=species,
@@ -151,7 +153,8 @@ def build(scene: MolecularScene) -> System:
         constants=constants,
         constant_pressure=pressure,
         tail=beyond,
-        sites=_sites(species, arrangement.species),
+        sites=_sites(species, index),
+        residue_number=number,
         from_lattice=scene.structure is None,
         cutoff=cutoff,
         left_out=_left_out(scene, terms, model, space),
@@ -161,21 +164,24 @@ def build(scene: MolecularScene) -> System:
     _set_momenta(system, arrangement)
     system.notes.extend(
         f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
-        for m in species
+        for m in {m.name: m for m in species}.values()
         if m.mixing not in (None, scene.forces.mixing)
     )
     if scene.structure is not None:
         system.notes.append(
-            f"{n} molecules read from {scene.structure.file}; atoms against rigid templates: "
+            f"{len(index)} molecules read from {scene.structure.file}; atoms against rigid templates: "
             f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
         )
         system.notes.extend(f"{scene.structure.file}: {note}" for note in arrangement.notes)
         if faults := overlaps(system):
             raise StructureError(str(scene.path(scene.structure.file)), faults)
+    else:
+        system.notes += [f"box: {note}" for note in arrangement.notes]
     return system
 
 
-def _species(scene: MolecularScene) -> list[Molecule]:
+def species_of(scene: MolecularScene) -> list[Molecule]:
+    """The molecules that a scene names, in its order. Raises SceneError with every fault."""
     found, faults = [], []
     for k, entry in enumerate(scene.molecules):
         try:
@@ -220,7 +226,9 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site,
             faults.append(f"atom {name}: no entry of sites{where} has this name or is called {element}")
             continue
         used.add(match.name if match else "")
-        given = next((s.mass_u for s in (match, shared) if s is not None and s.mass_u is not None), float(mass))
+        entries = [s for s in (match, shared) if s is not None]
+        given = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
+        element = next((s.element for s in entries if s.element != "X"), element)
         known = {"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
         sites.append(match.model_copy(update=known) if match else Site(**known))
     faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]
@@ -234,7 +242,14 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         path = scene.path(scene.structure.file)
         start = scene.structure
         found = read_structure(
-            path, species, scene.box.cell, scene.box.periodic, start.tolerance, start.frame, start.repeat
+            path,
+            species,
+            scene.box.cell,
+            scene.box.periodic,
+            start.tolerance,
+            start.frame,
+            start.repeat,
+            start.atom_types,
         )
         faults = []
         for k, entry in enumerate(scene.molecules):
@@ -254,16 +269,55 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         cell = np.eye(3) * np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))
     rng = np.random.default_rng([scene.seed, LATTICE])
     n = sum(counts)
-    return Arrangement(
+    found = Arrangement(
         species=np.repeat(np.arange(len(species)), counts),
         position=lattice(n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
         velocity=None,
         angular_momentum_body=None,
-        cell=reduced(cell) if scene.box.periodic else None,
+        cell=cell if scene.box.periodic else None,
         residual_rms=0.0,
         residual_max=0.0,
     )
+    return leaning_less(found, "its", may_turn=False)
+
+
+def _numbers(arrangement: Arrangement) -> np.ndarray:
+    """Numbers (n,) of residues, or else 1, 2, ... among the molecules of each species."""
+    if arrangement.number is not None:
+        return arrangement.number
+    found = np.zeros(len(arrangement.species), int)
+    for k in np.unique(arrangement.species):
+        own = arrangement.species == k
+        found[own] = np.arange(1, own.sum() + 1)
+    return found
+
+
+def _frozen(
+    scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
+) -> tuple[list[Molecule], np.ndarray, np.ndarray]:
+    """Species, index (n,) into them, and which are frozen; one of which some molecules are frozen becomes two."""
+    species, index, faults = list(species), index.copy(), []
+    frozen = [entry.frozen is True for entry in scene.molecules]
+    for k, entry in enumerate(scene.molecules):
+        own = index == k
+        chosen = np.zeros(len(index), bool)
+        for first, last in entry.frozen_spans:
+            here = own & (first <= number) & (number <= last)
+            if not here.any() or last > number[own].max():
+                there = f"they have {number[own].min()} to {number[own].max()}" if own.any() else "there are none"
+                asked = f"{first}" if first == last else f"{first}-{last}"
+                faults.append(f"molecules.{k}.frozen: no {species[k].name} has the number {asked}; {there}")
+            chosen |= here
+        if chosen.any() and (chosen == own).all():
+            frozen[k] = True
+        elif chosen.any():
+            index[chosen] = len(species)
+            species.append(species[k])
+            frozen.append(True)
+    if faults:
+        raise SceneError(scene.source, faults)
+    return species, index, np.array(frozen)
 
 
 def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> float:
@@ -368,7 +422,13 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
 
 
 def _terms(
-    scene: MolecularScene, species: list[Molecule], model: Model, space: Space, cutoff: float, state: State
+    scene: MolecularScene,
+    species: list[Molecule],
+    model: Model,
+    space: Space,
+    cutoff: float,
+    state: State,
+    basis: np.ndarray,
 ) -> tuple[dict[str, NamedTuple], dict[str, float], float, Tail | None, Electrostatics | None]:
     """Terms by name, constant energies by name, constant pressure, what is beyond the cut-off, what charges are."""
     forces = scene.forces
@@ -407,7 +467,7 @@ def _terms(
     if forces.electrostatics != "none" and any(len(c) for c in chosen):
         sites = _taking_part(species, index, chosen)
         charged = Charged(species, index, frozen[index], chosen, sites, _groups(sites, frozen[index]))
-        found = electrostatics(scene, charged, space, cutoff, start, state)
+        found = electrostatics(scene, charged, space, cutoff, start, state, basis)
         terms |= found.terms
         constants |= found.constants
         pressure += found.pressure
@@ -433,6 +493,8 @@ def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) ->
         out.append("periodic images: there is no box")
     if all(stage.ensemble == "nve" for stage in scene.stages):
         out.append("thermostat: every stage is nve")
+    if scene.run.remove_momentum_interval_ps is False:
+        out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
     if not scene.forces.tail_correction:
         out.append("tail correction: not asked for")
     return out

@@ -12,8 +12,9 @@ LIST_FULL = 2  # a neighbour list needs more room: enlarge it and call again
 CELL_CHANGED = 3  # the cell is now too small for the skin of a list: fit the list and call again
 NOT_FINITE = 4  # a position is not a number, or so large that it says nothing any more
 
-#: Columns of `State.books`: the heat that baths have put in, and the work of what drives or brakes.
-HEAT, WORK = 0, 1
+#: Columns of `State.books`, energies put in so far: heat of baths, work of what drives or brakes, and what goes (below
+#: zero) with total momentum that is taken out.
+HEAT, WORK, REST = 0, 1, 2
 #: Columns of `State.time` and `State.step`: now, and where the present stretch of equal steps began.
 NOW, ORIGIN = 0, 1
 
@@ -37,7 +38,7 @@ class State(NamedTuple):
     cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges where there is no box
     time: np.ndarray  # (2,) now; when this stretch of equal steps began
     step: np.ndarray  # (2,) int64 steps since the start; those when this stretch began
-    books: np.ndarray  # (2,) heat and work put in so far; the energy less both is conserved
+    books: np.ndarray  # (3,) energies put in so far, see HEAT; the energy less their sum is conserved
     bath: np.ndarray  # (m,) what a bath or a textbook formulation evolves besides; (0,) of most
 
     def copy(self) -> "State":
@@ -85,7 +86,7 @@ def state_of(
         _array(NO_CELL if cell is None else cell),
         np.zeros(2),
         np.zeros(2, np.int64),
-        np.zeros(2),
+        np.zeros(3),
         np.zeros(0),
     )
 

@@ -20,12 +20,21 @@ class Saved(NamedTuple):
     state: State
     names: list[str]  # of species
     species: np.ndarray  # (n,) index into the names
+    residue_number: np.ndarray | None  # (n,); older files have none
 
 
-def write_state(path: Path, state: State, names: list[str], species: np.ndarray) -> None:
-    """Write a state of molecules with the names of their species (n,) index. No pickle in it. Raises OutputError."""
+def write_state(path: Path, saved: Saved) -> None:
+    """Write a state of molecules. No pickle in it. Raises OutputError."""
+    more = {} if saved.residue_number is None else {"residue_number": saved.residue_number}
     with whole_file(path) as temporary:
-        np.savez(temporary, schema=SCHEMA, species_names=np.array(names), species=species, **state._asdict())
+        np.savez(
+            temporary,
+            schema=SCHEMA,
+            species_names=np.array(saved.names),
+            species=saved.species,
+            **more,
+            **saved.state._asdict(),
+        )
 
 
 def read_state(path: Path) -> Saved:
@@ -45,7 +54,7 @@ def read_state(path: Path) -> Saved:
         raise StructureError(str(path), [fault])
     example = state_of()
     if schema == 1:
-        arrays = {key: arrays[key] for key in ("species", *State._fields[:5]) if key in arrays}
+        arrays = {key: arrays[key] for key in ("species", "residue_number", *State._fields[:5]) if key in arrays}
         arrays |= {key: getattr(example, key) for key in State._fields[5:]}
     if missing := [key for key in State._fields if key not in arrays]:
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])
@@ -53,7 +62,7 @@ def read_state(path: Path) -> Saved:
         raise StructureError(str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"])
     kinds = (getattr(example, key).dtype for key in State._fields)
     state = State(*(np.array(arrays[key], kind) for key, kind in zip(State._fields, kinds, strict=True)))
-    return Saved(state, names, species)
+    return Saved(state, names, species, arrays.get("residue_number"))
 
 
 def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
@@ -61,13 +70,13 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     n = len(arrays["species"]) if arrays["species"].ndim else 0
     m = n if len(np.atleast_1d(arrays["rotation"])) else 0
     shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3), "rotation": (m, 3, 3)}
-    shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (2,)}
+    shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (3,)}
+    shapes |= {"residue_number": (n,)} if "residue_number" in arrays else {}
     bad = {key for key, shape in shapes.items() if arrays[key].shape != shape or arrays[key].dtype.kind not in "fi"}
     finite = [key for key in (*shapes, "bath") if key not in (*bad, "cell")]
     bad |= {key for key in finite if not np.isfinite(arrays[key]).all()}
-    if "species" not in bad and not (
-        arrays["species"].dtype.kind == "i" and np.isin(arrays["species"], np.arange(len(names))).all()
-    ):
+    bad |= {key for key in ("species", "residue_number") if key in arrays and arrays[key].dtype.kind != "i"}
+    if "species" not in bad and not np.isin(arrays["species"], np.arange(len(names))).all():
         bad.add("species")
     if "rotation" not in bad and m:
         gap = np.swapaxes(arrays["rotation"], 1, 2) @ arrays["rotation"] - np.eye(3)

@@ -31,6 +31,8 @@ from rigidmd.forces.terms import Setup
 from rigidmd.units import COULOMB
 
 WIDTH = lane_count(np.float64)
+#: The basis of a cell that stands as it was described.
+AS_GIVEN = np.eye(3, dtype=int)
 
 
 class Waves(NamedTuple):
@@ -47,21 +49,41 @@ class Waves(NamedTuple):
         return 2 * int(self.count.sum())
 
 
-def waves(most: tuple[int, int, int], largest_square: int | None = None) -> Waves:
-    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` where it is given."""
-    return _waves(most, lambda n: (n**2).sum(axis=-1) <= (np.inf if largest_square is None else largest_square))
+def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = AS_GIVEN) -> Waves:
+    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` where it is given.
+
+    basis (3, 3) : integers; both bound n in another cell of the lattice, and this cell's edges are `basis` times those
+    """
+    square = np.inf if largest_square is None else largest_square
+
+    def inside(n: np.ndarray) -> np.ndarray:
+        other = _in_other(n, basis)
+        return (np.abs(other) <= most).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
+
+    return _waves(np.abs(basis) @ most, inside)
 
 
-def waves_within(reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None) -> Waves:
+def waves_within(
+    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = AS_GIVEN
+) -> Waves:
     """All n != 0 whose k is no longer than `radius` (1/Å), with |n_x|, |n_y|, |n_z| up to `limit` where it is given.
 
     reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
+    basis : of the limit, see `waves`
     """
     cell = 2 * pi * np.linalg.inv(reciprocal).T
     most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
-    if limit is not None:
-        most = np.minimum(most, limit)
-    return _waves(tuple(most), lambda n: ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2)
+
+    def inside(n: np.ndarray) -> np.ndarray:
+        short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
+        return short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
+
+    return _waves(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
+
+
+def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """The n (..., 3) of the same waves in the cell of which `basis` makes this one."""
+    return n @ np.rint(np.linalg.inv(basis)).astype(int).T
 
 
 def _waves(most, inside) -> Waves:

@@ -119,7 +119,7 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
         "kinetic": kinetic,
         "potential": potential,
         "energy": kinetic + potential,
-        "work": states.books.reshape(n, 2)[:, WORK],
+        "work": states.books.reshape(n, 3)[:, WORK],
     }
 
 

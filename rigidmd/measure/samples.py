@@ -22,7 +22,7 @@ class Sample(NamedTuple):
     temperature_translation_unbiased: float  # NaN with any integrator but velocity Verlet
     temperature_rotation_unbiased: float
     pressure_bar: float
-    conserved: float  # energy less the heat of the thermostat, u Å²/ps²
+    conserved: float  # energy less heat of the thermostat, with what went with the total momentum, u Å²/ps²
     drift: float  # of the conserved energy since the stage began, u Å²/ps²
     momentum: float  # |P|, u Å/ps
     orthogonality: float

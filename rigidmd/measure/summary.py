@@ -1,18 +1,24 @@
 """The figures a run is judged by, as one dictionary with units in its keys."""
 
 import platform
+from collections import Counter
 from importlib.metadata import version
 from math import isnan, sqrt
 
 import numba
 import numpy as np
 
+from rigidmd.build.momenta import Removed, mobile
 from rigidmd.build.relief import Relief
 from rigidmd.build.system import System
-from rigidmd.core.state import State
+from rigidmd.core.state import REST, State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.samples import Sample, Samples
+from rigidmd.scene import MolecularScene
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+
+#: Share of the translational temperature that a drift of all molecules may have unsaid.
+SHOWS = 1e-4
 
 
 def summarise(
@@ -28,13 +34,16 @@ def summarise(
     choices: dict[int, str],
     stable: dict[int, float],
     warnings: list[str],
+    removed: Removed,
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
 
     choices : of stages that left their integrator open, what was chosen and why
     stable : the longest stable step (ps) of stages, as estimated at their start
+    removed : how often, and how much, total momentum was taken out
     """
     scene = system.scene
+    momentum = samples.rows[-1].momentum
     stages = [
         _stage(system, samples.rows, k, computing[k])
         | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
@@ -50,7 +59,7 @@ def summarise(
         "seed": scene.seed,
         "interrupted": interrupted,
         "molecules": len(system.model.species),
-        "species": {m.name: int((system.model.species == k).sum()) for k, m in enumerate(system.species)},
+        "species": dict(Counter(system.species[k].name for k in system.model.species)),
         "sites": len(system.sites.molecule),
         "degrees_of_freedom": system.freedom.total,
         "degrees_of_freedom_translation": system.freedom.translation,
@@ -62,11 +71,38 @@ def summarise(
         "preparing_s": preparing,
         "wall_s": wall,
         "largest_orthogonality_error": max(sample.orthogonality for sample in samples.rows),
-        "momentum_u_A_ps": samples.rows[-1].momentum,
-        "momentum_relative": _relative_momentum(system, state, samples.rows[-1].momentum),
+        "momentum_u_A_ps": momentum,
+        "momentum_relative": _relative_momentum(system, state, momentum),
+        "momentum_removed": _removed(scene, removed, state),
         "stages": stages,
-        "notes": [*system.notes, *warnings],
+        "notes": [*system.notes, *_drifting(system, samples.rows[-1]), *warnings],
     }
+
+
+def _removed(scene: MolecularScene, removed: Removed, state: State) -> dict | None:
+    """What removals of the total momentum took out in the whole run; None where there are none."""
+    if scene.removes_momentum_every is None:
+        return None
+    return {
+        "interval_ps": scene.removes_momentum_every,
+        "times": removed.times,
+        "largest_u_A_ps": removed.largest,
+        "energy_kJ_mol": -float(state.books[REST]) / KJ_PER_MOL,
+    }
+
+
+def _drifting(system: System, last: Sample) -> list[str]:
+    """A note where the total momentum, whose degrees of freedom are not counted, has energy that temperatures show."""
+    if not mobile(system.model).all() or not system.freedom.translation or not last.temperature_translation > 0:
+        return []
+    mass = float(system.model.mass[system.model.species].sum())
+    gain = last.momentum**2 / (mass * BOLTZMANN * system.freedom.translation)
+    if gain <= SHOWS * last.temperature_translation:
+        return []
+    return [
+        f"the molecules drift together with |P| = {last.momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
+        "run.remove_momentum_interval_ps takes the total momentum out"
+    ]
 
 
 def _relative_momentum(system: System, state: State, momentum: float) -> float:

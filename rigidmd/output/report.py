@@ -39,6 +39,11 @@ def summary_text(summary: dict) -> str:
         f"  {'momentum':<16}|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, "
         f"{summary['momentum_relative']:.1e} of the sum of |m v|"
     )
+    if removed := summary["momentum_removed"]:
+        lines.append(
+            f"  {'':<16}taken out every {removed['interval_ps']:g} ps, {removed['times']} times, at most "
+            f"{removed['largest_u_A_ps']:.1e} u Å/ps; {removed['energy_kJ_mol']:.1e} kJ/mol in all"
+        )
     lines += [f"\n  note: {note}" for note in summary["notes"]]
     if summary["interrupted"]:
         lines += ["", "  interrupted: the figures are those so far"]

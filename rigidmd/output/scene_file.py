@@ -25,6 +25,7 @@ def write_scene(folder: Path, scene: MolecularScene, system: System) -> None:
     data = scene.model_dump(exclude_none=True)
     if system.cutoff < inf:
         data["forces"]["cutoff_A"] = system.cutoff
+    data["run"]["remove_momentum_interval_ps"] = scene.removes_momentum_every or False
     for key, copied in input_names(scene).items():
         with whole_file(folder / copied) as temporary:
             shutil.copyfile(scene.inputs[key], temporary)

@@ -3,13 +3,14 @@
 import os
 import re
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr, ValidationError
 
 from rigidmd.errors import SceneError
-from rigidmd.validation import Section, faults_of
+from rigidmd.validation import Section, faults_of, meant, place, toml_fault
 
 
 class Scene(Section):
@@ -52,8 +53,8 @@ class Scene(Section):
     def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "Scene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
 
-        Files named in the scene must lie in its folder or below; files named in `overrides` may be anywhere, and are
-        taken relative to the working directory.
+        An override of None removes the key. Files named in the scene must lie in its folder or below; files named in
+        `overrides` may be anywhere, and are taken relative to the working directory.
         """
         path = Path(path)
         try:
@@ -61,8 +62,10 @@ class Scene(Section):
             data = tomllib.loads(text)
         except OSError as error:
             raise SceneError(str(path), [f"cannot be read: {error.strerror}"]) from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except UnicodeDecodeError as error:
             raise SceneError(str(path), [f"is not TOML: {error}"]) from None
+        except tomllib.TOMLDecodeError as error:
+            raise SceneError(str(path), [toml_fault(error, text)]) from None
         data.setdefault("name", re.sub(r"[^\w.\-]", "_", path.stem))
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
 
@@ -84,18 +87,37 @@ class Scene(Section):
             if cls is None:
                 raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults = cls.strange_paths(data, folder)
+        overridden = []
         for key, value in (overrides or {}).items():
             faults += _override(data, key, value)
+            if value is None and key.rpartition(".")[2].isdigit():
+                text = ""  # without an entry, those after it have other numbers than in the text
+            else:
+                overridden.append(key)
         faults += cls.contradictions(data, text)
         try:
             scene = cls.model_validate(data)
         except ValidationError as error:
-            raise SceneError(source, faults + faults_of(error, cls, text, overrides or {})) from None
+            raise SceneError(source, faults + faults_of(error, cls, text, overridden)) from None
         if faults:
             raise SceneError(source, faults)
         scene._source = source
         scene._folder = folder
+        if missing := scene._missing_files(text, overridden):
+            raise SceneError(source, missing)
         return scene
+
+    def _missing_files(self, text: str, overridden: Iterable[str]) -> list[str]:
+        """Faults: files it names that are not there, by line and key."""
+        faults = []
+        for key, path in self.inputs.items():
+            if path.is_file():
+                continue
+            where = place([int(part) if part.isdigit() else part for part in key.split(".")], text, overridden)
+            near = meant(path.name, [p.name for p in path.parent.iterdir()]) if path.parent.is_dir() else ""
+            what = "is a folder" if path.is_dir() else "there is no such file"
+            faults.append(f"{where}: {what}: {path}{near}")
+        return faults
 
 
 def file_name(name: str, endings: tuple[str, ...]) -> str:
@@ -120,7 +142,7 @@ def _kind(data: dict, body: type[Scene], molecules: type[Scene]) -> type[Scene] 
 
 
 def _override(data: dict, key: str, value: Any) -> list[str]:
-    """Set one dotted key in nested tables and lists, in place; a list of faults."""
+    """Set one dotted key in nested tables and lists, or remove it by None, in place; a list of faults."""
     if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".")
@@ -133,7 +155,12 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
             part = int(part)
         elif not isinstance(target, dict):
             return [f"--set {key}: {here} is no table"]
-        if depth == len(parents):
+        elif value is None and part not in target:
+            there = meant(part, target) or f"; there are {', '.join(target)}"
+            return [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
+        if depth == len(parents) and value is None:
+            del target[part]
+        elif depth == len(parents):
             target[part] = value
         elif isinstance(target, dict):
             target = target.setdefault(part, {})
@@ -143,10 +170,15 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """KEY=VALUE of the command line; the value as TOML would read it, or else as text. Raises SceneError."""
+    """KEY=VALUE of the command line: the value as TOML would read it, or else as text; None if empty.
+
+    Raises SceneError.
+    """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SceneError("--set", [f"{text!r} is not KEY=VALUE, for example stages.1.timestep_fs=4"])
+    if not value.strip():
+        return key.strip(), None
     try:
         return key.strip(), tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:

@@ -1,5 +1,6 @@
 """The scene of molecules: species, box, forces, stages."""
 
+import re
 from math import cos, inf, pi, radians, sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +19,10 @@ WITH_VELOCITIES = (".trr", ".nc")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 MOST_STEPS = 1e12
+REMOVE_MOMENTUM_EVERY = 1.0  # ps, with pme: in it 216 waters at an accuracy of 1e-4 gained 26 u Å/ps; thermal were 980
+
+#: Endings of LAMMPS' data files.
+LAMMPS_DATA = (".data", ".lmp", ".lammps")
 
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
@@ -26,6 +31,7 @@ Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
+ResidueNumber = Annotated[int, Strict(), Field(ge=0)]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
 #: Keys of `Forces` that only some kinds of electrostatics know.
@@ -35,6 +41,7 @@ ELECTROSTATIC_KEYS = {
     "ewald_accuracy": ("ewald", "pme"),
     "ewald_alpha_per_A": ("ewald", "pme"),
     "ewald_surface_permittivity": ("ewald", "pme"),
+    "ewald_truncation": ("ewald", "pme"),
     "ewald_k_max": ("ewald",),
     "ewald_k2_max": ("ewald",),
     "ewald_k_radius_per_A": ("ewald",),
@@ -57,6 +64,15 @@ class Structure(Section):
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
     """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
+    atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
+    """Of LAMMPS' data files: what each atom type is, { 1 = "O", 2 = "H" }, by a site's name or an element, X without
+    mass. When not given, labels in the file tell, and else masses"""
+
+    @model_validator(mode="after")
+    def _has_types(self):
+        if self.atom_types is not None and not self.file.lower().endswith(LAMMPS_DATA):
+            raise ValueError(f"atom_types are of LAMMPS' data files ({' '.join(LAMMPS_DATA)}), not of {self.file}")
+        return self
 
 
 class Box(Section):
@@ -118,8 +134,29 @@ class Molecules(Section):
     """Residue names by which structure files may call this species"""
     count: Count | None = None
     """How many; needed unless there is a structure file"""
-    frozen: Flag = False
-    """They stay put and act on the others; not on one another, so the potential energy lacks that constant"""
+    frozen: Flag | tuple[ResidueNumber, ...] | str = False
+    """They stay put and act on the others; not on one another, so the potential energy lacks that constant. True for
+    all, or numbers of some, [1, 2, 5] or "1-10, 15": all residues of such a number in the structure file; where its
+    residues are not the molecules, or there is no file, 1, 2, ... among those of this species"""
+
+    @field_validator("frozen")
+    @classmethod
+    def _are_numbers(cls, frozen: bool | tuple[int, ...] | str):
+        if frozen == ():
+            raise ValueError("is empty: list the numbers of molecules, or leave it out")
+        if isinstance(frozen, str):
+            if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", frozen):
+                raise ValueError(f"is {frozen!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
+            if turned := [f"{first}-{last}" for first, last in _spans(frozen) if first > last]:
+                raise ValueError(f"is {frozen!r}: {', '.join(turned)} ends before it begins")
+        return frozen
+
+    @property
+    def frozen_spans(self) -> list[tuple[int, int]]:
+        """First and last of the numbers of frozen molecules; none where all or none are."""
+        if isinstance(self.frozen, bool):
+            return []
+        return _spans(self.frozen) if isinstance(self.frozen, str) else [(number, number) for number in self.frozen]
 
     @field_validator("model")
     @classmethod
@@ -148,6 +185,12 @@ class Molecules(Section):
         return self
 
 
+def _spans(text: str) -> list[tuple[int, int]]:
+    """First and last number of each part of "1-10, 15"."""
+    ends = [[int(number) for number in part.split("-")] for part in text.split(",")]
+    return [(numbers[0], numbers[-1]) for numbers in ends]
+
+
 class UnlikePair(Section):
     """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
 
@@ -165,8 +208,9 @@ class Forces(Section):
     cutoff_A: Positive | None = None
     """Cut-off between sites; 9 Å in a periodic box, none without one"""
     truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
-    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. What
-    ewald and pme leave to pairs only has its energy shifted to 0 there, unless plain"""
+    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. The
+    energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. What ewald and
+    pme leave to pairs ends as ewald_truncation says"""
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
     and smooth_switch, at 0.6 of the cut-off"""
@@ -175,7 +219,7 @@ class Forces(Section):
     pairs: tuple[UnlikePair, ...] = ()
     """Parameters of particular pairs, in place of the mixing rule"""
     tail_correction: Flag = False
-    """Add the energy and pressure of Lennard-Jones beyond the cut-off"""
+    """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` is with it, `virial` without"""
     electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
     """How charges act: ewald and pme with all periodic images, the others within the cut-off; none ignores them"""
     reaction_field_permittivity: Permittivity = inf
@@ -187,17 +231,22 @@ class Forces(Section):
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
-    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each"""
+    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each, of the cell as box or file describe it"""
     ewald_k2_max: Count | None = None
     """Of ewald: largest n_x² + n_y² + n_z² besides"""
     ewald_k_radius_per_A: Positive | None = None
     """Of ewald: largest length of k"""
+    ewald_truncation: Literal["plain", "shift"] | None = None
+    """Of ewald and pme: whether the energy of what they leave to pairs, erfc(alpha r)/r, is shifted to 0 at the
+    cut-off; forces are the same. When not given: plain where `truncation` is plain, else shift. coulomb_self then also
+    holds -erfc(alpha R)/(2 R) times the square of each molecule's charge, R the cut-off: nothing for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
     """Of pme: order of the B-splines, 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """Of pme: grid points along each edge"""
+    """Of pme: grid points along each edge of the cell as box or file describe it; three equal ones if it leans by more
+    than half an edge, as another cell stands for it then"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.6
     """Extra radius of the neighbour list; speed only, never the result"""
 
@@ -217,6 +266,12 @@ class Forces(Section):
         if settled and self.ewald_alpha_per_A is not None and "ewald_accuracy" in self.model_fields_set:
             raise ValueError("ewald_accuracy would do nothing: alpha and what goes with it are all given")
         return self
+
+    @property
+    def shifts_ewald(self) -> bool:
+        """Whether the real-space energy of an Ewald sum is shifted to 0 at the cut-off."""
+        usual = "plain" if self.truncation == "plain" else "shift"
+        return (self.ewald_truncation or usual) == "shift"
 
     @property
     def gives_waves(self) -> bool:
@@ -256,6 +311,13 @@ class Stage(Section):
     """With auto: largest error of Q (of X in Å, of points) at the end of the pilot run, ten radians of libration"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
+
+    @field_validator("ensemble", mode="before")
+    @classmethod
+    def _is_there(cls, ensemble: Any):
+        if isinstance(ensemble, str) and ensemble.lower() in ("npt", "nph"):
+            raise ValueError(f"is {ensemble!r}, must be 'nve' or 'nvt': there is no pressure coupling yet")
+        return ensemble
 
     @model_validator(mode="after")
     def _makes_sense(self):
@@ -304,6 +366,14 @@ class Stage(Section):
     def label(self) -> str:
         """Its name, or its ensemble."""
         return self.name or self.ensemble
+
+
+class Throughout(Section):
+    """What holds for all stages."""
+
+    remove_momentum_interval_ps: Interval | Literal[False] | None = None
+    """Time between removals of the total momentum; false for never. When not given: 1 ps with pme, whose forces do not
+    add up to zero exactly, and never otherwise. Its energy is booked like the heat of a thermostat"""
 
 
 class Output(Section):
@@ -361,8 +431,18 @@ class MolecularScene(Scene):
     forces: Forces = Forces()
     start: Start = Start()
     stages: tuple[Stage, ...] = Field(min_length=1)
+    run: Throughout = Throughout()
     output: Output = Output()
     watch: Watch = Watch()
+
+    @property
+    def removes_momentum_every(self) -> float | None:
+        """Time between removals of the total momentum, ps; None for never."""
+        asked = self.run.remove_momentum_interval_ps
+        if asked is not None:
+            return asked or None
+        held = any(species.frozen for species in self.molecules)
+        return REMOVE_MOMENTUM_EVERY if self.forces.electrostatics == "pme" and not held else None
 
     @property
     def inputs(self) -> dict[str, Path]:
@@ -399,6 +479,11 @@ class MolecularScene(Scene):
             faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot warm what is at rest")
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             faults.append("forces.tail_correction is that of a liquid all around; with frozen molecules leave it out")
+        if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
+            faults.append(
+                "run.remove_momentum_interval_ps: frozen molecules hold the others, and no total momentum is kept; "
+                "leave it out"
+            )
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")

@@ -8,6 +8,7 @@ from math import nan
 import numba
 import numpy as np
 
+from rigidmd.build.momenta import Removed
 from rigidmd.build.relief import Relief, relieve
 from rigidmd.build.system import build
 from rigidmd.core.schemes import Scheme
@@ -18,6 +19,7 @@ from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
+from rigidmd.measure.meanings import meanings
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
@@ -114,6 +116,7 @@ class MolecularSimulation(Simulation):
         self._stage = 0
         self._last_good: tuple[int, float, State] | None = None
         self._thermal = 0.0
+        self._removed = Removed()
 
     def _row(self, k: int) -> Scheme:
         """The scheme of a stage, with its thermostat."""
@@ -138,6 +141,8 @@ class MolecularSimulation(Simulation):
         if self.scene.stages[k].is_open:
             self._choose(k)
         self._stage = k
+        if self.scene.removes_momentum_every is not None:
+            self._removed.remove(self.system.model, self.state)
         self._estimate(k)
         # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
         self.engine = self.system.engine()
@@ -181,7 +186,15 @@ class MolecularSimulation(Simulation):
 
     def _advance(self, k: int, steps: int, done: int) -> None:
         dt = self.scene.stages[k].timestep_fs * FEMTOSECOND
-        self.engine.advance(self.state, self._row(k), dt, int(self.state.step[NOW]) + steps)
+        row, interval = self._row(k), self.scene.removes_momentum_every
+        every = steps + done if interval is None else max(1, round(interval / dt))
+        end = done + steps
+        while done < end:
+            to = min(end, done + every - done % every)
+            self.engine.advance(self.state, row, dt, int(self.state.step[NOW]) + to - done)
+            done = to
+            if interval is not None and done % every == 0:
+                self._removed.remove(self.system.model, self.state)
 
     def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
         results.samples = Samples()
@@ -295,7 +308,7 @@ class MolecularSimulation(Simulation):
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
         results.summary = summarise(
             self.system, results.samples, self.state, self._relief, self.threads, prepared, wall, computing,
-            self._interrupted, self._choices, self._stable, self._warnings,
+            self._interrupted, self._choices, self._stable, self._warnings, self._removed,
         )  # fmt: skip
         if self.folder is None:
             return
@@ -317,7 +330,7 @@ class MolecularSimulation(Simulation):
         return watch.explained(self.system, error, states, dt, self._stable.get(self._stage))
 
     def _write_state(self, name: str, state: State) -> None:
-        write_state(self.folder / name, state, self.system.names, self.system.model.species)
+        write_state(self.folder / name, self.system.saved(state))
 
     def _save(self) -> str:
         if self.folder is None or self._last_good is None:
@@ -353,6 +366,7 @@ class MolecularSimulation(Simulation):
             "unit": unit,
             "molecules": len(self.system.model.species),
             "relief_steps": relief.steps if relief else 0,
+            "notes": list(self.system.notes),
             "components": {name: energy / size for name, energy in seen.components.items()},
             "potential": seen.potential / size,
             "kinetic": seen.kinetic / size,
@@ -361,6 +375,7 @@ class MolecularSimulation(Simulation):
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
             "largest_force_per_A": force / size,
             "largest_force_molecule": molecule + 1,
+            "meaning": meanings(self.system),
         }
         if measure_accuracy:
             error = accuracy(self.system, self.state)

@@ -9,6 +9,7 @@ from rigidmd.measure.precision import Precision, Subject, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.simulation.molecules import MolecularSimulation
 from rigidmd.simulation.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
+from rigidmd.validation import meant
 
 #: Tried when no others are asked for: the common one, and the best of each kind.
 USUAL = (
@@ -41,7 +42,8 @@ def precision(
     """
     known = (*SCHEMES, *COMPARATORS)
     if unknown := [name for name in integrators or [] if name not in known]:
-        raise SceneError("--integrators", [f"there is no {name}; known: {', '.join(known)}" for name in unknown])
+        faults = [f"there is no {name}{meant(name, known)} (known: {', '.join(known)})" for name in unknown]
+        raise SceneError("--integrators", faults)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(length > 0 for length in lengths) or repeats < 1:
         raise SceneError("precision", ["time steps, span, averages and repeats must be greater than 0"])

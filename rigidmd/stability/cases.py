@@ -1,12 +1,12 @@
 """The battery: named cases in the order in which they are run."""
 
-import difflib
 import time as clock
 from collections.abc import Callable
 from typing import NamedTuple
 
 from rigidmd.errors import SceneError
 from rigidmd.measure.stability import Finding
+from rigidmd.validation import meant
 
 #: What a case does to its finding; quick: fewer settings and integrators.
 Attempt = Callable[[Finding, bool], None]
@@ -40,12 +40,11 @@ def chosen(names: list[str] | None) -> list[Case]:
     """The cases of these names, or all. Raises SceneError with a suggestion."""
     from rigidmd.stability import bodies, boxes, collisions, resistance, tops, unfit, water  # noqa: F401  (each enters its own)
 
-    faults = []
-    for name in names or []:
-        if name not in CASES:
-            near = difflib.get_close_matches(name, CASES, 1, 0.4)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            faults.append(f"there is no case {name!r}{hint} (known: {', '.join(CASES)})")
+    faults = [
+        f"there is no case {name!r}{meant(name, CASES)} (known: {', '.join(CASES)})"
+        for name in names or []
+        if name not in CASES
+    ]
     if faults:
         raise SceneError("--case", faults)
     found = [CASES[name] for name in names] if names else CASES.values()

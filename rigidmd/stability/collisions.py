@@ -113,7 +113,7 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
             path = Path(folder) / "start.npz"
             template = data | {"start": {"temperature_K": 0.0}}
             system = build(Scene.from_dict(template))
-            write_state(path, state, system.names, system.model.species)
+            write_state(path, system.saved(state))
             started = data | {"structure": {"file": path.name, "velocities": velocities}}
             results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
         told = energy_error(results)

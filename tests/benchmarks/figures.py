@@ -1,4 +1,4 @@
-"""The figures of README: runs systems/water.toml and draws its box of water.
+"""The figures of the tutorial of water, one of them in README too: runs systems/water.toml and draws its box of water.
 
     python tests/benchmarks/figures.py
 

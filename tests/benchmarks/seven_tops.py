@@ -1,4 +1,4 @@
-"""The picture of the seven heavy tops in README: runs systems/heavy_top_1.toml ... 7 and draws their axes from above.
+"""The picture of the seven heavy tops: runs systems/heavy_top_1.toml ... 7 and draws their axes from above.
 
     python tests/benchmarks/seven_tops.py
 

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/single_body.py
 
-writes results/single_body.csv and results/single_body.png and prints the table of README. The top is that of
+writes results/single_body.csv and results/single_body.png and prints the table of the benchmarks. The top is that of
 systems/heavy_top_3.toml for 20 nutations; the error is that of Q at the end against the elliptic solution. SciPy solves
 the 12-variable system (direction cosines and angular velocity) once with a right-hand side in plain Python as a user
 would write it, once through this engine (integrator = "dop853"). Medians of five; one thread.

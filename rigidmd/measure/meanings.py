@@ -1,0 +1,66 @@
+"""What the figures of `rigidmd energy` hold, where their names alone do not say it."""
+
+from math import inf
+
+import numpy as np
+
+from rigidmd.build.electrostatics import NEUTRAL
+from rigidmd.build.system import System
+from rigidmd.units import BAR
+
+
+def meanings(system: System) -> dict[str, str]:
+    """In words, by the name of a component of the energy, `virial` or `pressure`."""
+    methods = {"reaction_field": _of_reaction_field, "ewald": _of_ewald, "pme": _of_ewald}
+    has = {*system.terms, *system.constants}
+    of_charges = methods.get(system.scene.forces.electrostatics, lambda system: {})(system)
+    found = {name: text for name, text in of_charges.items() if name in has}
+    if system.space.volume < inf:
+        found |= _of_pressure(system)
+    return found
+
+
+def _of_reaction_field(system: System) -> dict[str, str]:
+    """Of a law that ends at a cut-off."""
+    if system.cutoff == inf or "coulomb" not in system.terms:
+        return {}
+    name, law = system.scene.forces.truncation, system.terms["coulomb"].law
+    ends = {"plain": "", "shift": ", less its value at the cut-off", "force_shift": ", less its value and slope there"}
+    if name in ends:
+        how = ends[name]
+    elif name == "force_switch":
+        how = f", its force switched off from {law.shape.start:g} Å on"
+    else:
+        how = f", less its value at the cut-off, times {name} from {law.shape.start:g} Å on"
+    return {
+        "coulomb": f"q q (1/r + k r²) up to the cut-off{how}",
+        "reaction_field_self": "charges of each molecule in the field that they raise themselves, by the same law",
+    }
+
+
+def _of_ewald(system: System) -> dict[str, str]:
+    """Of what depends on whether energies of real space are shifted."""
+    real, own = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
+    if not system.scene.forces.shifts_ewald:
+        return {"coulomb_real": f"{real}, plain at the cut-off", "coulomb_self": own}
+    charged = any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species)
+    more = (
+        ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is the cut-off"
+        if charged
+        else "; shifted energies add nothing to it, as every molecule is neutral"
+    )
+    return {"coulomb_real": f"{real}, less its value at the cut-off", "coulomb_self": own + more}
+
+
+def _of_pressure(system: System) -> dict[str, str]:
+    """Which of the two has what no motion changes."""
+    constant = f"{system.tail_pressure / BAR:.10g} bar"
+    virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
+    if "lennard_jones_tail" in system.constants:
+        return {
+            "virial": f"{virial}, without the tail correction",
+            "pressure": f"{pressure}, and {constant} of the tail",
+        }
+    if "coulomb_frozen" in system.constants:
+        pressure += f", and {constant}, which takes out what frozen molecules do to one another"
+    return {"virial": virial, "pressure": pressure}

@@ -1,0 +1,103 @@
+"""What travels with the package for people: scenes to start from, and the chapters of the documentation."""
+
+import difflib
+import re
+import shutil
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+from rigidmd.errors import Faults, OutputError
+from rigidmd.output.folder import whole_file
+
+PACKAGE = Path(__file__).parent
+
+#: In a wheel the scenes lie inside the package; in a checkout, and in an editable install of one, beside it.
+SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
+DOCS = PACKAGE / "docs"
+
+#: In the order in which they are listed.
+CHAPTERS = ("top", "water", "molecule", "extending", "manual", "benchmarks", "validation", "changelog")
+
+
+class Example(NamedTuple):
+    """A scene that comes along."""
+
+    name: str
+    path: Path
+    about: str  # the first line of its comment
+    is_body: bool
+
+
+def examples() -> list[Example]:
+    """The scenes that come along, by name."""
+    found = []
+    for path in sorted(SYSTEMS.glob("*.toml")):
+        text = path.read_text(encoding="utf-8")
+        about = text.partition("\n")[0].removeprefix("# ")
+        found.append(Example(path.stem, path, about, "body" in tomllib.loads(text)))
+    return sorted(found, key=_in_series)
+
+
+def _in_series(example: Example) -> list:
+    """Key by which a name's numbers sort as numbers."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
+
+
+def find_example(name: str) -> Example:
+    """The scene of this name, or the first of a numbered series of this name. Raises Faults."""
+    known = {example.name: example for example in examples()}
+    if name in known:
+        return known[name]
+    if series := series_of(name):
+        return known[series[0]]
+    stem = Path(name).stem
+    near = [other for other in known if other == stem or other.startswith(f"{stem}_")]
+    near = near or difflib.get_close_matches(stem, known, 3, 0.6)
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    raise Faults("examples", [f"there is no scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
+
+
+def series_of(name: str) -> list[str]:
+    """The scenes NAME_1, NAME_2, ...; none where there is no such series."""
+    return [example.name for example in examples() if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)]
+
+
+def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
+    """Copy a scene to `path`, and beside it the files that it reads; the paths written. Raises OutputError."""
+    from rigidmd.scene import Scene
+
+    if path.suffix != ".toml":
+        raise OutputError(f"{path} must end in .toml: name a file for the scene with -o")
+    scene = Scene.read(example.path)
+    inputs = {path.parent / file.relative_to(example.path.parent): file for file in scene.inputs.values()}
+    for target in (path, *inputs):
+        kept = target in inputs and target.is_file() and target.read_bytes() == inputs[target].read_bytes()
+        if target.is_dir():
+            raise OutputError(f"{target} is a folder; name another file with -o")
+        if target.exists() and not force and not kept:
+            raise OutputError(f"{target} exists; --force replaces it, -o names another file")
+    for target, source in {path: example.path, **inputs}.items():
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(target) as temporary:
+                shutil.copyfile(source, temporary)
+        except OSError as error:
+            raise OutputError(f"{target} cannot be written: {error.strerror}") from None
+    return [path, *inputs]
+
+
+def contents() -> dict[str, str]:
+    """Chapters of the documentation: name -> what it is about, the first line under its title."""
+    return {name: (DOCS / f"{name}.md").read_text(encoding="utf-8").splitlines()[2] for name in CHAPTERS}
+
+
+def chapter_text(name: str) -> str:
+    """A chapter as plain text: without its comments, pictures by name and path. Raises Faults."""
+    if name not in CHAPTERS:
+        near = difflib.get_close_matches(name, CHAPTERS, 1, 0.5)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise Faults("help", [f"there is no chapter {name!r}; {hint}there are {', '.join(CHAPTERS)}"])
+    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
+    return re.sub(r"!\[([^\]]*)\]\((?:\.\./)*([^)]*)\)", r"[picture: \1, \2]", text).rstrip()

@@ -1,0 +1,377 @@
+"""README and the chapters: every command and snippet in them runs, every key and column is in the manual, no link is dead.
+
+A comment before a block tells this file how to treat it:
+
+    <!-- test: file NAME -->       the block is the file NAME, which later commands use
+    <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run` and `rigidmd precision` of the block, and those
+                                   of --set to each `Scene.read` of a Python block: shorter runs
+    <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
+
+Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
+"""
+
+import argparse
+import contextlib
+import csv
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from conftest import ROOT
+from pydantic import BaseModel
+
+import rigidmd
+from rigidmd import cli
+from rigidmd.build.describe import describe
+from rigidmd.errors import SceneError
+from rigidmd.molecules import read_parameters
+from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
+from rigidmd.shipped import CHAPTERS, DOCS
+
+README = ROOT / "README.md"
+DOCUMENTS = [README, *(ROOT / "rigidmd" / "docs" / f"{name}.md" for name in CHAPTERS)]
+MANUAL = (ROOT / "rigidmd" / "docs" / "manual.md").read_text(encoding="utf-8")
+LANGUAGES = {"sh", "python", "toml", "text", "bibtex"}
+MINIMAL = {
+    MolecularScene: {
+        "box": {"lengths_A": 40.0},
+        "molecules": [{"model": "spce", "count": 2}],
+        "start": {"temperature_K": 300.0},
+        "stages": [{"duration_ps": 1.0}],
+    },
+    BodyScene: {
+        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 2.0, 2.5]},
+        "run": {"duration_s": 1.0, "timestep_s": 0.01},
+    },
+}
+
+
+class Block(NamedTuple):
+    """A fenced block, or the indented lines that README begins with."""
+
+    line: int  # of its first line of text
+    language: str
+    text: str
+    told: str  # what the comment before it tells this test
+
+
+def blocks_of(document: Path) -> list[Block]:
+    lines = document.read_text(encoding="utf-8").splitlines()
+    found, told, k = [], "", 0
+    while k < len(lines):
+        line = lines[k]
+        if marker := re.fullmatch(r"<!-- test: (.*) -->", line):
+            told = marker[1]
+            assert lines[k + 1].startswith("```"), f"{document.name}:{k + 1}: a block must follow at once"
+        elif line.startswith("```"):
+            end = lines.index("```", k + 1)
+            found.append(Block(k + 2, line[3:], "\n".join(lines[k + 1 : end]), told))
+            told, k = "", end
+        elif re.match(r" {4}\S", line) and not lines[k - 1]:
+            end = next(n for n in range(k, len(lines)) if not lines[n].startswith("    "))
+            found.append(Block(k + 1, "sh", "\n".join(line[4:] for line in lines[k:end]), "not run, by CI"))
+            k = end - 1
+        k += 1
+    return found
+
+
+def commands_of(text: str) -> list[list[str]]:
+    """The words of each command of a shell block, comments left out."""
+    joined = text.replace("\\\n", " ")
+    return [shlex.split(part, comments=True) for line in joined.splitlines() for part in line.split("&&")]
+
+
+class Reader:
+    """Does what a document tells its reader to do, in the working directory."""
+
+    def __init__(self, monkeypatch, capsys):
+        self.monkeypatch, self.capsys = monkeypatch, capsys
+        self.namespace: dict = {"__name__": "__main__"}
+
+    def follow(self, block: Block) -> None:
+        how, _, rest = block.told.partition(" ")
+        assert how in ("", "file", "with", "not"), block.told
+        if how == "file":
+            Path(rest).write_text(block.text + "\n", encoding="utf-8")
+        options = shlex.split(rest) if how == "with" else []
+        if block.language == "sh":
+            for words in commands_of(block.text):
+                self.command(words, options, runs=how != "not")
+        elif block.language == "toml":
+            self.scene(tomllib.loads(block.text), rest if how == "file" else "")
+        elif block.language == "python" and how != "file":
+            self.python(block, options)
+
+    def command(self, words: list[str], options: list[str], runs: bool) -> None:
+        match words:
+            case ["rigidmd", *arguments]:
+                if arguments[0] in ("run", "precision"):
+                    arguments += options
+                to = Path(arguments[arguments.index(">") + 1]) if ">" in arguments else None
+                parse(arguments := arguments[: arguments.index(">")] if to else arguments)
+                if runs:
+                    code = cli.main(arguments)
+                    said = self.capsys.readouterr()
+                    assert code == 0, said.err
+                    if to is not None:
+                        to.write_text(said.out)
+            case ["python", script, *arguments] if script.startswith("tests/"):
+                assert not runs
+                source = (ROOT / script).read_text()
+                assert all(a in source for a in arguments if a.startswith("--")), words
+            case ["python", script]:
+                # Terms of one's own name their classes in the cache, and would leave an index nobody else can read
+                own = {"RIGIDMD_CACHE": "cache", "PYTHONPATH": str(Path(rigidmd.__file__).parents[1])}
+                done = subprocess.run([sys.executable, script], env=os.environ | own, capture_output=True, text=True)
+                assert done.returncode == 0, done.stderr
+            case ["pip", "install", what]:
+                project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+                assert what in (".", *(f".[{extra}]" for extra in project["optional-dependencies"]))
+            case ["pytest", *arguments]:
+                assert arguments in ([], ["-m", "slow"])
+            case _:
+                pytest.fail(f"no command that this test knows: {words}")
+
+    def python(self, block: Block, options: list[str]) -> None:
+        extra = dict(parse_override(text) for text in options if text != "--set")
+        read = Scene.read.__func__
+
+        def shortened(cls, path, overrides=None):
+            return read(cls, path, (overrides or {}) | extra)
+
+        with self.monkeypatch.context() as patch:
+            patch.setattr(Scene, "read", classmethod(shortened))
+            exec(compile("\n" * (block.line - 1) + block.text, "snippet", "exec"), self.namespace)
+
+    def scene(self, data: dict, file: str) -> None:
+        """A whole scene must build; a fragment must validate within a minimal scene; a table of sites as such."""
+        if "sites" in data:
+            assert file, "a molecule or table of parameters is a file"
+            if "name" not in data:
+                read_parameters(Path(file))
+            else:
+                assert cli.main(["models", file]) == 0
+            return
+        if {"molecules", "stages"} <= set(data) or {"body", "run"} <= set(data):
+            describe(Scene.from_dict(data, "."))
+            return
+        faults = []
+        for kind, minimal in MINIMAL.items():
+            whole = {key: value for key, value in minimal.items() if key != "box" or "structure" not in data} | data
+            try:
+                kind.from_dict(whole, ".")
+                return
+            except SceneError as error:
+                faults.append(str(error))
+        pytest.fail("\n".join(faults))
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """The options of a command line, its scene read with them if it is there. Fails where the commands would."""
+    try:
+        options = cli._parser().parse_args(arguments)
+    except SystemExit as error:
+        pytest.fail(f"rigidmd {shlex.join(arguments)}: exit code {error.code}")
+    scene = getattr(options, "scene", None)
+    if scene is not None and Path(scene).suffix == ".toml" and Path(scene).exists():
+        cli._read_scene(options)
+    return options
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsys):
+    shutil.copytree(ROOT / "systems", tmp_path / "systems")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["rigidmd"])
+    reader = Reader(monkeypatch, capsys)
+    for block in blocks_of(document):
+        assert block.language in LANGUAGES, f"{document.name}:{block.line}: a block of {block.language!r}"
+        try:
+            reader.follow(block)
+        except BaseException as error:
+            error.add_note(f"in {document.name}, the block at line {block.line}")
+            raise
+    for path in [*tmp_path.rglob("log.csv"), *tmp_path.rglob("motion.csv")]:
+        with path.open() as file:
+            header = next(csv.reader(file))
+        part = section("Columns of log.csv" if path.name == "log.csv" else "Columns of motion.csv")
+        named = set(re.findall(r"`([^`]+)`", part))
+        assert {_first_of_its_kind(column) for column in header} <= named
+
+
+def _first_of_its_kind(column: str) -> str:
+    """The column that stands in the manual for all of its kind: omega_body_1 for omega_body_2, q11 for q23."""
+    column = re.sub(r"^L_\w+_error$", "L_z_error", column)
+    return re.sub(r"_[xyz]$", "_x", re.sub(r"_[123]$", "_1", re.sub(r"^q\d\d$", "q11", column)))
+
+
+def section(title: str) -> str:
+    """What stands under a heading of the manual, to the next of its rank."""
+    rank = re.search(rf"^(#+) {re.escape(title)}$", MANUAL, re.MULTILINE)
+    assert rank, f"the manual has no heading {title!r}"
+    text = MANUAL[rank.end() :]
+    after = re.search(rf"^#{{1,{len(rank[1])}}} ", text, re.MULTILINE)
+    return text[: after.start()] if after else text
+
+
+COMMANDS = next(a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+PLACEHOLDERS = {
+    "SCENE": "scene.toml", "[NAME]": "", "[CHAPTER]": "", "NAME": "x", "CHAPTER": "x", "KEY=VALUE": "a=1", "KEY=": "a=",
+    "N": "1", "PS": "1", "DIR": "x", "FILE": "x",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_commands_in_the_text_are_commands(document):
+    text = re.sub(r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for quoted in re.findall(r"`([^`]+)`", text):
+        words = quoted.replace("\n", " ").split()
+        if words[0] == "rigidmd" and len(words) == 2 and words[1] not in PLACEHOLDERS:
+            assert words[1] in COMMANDS
+        elif words[0] == "rigidmd" and words[1:2] != ["COMMAND"] and len(words) > 1:
+            filled = [PLACEHOLDERS.get(word, word) for word in words[1:]]
+            parse([word for word in filled if word][: filled.index(">") if ">" in filled else None])
+        elif words[:1] == ["python"]:
+            assert (ROOT / words[1]).is_file(), quoted
+            source = (ROOT / words[1]).read_text()
+            assert all(word in source for word in words if word.startswith("--")), quoted
+
+
+def test_every_command_and_option_is_in_the_manual():
+    table = section("Commands")
+    for name, parser in COMMANDS.items():
+        row = next((line for line in table.splitlines() if line.startswith(f"| `rigidmd {name}")), None)
+        assert row, f"the manual has no row for `rigidmd {name}`"
+        for action in parser._actions:
+            for option in action.option_strings:
+                if option.startswith("--") and option not in ("--help", "--set"):
+                    short = next((o for o in action.option_strings if not o.startswith("--")), option)
+                    assert option in row or f"`{short} " in row, f"the manual's row of {name} lacks {option}"
+
+
+def tables_of(kind: type[BaseModel], path: str = "", many: bool = False):
+    """(heading in the manual, model) of each table of a scene."""
+    name = f"[[{path}]]" if many else f"[{path}]"
+    yield f"`{name}`" if path else "Top level", kind
+    for key, field in kind.model_fields.items():
+        for inner in _models_in(field.annotation):
+            yield from tables_of(inner, f"{path}.{key}".strip("."), "tuple" in str(field.annotation))
+
+
+def _models_in(annotation) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]
+
+
+def _toml(value) -> str:
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case str():
+            return f'"{value}"'
+        case tuple():
+            return f"[{', '.join(map(_toml, value))}]"
+    return f"{value:g}"
+
+
+# Keys that these tables inherit and refuse
+REFUSED = {"`[frame]`": {"from_s", "to_s"}, "`[changing_inertia]`": {"times_s", "from_s", "to_s"}}
+
+
+@pytest.mark.parametrize("kind", [MolecularScene, BodyScene])
+def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
+    shared = {heading for heading, _ in tables_of(MolecularScene)}
+    for heading, model in tables_of(kind):
+        if kind is BodyScene and heading == "Top level":
+            continue  # the name only, said for molecules
+        title = f"{heading} of a body" if kind is BodyScene and heading in shared else heading
+        said = {}
+        for row in re.findall(r"^\| (`[a-z].*?) \| (.*?) ?\| ", section(title), re.MULTILINE):
+            said |= {key: row[1].strip() for key in re.findall(r"`(\w+)`", row[0])}
+        wanted = {
+            key: "needed" if field.is_required() else f"`{text}`" if (text := _toml(field.default)) else ""
+            for key, field in model.model_fields.items()
+            if not _models_in(field.annotation)
+        }
+        for key in REFUSED.get(heading, ()):
+            wanted.pop(key)
+            said.pop(key, None)
+        assert said == wanted, f"the manual's table of {title} is not that of the scene"
+
+
+def slugs(document: Path) -> set[str]:
+    """Anchors of a document's headings, as they are made where it is shown."""
+    text = re.sub(r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_links_and_pictures_are_there(document):
+    text = document.read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (document.parent / path).resolve() if path else document
+        assert target.is_file(), f"{document.name}: {link}"
+        assert target.is_relative_to(ROOT)
+        if anchor:
+            assert anchor in slugs(target), f"{document.name}: {link}"
+
+
+def test_readme_is_a_first_page_and_leads_to_every_chapter():
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 130
+    for name in CHAPTERS:
+        assert f"(rigidmd/docs/{name}.md)" in text
+
+
+def test_author_and_version_are_the_same_wherever_they_are_said():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version, (author,) = project["version"], project["authors"]
+    text = README.read_text(encoding="utf-8")
+    assert f"{author['name']}, *rigidmd" in text
+    assert f"{{{{{author['name']}}}}}" in text
+    assert f"version {version}," in text
+    assert f"version = {{{version}}}" in text
+    assert f"\n## {version}" in (DOCS / "changelog.md").read_text(encoding="utf-8")
+
+
+def test_help_lists_and_prints_the_chapters(capsys):
+    assert {path.stem for path in DOCS.glob("*.md")} == set(CHAPTERS)
+    assert cli.main(["help"]) == 0
+    listed = capsys.readouterr().out
+    for name in CHAPTERS:
+        source = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+        about = source.splitlines()[2]
+        assert about.endswith(".")
+        assert len(about) <= 120
+        assert re.search(rf"^  {name} +{re.escape(about)}$", listed, re.MULTILINE)
+        assert cli.main(["help", name]) == 0
+        said = capsys.readouterr().out
+        assert said.startswith(source.splitlines()[0])
+        assert "<!--" not in said
+        assert "![" not in said
+        with contextlib.suppress(StopIteration):
+            code = next(block for block in blocks_of(DOCS / f"{name}.md") if block.language == "sh")
+            assert code.text in said
+    cli.main(["help", "top"])
+    assert "[picture: seven heavy tops, tests/benchmarks/results/seven_tops.png]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "expected"), [("manuel", "did you mean manual?"), ("qqq", "there are top, water")])
+def test_a_chapter_that_is_not_there(name, expected, capsys):
+    assert cli.main(["help", name]) == 2
+    assert expected in capsys.readouterr().err
