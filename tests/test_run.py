@@ -153,8 +153,8 @@ def test_log_and_summary(tmp_path):
     energy, n, time = results["energy"], 20, results["time"]
     gradient = np.polyfit(time, energy, 1)[0]
     stage = summary["stages"][0]
-    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / 100 / n, rel=1e-6, abs=1e-9)
-    thermal = 0.83144626 * stage["temperature_K"] * 117
+    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / n, rel=1e-6, abs=1e-9)
+    thermal = 0.0083144626 * stage["temperature_K"] * 117
     assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(gradient * 1000 / thermal, rel=1e-6, abs=1e-9)
 
 

@@ -3,13 +3,18 @@
 import os
 import re
 import tomllib
+from html import escape
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, PrivateAttr, ValidationError
 
 from rigidmd.errors import SceneError
 from rigidmd.validation import Section, faults_of
+
+if TYPE_CHECKING:
+    from rigidmd.scene.body import BodyScene
+    from rigidmd.scene.molecules import MolecularScene
 
 
 class Scene(Section):
@@ -23,6 +28,17 @@ class Scene(Section):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.in_short}>"
+
+    def _repr_html_(self) -> str:
+        return escape(self.in_short)
+
+    @property
+    def in_short(self) -> str:
+        """What it is, in a line."""
+        return self.name
 
     @property
     def source(self) -> str:
@@ -49,7 +65,7 @@ class Scene(Section):
         return []
 
     @classmethod
-    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "Scene":
+    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
 
         Files named in the scene must lie in its folder or below; files named in `overrides` may be anywhere, and are
@@ -74,7 +90,7 @@ class Scene(Section):
         overrides: dict[str, Any] | None = None,
         source: str = "scene",
         text: str = "",
-    ) -> "Scene":
+    ) -> "MolecularScene | BodyScene":
         """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault."""
         folder = Path(folder)
         if cls is Scene:
