@@ -397,7 +397,7 @@ class Simulation(object if TYPE_CHECKING else ABC):
                     self._show(observers, Moment(self, 0, 0.0, 0), [True] * len(observers))
                 checked, patience = 0, self._patience(k)
                 intervals = [max(1, round(observer.interval / phase.dt)) for observer in observers]
-                seconds, done = 0.0, 0
+                seconds, done, sampled = 0.0, 0, True
                 while done < phase.steps and not self._interrupted:
                     ahead = [interval - (phase.counted + done) % interval for interval in intervals]
                     to = min(phase.steps, done + min(ahead), checked + patience)
@@ -413,8 +413,10 @@ class Simulation(object if TYPE_CHECKING else ABC):
                         checked = done
                     last = done == phase.steps or self._interrupted
                     due = [(phase.counted + done) % interval == 0 for interval in intervals]
-                    due[0] = due[0] or last
+                    due[0] = sampled = due[0] or last
                     self._show(observers, Moment(self, step + done, time + done * phase.dt, k), due)
+                if not sampled:  # the signal came while observers looked
+                    self._show(observers[:1], Moment(self, step + done, time + done * phase.dt, k), [True])
                 computing.append(seconds)
                 step, time = step + done, time + done * phase.dt
                 if self._interrupted:
