@@ -8,13 +8,20 @@ print(results["temperature"].mean(), results.universe())
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-__all__ = ["Every", "Results", "Scene", "Simulation"]
+if TYPE_CHECKING:
+    from rigidmd.scene import BodyScene, MolecularScene, Scene
+    from rigidmd.simulation import Every, Moment, Results, Simulation
 
-_HOMES = {"Scene": "scene", "Simulation": "simulation", "Results": "simulation", "Every": "simulation"}
+    __version__: str
+
+__all__ = ["BodyScene", "Every", "MolecularScene", "Moment", "Results", "Scene", "Simulation"]
+
+_HOMES = {name: "scene" if name.endswith("Scene") else "simulation" for name in __all__}
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> object:
     # Loaded when asked for, so that `rigidmd --help` need not wait for Numba and MDAnalysis.
     if name == "__version__":
         from importlib.metadata import version

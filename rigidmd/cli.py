@@ -6,7 +6,9 @@ import shlex
 import sys
 from pathlib import Path
 
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+#: A command that a signal ended exits with this more than the signal's number: 130 of Ctrl-C, 143 of SIGTERM.
+BY_SIGNAL = 128
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -20,7 +22,7 @@ EXAMPLES = """examples:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; the exit code: 0 done, 1 a run that failed, 2 bad input, 130 interrupted."""
+    """Run one command; the exit code: 0 done, 1 a run that failed, 2 bad input, 130 or 143 ended by a signal."""
     from rigidmd.errors import RigidMDError, SimulationError
 
     options = _parser().parse_args(arguments)
@@ -237,17 +239,16 @@ def _run(options: argparse.Namespace) -> int:
     from rigidmd.simulation import Simulation
 
     simulation = Simulation(scene, folder, options.force, say=_say, warn=_warn)
-    print(simulation.introduction())
+    print(simulation.introduction(), flush=True)
     results = simulation.run(progress=True)
     print(simulation.conclusion(results))
     print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
-    return INTERRUPTED if results.interrupted else 0
+    return BY_SIGNAL + results.signal if results.signal else 0
 
 
 def _say(sentence: str) -> None:
-    """On a terminal only: what takes a moment."""
-    if sys.stderr.isatty():
-        print(f"  {sentence} ...", file=sys.stderr)
+    """What takes a moment."""
+    print(f"  {sentence} ...", file=sys.stderr, flush=True)
 
 
 def _warn(sentence: str) -> None:

@@ -102,8 +102,15 @@ def test_trajectories_show_the_body(name, tmp_path):
             assert frame.velocities.mean(axis=0) == pytest.approx(speed, abs=1e-3)
         if name not in ("t.xyz", "t.pdb"):
             assert frame.time == pytest.approx(0.01 * k, abs=1e-6)
-    in_memory = Simulation(scene).run().universe()
-    assert len(in_memory.trajectory) == 6
+    for universe in (results.universe(), Simulation(scene).run().universe()):  # a second as a picosecond
+        trajectory = universe.trajectory
+        assert [frame.time for frame in trajectory] == results["t"].tolist()
+        assert (trajectory.dt, trajectory.totaltime) == (results["t"][1], results["t"][-1])
+        speed = np.diff(trajectory.timeseries(order="fac").mean(axis=1), axis=0) / trajectory.dt
+        known = np.stack([results[k] for k in ("vx", "vy", "vz")], axis=-1) * 50
+        assert speed == pytest.approx(
+            (known[1:] + known[:-1]) / 2, abs=1.0 if name == "trajectory.xtc" else 0.2
+        )  # of some 20 Å/ps
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)

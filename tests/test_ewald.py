@@ -716,7 +716,7 @@ def nve(model, timestep, duration):
 def conserved(rows):
     """Times (ps) and conserved energy (kJ/mol per molecule) of the last stage."""
     rows = [row for row in rows if row.stage == 1]
-    return np.array([row.time for row in rows]), np.array([row.conserved for row in rows]) / 216 / KJ_PER_MOL
+    return np.array([row.time for row in rows]), np.array([row.conserved for row in rows]) / 216
 
 
 @pytest.mark.parametrize("model", ["spce", "tip4p2005"])
@@ -783,7 +783,7 @@ def test_liquid_spce_is_the_published_one():
     }
     pairs = Every(1.0, lambda moment: sampled.append(moment.site_positions[::3]))
     rows = Simulation(Scene.from_dict(data), observers=[pairs]).run().samples.rows
-    energy = np.array([row.potential for row in rows if row.time > 30]) / 512 / KJ_PER_MOL
+    energy = np.array([row.potential for row in rows if row.time > 30]) / 512
     blocks = energy[: len(energy) // 10 * 10].reshape(10, -1).mean(axis=1)
     error = blocks.std(ddof=1) / np.sqrt(10)
     assert error < 0.05

@@ -19,7 +19,8 @@ from rigidmd.build.system import build
 from rigidmd.cli import main
 from rigidmd.core.state import State
 from rigidmd.dynamics.engine import Engine
-from rigidmd.errors import SceneError
+from rigidmd.errors import SceneError, SimulationError
+from rigidmd.output import progress
 from rigidmd.output.log import COLUMNS
 from rigidmd.output.report import summary_text
 from rigidmd.scene import Scene
@@ -103,8 +104,8 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
     exact = {".xtc": 6e-3, ".pdb": 6e-4, ".xyz": 6e-5}.get(name[1:], 1e-4)
     for frame, (moment, positions, velocities) in zip(universe.trajectory, seen, strict=True):
         assert frame.positions == pytest.approx(positions, abs=exact)
-        if name[1:] not in (".xyz", ".pdb"):  # those say the time in their own words, tested below
-            assert frame.time == pytest.approx(moment, abs=1e-5)
+        assert frame.time == moment
+        assert frame.dt == 0.01
         if name != "t.xyz":
             assert frame.dimensions == pytest.approx([*lengths, *angles], abs=2e-3)
         assert frame.has_velocities == (name in ("t.trr", "t.nc"))
@@ -119,6 +120,13 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
         assert frames[2].info["Time"] == pytest.approx(0.02)
     if name == "t.pdb":
         assert b"TIME 0.020000 PS" in text
+    trajectory = universe.trajectory
+    assert (trajectory.dt, trajectory.totaltime, trajectory[3].time) == (0.01, 0.04, seen[3][0])
+    copy = universe.copy().trajectory
+    assert [frame.time for frame in copy[::2]] == [moment for moment, _, _ in seen[::2]]
+    if name[1:] not in (".xyz", ".pdb"):  # what MDAnalysis reads from the file alone
+        alone = mda.Universe(str(tmp_path / "out" / topology), str(tmp_path / "out" / name)).trajectory
+        assert [frame.time for frame in alone] == pytest.approx([moment for moment, _, _ in seen], abs=1e-5)
     assert list(universe.atoms.names[:4]) == ["OW", "HW1", "HW2", "MW"]
     assert universe.residues.n_residues == 10
 
@@ -157,8 +165,8 @@ def test_log_and_summary(tmp_path):
     energy, n, time = results["energy"], 20, results["time"]
     gradient = np.polyfit(time, energy, 1)[0]
     stage = summary["stages"][0]
-    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / 100 / n, rel=1e-6, abs=1e-9)
-    thermal = 0.83144626 * stage["temperature_K"] * 117
+    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / n, rel=1e-6, abs=1e-9)
+    thermal = 0.0083144626 * stage["temperature_K"] * 117
     assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(gradient * 1000 / thermal, rel=1e-6, abs=1e-9)
 
 
@@ -185,8 +193,52 @@ def test_a_simulation_runs_twice_alike_and_keeps_true_times():
     second = simulation.run()
     for a, b, c in zip(first.state, kept, second.state, strict=True):
         assert a.tobytes() == b.tobytes() == c.tobytes()
-    times = [frame.time for frame in first.universe().trajectory]
+    with pytest.warns(UserWarning, match=r"not evenly spaced \(0.02 to 0.021 ps\)"):
+        trajectory = first.universe().trajectory
+    times = [frame.time for frame in trajectory]
     assert times == pytest.approx([0, 0.02, 0.04, 0.06, 0.081, 0.102])  # 20 fs are seven steps of 3 fs
+    assert trajectory.dt == pytest.approx(0.02)
+    assert trajectory.totaltime == pytest.approx(0.102)
+
+
+def free_flight(name, folder):
+    """Two argon atoms far apart in a large box, which cross its sides."""
+    scene = small_scene(
+        {"argon": 2}, 60.0, stages=[{"duration_ps": 20.0, "timestep_fs": 10.0}], start={"temperature_K": 3000.0},
+        forces={"cutoff_A": 6.0}, output={"trajectory": name, "trajectory_interval_ps": 0.1, "log_interval_ps": 10.0},
+    )  # fmt: skip
+    return Simulation(scene, folder).run()
+
+
+@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.dcd", "t.nc", "t.xyz", "t.pdb", "memory"])
+def test_displacements_over_time_are_speeds(name, tmp_path):
+    """What a diffusion coefficient rests on: times of frames, and positions that do not jump at the sides of the box."""
+    results = free_flight(*(("t.xtc", None) if name == "memory" else (name, tmp_path / "out")))
+    universe = results.universe()
+    path = universe.trajectory.timeseries(order="fac")
+    speed = np.diff(path, axis=0) / universe.trajectory.dt
+    assert np.abs(path).max() > 60
+    assert speed == pytest.approx(np.broadcast_to(results.state.velocity, speed.shape), abs=0.2)  # of some 10 Å/ps
+    assert universe.trajectory.dt == pytest.approx(0.1)
+    assert universe.trajectory.totaltime == pytest.approx(20)
+    assert results.summary["positions"] == "unwrapped"
+    assert "unwrapped: frames hold molecules where they travelled to" in summary_text(results.summary)
+
+
+def test_the_summary_says_when_positions_are_wrapped():
+    scene = small_scene({"argon": 20}, 20.0, output={"positions": "wrapped"})
+    assert "displacements need unwrapped ones" in summary_text(Simulation(scene).run().summary)
+    for without in ({"output": {"trajectory": False}}, {"box": {"lengths_A": 20.0, "periodic": False}}):
+        assert "positions" not in summary_text(Simulation(small_scene({"argon": 20}, 20.0, **without)).run().summary)
+
+
+def test_a_format_too_narrow_for_a_long_way_is_told(tmp_path):
+    scene = small_scene({"argon": 2}, 60.0, output={"trajectory": "t.pdb", "trajectory_interval_ps": 0.002})
+    simulation = Simulation(scene, tmp_path / "out")
+    simulation.system.state.velocity[:] = [[-1e6, 0, 0], [1e6, 0, 0]]
+    simulation.system.from_lattice = False
+    with pytest.raises(SimulationError, match=r"beyond the -999.99 Å that .pdb can hold: use .trr or .nc, output.pos"):
+        simulation.run()
 
 
 def test_the_topology_is_the_first_frame_relief_included(tmp_path):
@@ -333,16 +385,60 @@ def frames_in(folder):
     return sum(1 for _ in universe.trajectory)
 
 
-def test_ctrl_c_stops_with_a_summary_and_130(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
+    """Ctrl-C, and what a batch system sends when time is up: maybe more than once."""
     process, folder = running(tmp_path, 3)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
+    if number == signal.SIGTERM:
+        process.send_signal(number)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == code
     assert "interrupted" in out
     assert "Traceback" not in err
+    assert "compiling" in err  # said though this is no terminal
     assert json.loads((folder / "summary.json").read_text())["interrupted"]
     assert (folder / "final.npz").exists()
     assert frames_in(folder) >= 1
+
+
+def test_a_signal_of_the_program_s_own_is_left_to_it():
+    caught = []
+
+    def kill(moment):
+        if moment.step == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stages = [{"duration_ps": 0.02}]
+    before = signal.signal(signal.SIGTERM, lambda number, frame: caught.append(number))
+    try:
+        results = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, kill)]).run()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert caught == [signal.SIGTERM]
+    assert not results.interrupted
+    results = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, kill)]).run()
+    assert (results.interrupted, results.signal, results["step"][-1]) == (True, signal.SIGTERM, 4)
+    assert results["time"][-1] == results.state.time[0]
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_off_a_terminal_lines_say_how_far_it_is(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
+
+    def wait(moment):
+        now[0] += 20.0
+
+    stages = [{"duration_ps": 0.02}]
+    simulation = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, wait)])
+    simulation.run(progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    # of ten steps at 20 s each (one more before them): a line every 40 s
+    assert lines[0] == "  0.004 of 0.02 ps, 0.0001 ps/s, 02:40 left"
+    assert len(lines) == 5
+    simulation.run()
+    assert capsys.readouterr().err == ""
 
 
 def test_a_killed_run_leaves_a_readable_log_and_trajectory(tmp_path):

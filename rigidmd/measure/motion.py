@@ -10,6 +10,7 @@ from rigidmd.core.state import WORK, State
 from rigidmd.forces.fields import Drive, SteadyForce, Told
 from rigidmd.forces.frame import Inertial
 from rigidmd.forces.resistance import NoResistance
+from rigidmd.measure.columns import BODY, BODY_COLUMNS, MATRIX, Column
 from rigidmd.mechanics.course import is_steady
 from rigidmd.mechanics.flight import Immersed, inertial_masses
 from rigidmd.mechanics.rotation import direction, to_euler_angles, to_quaternion
@@ -27,9 +28,10 @@ class Snapshot(NamedTuple):
 class Motion:
     """The samples of a run, by column.
 
-    columns : arrays (t,), SI units, by the names in motion.csv. Position, velocity, attitude and omega are relative to
-        the frame; L is the angular momentum relative to axes that do not turn, that of wheels (h) included, along the
-        frame's (lab) or body's axes; the kinetic energy is that of I omega, without that of wheels about their axes
+    columns : arrays (t,), in SI units, by the names in motion.csv; `described` says what they are. Position, velocity,
+        attitude and omega are relative to the frame; L is the angular momentum relative to axes that do not turn, that
+        of wheels (h) included, along the frame's (lab) or body's axes; the kinetic energy is that of I omega, without
+        that of wheels about their axes
     invariants : what should stay constant; column NAME_error is its error since the start, energies relative to the
         largest kinetic energy, L to the largest |L|
     """
@@ -37,11 +39,24 @@ class Motion:
     columns: dict[str, np.ndarray]
     invariants: list[str]
 
+    def __len__(self) -> int:
+        return len(self.columns.get("t", ()))
+
     def __getitem__(self, column: str) -> np.ndarray:
-        """A column as an array (t,)."""
-        if column not in self.columns:
-            raise KeyError(f"no column {column!r}; there are {', '.join(self.columns)}")
+        """A column as an array (t,) in SI units; "Q", of a body that turns, as matrices (t, 3, 3)."""
+        if column not in self.described:
+            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
+        if column == MATRIX:
+            return np.stack([self.columns[name] for name in BODY["rotation"].names], axis=-1).reshape(-1, 3, 3)
         return self.columns[column]
+
+    @property
+    def described(self) -> dict[str, Column]:
+        """What there is, by name."""
+        found = {name: BODY_COLUMNS[name] for name in self.columns}
+        if BODY["rotation"].names[0] in found:
+            found[MATRIX] = Column("", "1", "the rotation matrices (n, 3, 3): lab = Q body")
+        return found
 
 
 def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
@@ -49,7 +64,7 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     times = np.array([s.time for s in snapshots])
     states = State(*(np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields))))
     position, velocity, rotation, omega = system.motion(times, states)
-    columns = {"t": times} | _vector(("x", "y", "z"), position) | _vector(("vx", "vy", "vz"), velocity)
+    columns = {"t": times} | _columns("position", position) | _columns("velocity", velocity)
     if system.turns:
         columns |= _rotation_columns(system, times, states, rotation, omega)
     columns |= energies(system, times, states)
@@ -61,8 +76,9 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     return Motion(columns, list(errors))
 
 
-def _vector(names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip(names, values.T, strict=True))
+def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of a family, by their names, from values (t, n)."""
+    return dict(zip(BODY[family].names, values.T, strict=True))
 
 
 def _rotation_columns(
@@ -70,14 +86,14 @@ def _rotation_columns(
 ) -> dict[str, np.ndarray]:
     n = len(rotation)
     momentum = states.angular_momentum_body.reshape(n, 3) @ system.axes.T
-    columns = {f"q{i + 1}{j + 1}": rotation[:, i, j] for i in range(3) for j in range(3)}
-    columns |= _vector(("qw", "qx", "qy", "qz"), _continuous(to_quaternion(rotation)))
-    columns |= _vector(("phi", "theta", "psi"), to_euler_angles(rotation))
+    columns = _columns("rotation", rotation.reshape(n, 9))
+    columns |= _columns("quaternion", _continuous(to_quaternion(rotation)))
+    columns |= _columns("euler_angles", to_euler_angles(rotation))
     if isinstance(system.body.rotor, DrivenRotor):
-        columns |= _vector(("h_body_1", "h_body_2", "h_body_3"), system.moments(times)[1] @ system.axes.T)
+        columns |= _columns("h_body", system.moments(times)[1] @ system.axes.T)
     for name, body in (("omega", omega), ("L", momentum)):
-        columns |= _vector(tuple(f"{name}_body_{k}" for k in (1, 2, 3)), body)
-        columns |= _vector(tuple(f"{name}_lab_{k}" for k in "xyz"), np.einsum("tij,tj->ti", rotation, body))
+        columns |= _columns(f"{name}_body", body)
+        columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
     return columns
 
 

@@ -9,7 +9,29 @@ from rigidmd.build.system import System
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.engine import Engine
 from rigidmd.mechanics.rotation import orthogonality_error
-from rigidmd.units import BAR, BOLTZMANN
+from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
+
+
+class Reading(NamedTuple):
+    """What can be measured of molecules at one moment, in the units of the log. NaN where there is no such thing."""
+
+    components: dict[str, float]  # potential energy by term and constant, kJ/mol
+    potential: float  # their sum, kJ/mol
+    kinetic_translation: float  # kJ/mol
+    kinetic_rotation: float
+    kinetic: float  # both
+    energy: float  # potential and kinetic
+    temperature: float  # K
+    temperature_translation: float
+    temperature_rotation: float
+    temperature_translation_unbiased: float  # see `observe`; NaN with any integrator but velocity Verlet
+    temperature_rotation_unbiased: float
+    pressure_bar: float  # molecular, tail correction included; NaN without a box
+    virial: np.ndarray  # (3, 3) molecular, without the tail correction, kJ/mol
+    momentum: np.ndarray  # (3,) u Å/ps
+    force: np.ndarray  # (n, 3) on each molecule, lab frame, kJ/mol/Å
+    torque_body: np.ndarray  # (n, 3) on each molecule, body frame, kJ/mol; (0, 3) of points
+    orthogonality: float  # largest entry of |QᵀQ - 1|
 
 
 class Observation(NamedTuple):
@@ -48,6 +70,21 @@ class Observation(NamedTuple):
     def pressure_bar(self) -> float:
         """Molecular pressure in bar; NaN without a box."""
         return self.pressure / BAR
+
+    @property
+    def reading(self) -> Reading:
+        """The same in the units of the log."""
+        of_energy = ("potential", "kinetic_translation", "kinetic_rotation", "kinetic", "energy", "virial")
+        own = {name: getattr(self, name) for name in Reading._fields if hasattr(self, name)}
+        return Reading(
+            **own
+            | {name: own[name] / KJ_PER_MOL for name in of_energy}
+            | {
+                "components": {name: energy / KJ_PER_MOL for name, energy in self.components.items()},
+                "force": self.load.force / KJ_PER_MOL,
+                "torque_body": self.load.torque_body / KJ_PER_MOL,
+            }
+        )
 
     @property
     def largest_force(self) -> tuple[float, int]:

@@ -1,31 +1,44 @@
-"""Samples: one line an observation, kept as rows and asked for as columns."""
+"""Samples of a run of molecules: one line an observation, kept as rows and asked for as columns."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
+from rigidmd.measure.columns import Column
+
 
 class Sample(NamedTuple):
-    """One line of the log, in internal units."""
+    """One line of the log, in its units. What is not there is NaN: pressure without a box, T_rot of points."""
 
-    step: int
-    time: float  # ps
-    stage: int
-    stage_name: str
-    potential: float  # u Å²/ps²
-    kinetic: float
-    energy: float
-    temperature: float  # K
-    temperature_translation: float
-    temperature_rotation: float
-    temperature_translation_unbiased: float  # NaN with any integrator but velocity Verlet
-    temperature_rotation_unbiased: float
-    pressure_bar: float
-    conserved: float  # energy less heat of the thermostat, with what went with the total momentum, u Å²/ps²
-    drift: float  # of the conserved energy since the stage began, u Å²/ps²
-    momentum: float  # |P|, u Å/ps
-    orthogonality: float
+    step: Annotated[int, Column("Step", "1", "steps since the start")]
+    time: Annotated[float, Column("Time (ps)", "ps", "time since the start")]
+    potential: Annotated[float, Column("Potential Energy (kJ/mole)", "kJ/mol", "potential energy of the whole system")]
+    kinetic: Annotated[float, Column("Kinetic Energy (kJ/mole)", "kJ/mol", "kinetic energy, translation and rotation")]
+    energy: Annotated[float, Column("Total Energy (kJ/mole)", "kJ/mol", "potential and kinetic energy")]
+    temperature: Annotated[float, Column("Temperature (K)", "K", "temperature of all motion")]
+    volume: Annotated[float, Column("Box Volume (nm^3)", "nm³", "volume of the box")]
+    density: Annotated[float, Column("Density (g/mL)", "g/cm³", "mass density")]
+    stage_name: Annotated[str, Column("Stage", "", "name of the stage")]
+    temperature_translation: Annotated[float, Column("T_trans (K)", "K", "temperature of translation")]
+    temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
+    temperature_translation_unbiased: Annotated[
+        float, Column("T_trans unbiased (K)", "K", "T_trans without the error of the step (velocity Verlet only)")
+    ]
+    temperature_rotation_unbiased: Annotated[
+        float, Column("T_rot unbiased (K)", "K", "T_rot without the error of the step (velocity Verlet only)")
+    ]
+    pressure_bar: Annotated[float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")]
+    drift: Annotated[float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")]
+    momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]
+    orthogonality: Annotated[float, Column("Orthogonality error", "1", "largest entry of |QᵀQ - 1|")]
+    conserved: Annotated[float, Column("", "kJ/mol", "energy less what thermostat and removal of momentum have put in")]
+    stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
+
+
+COLUMNS: dict[str, Column] = {
+    name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items()
+}
 
 
 @dataclass
@@ -34,8 +47,16 @@ class Samples:
 
     rows: list[Sample] = field(default_factory=list)
 
+    def __len__(self) -> int:
+        return len(self.rows)
+
     def __getitem__(self, column: str) -> np.ndarray:
-        """A column as an array (rows,), by the name of a field of `Sample`."""
-        if column not in Sample._fields:
-            raise KeyError(f"no column {column!r}; there are {', '.join(Sample._fields)}")
+        """A column as an array (rows,), by the name of a field of `Sample`, in the unit of the log."""
+        if column not in COLUMNS:
+            raise KeyError(f"no column {column!r}; there are {', '.join(COLUMNS)}")
         return np.array([getattr(row, column) for row in self.rows])
+
+    @property
+    def described(self) -> dict[str, Column]:
+        """What there is, by name."""
+        return COLUMNS

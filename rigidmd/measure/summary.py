@@ -67,6 +67,7 @@ def summarise(
         "box_A": list(system.space) if system.density else None,
         "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
+        "positions": scene.output.positions if scene.output.trajectory and system.density else None,
         "relief_steps": relief.steps if relief else 0,
         "preparing_s": preparing,
         "wall_s": wall,
@@ -124,8 +125,8 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
     mean_t, error_t = mean([s.temperature for s in own])
     kinetic = np.array([s.kinetic for s in own])
     spread = float(kinetic.std())
-    per_molecule = line.value * 1000 / KJ_PER_MOL / n
-    thermal = BOLTZMANN * (mean_t or 0.0) * system.freedom.total
+    per_molecule = line.value * 1000 / n
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom.total
     per_kt = line.value * 1000 / thermal if thermal > 0 else None
     error_kt = line.error * 1000 / thermal if thermal > 0 else None
     return {
@@ -144,17 +145,17 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
         "temperature_rotation_K": mean([s.temperature_rotation for s in own])[0],
         "temperature_translation_unbiased_K": mean([s.temperature_translation_unbiased for s in own])[0],
         "temperature_rotation_unbiased_K": mean([s.temperature_rotation_unbiased for s in own])[0],
-        "potential_kJ_mol_per_molecule": float(np.mean([s.potential for s in own])) / KJ_PER_MOL / n,
+        "potential_kJ_mol_per_molecule": float(np.mean([s.potential for s in own])) / n,
         "pressure_bar": mean([s.pressure_bar for s in own])[0],
         "pressure_error_bar": mean([s.pressure_bar for s in own])[1],
         "drift_kJ_mol_ns_per_molecule": _known(per_molecule),
-        "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / KJ_PER_MOL / n),
+        "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / n),
         "drift_kT_ns_per_degree_of_freedom": per_kt and _known(per_kt),
         "drift_error_kT_ns_per_degree_of_freedom": error_kt and _known(error_kt),
         "drift_over_kinetic_std": _known(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread)
         if spread
         else None,
-        "energy_rms_kJ_mol_per_molecule": _known(line.rms / KJ_PER_MOL / n),
+        "energy_rms_kJ_mol_per_molecule": _known(line.rms / n),
     }
 
 

@@ -64,7 +64,7 @@ def patience(system: System) -> int:
 
 
 def thermal_energy(system: System, kinetic: float) -> float:
-    """kT of this kinetic energy, or the deepest well where that is more: the scale of momenta, u Å²/ps²."""
+    """kT of this kinetic energy (u Å²/ps²), or the deepest well where that is more: the scale of momenta, u Å²/ps²."""
     wells = max((m.epsilon.max() for m in system.species), default=0.0)
     return max(2 * kinetic / max(system.freedom.total, 1), wells)
 
@@ -129,13 +129,13 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     stage, share = system.scene.stages[now.stage], 1.0
     kinetic = since.kinetic
     if stage.ensemble == "nvt":
-        kinetic = max(kinetic, 0.5 * BOLTZMANN * stage.temperature_K * system.freedom.total)
+        kinetic = max(kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * stage.temperature_K * system.freedom.total)
         share = min(1.0, stage.thermostat_time_ps / (now.time - since.time)) if now.time > since.time else 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
     if abs(drift) * share <= limits.energy * scale:
         return None
-    n = len(system.model.species) * KJ_PER_MOL
+    n = len(system.model.species)
     return Finding(
         f"the conserved energy changed by {drift / n:.3g} kJ/mol per molecule in {now.time - since.time:g} ps, "
         f"{abs(drift) * share / scale if scale else inf:.3g} kinetic energies (watch.energy = {limits.energy:g})"

@@ -9,9 +9,13 @@ import numpy as np
 from rigidmd.build.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
-from rigidmd.units import KJ_PER_MOL
 
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
+
+POSITIONS = {
+    "unwrapped": "frames hold molecules where they travelled to",
+    "wrapped": "frames hold molecules back in the box; displacements need unwrapped ones",
+}
 
 
 def write_summary(path: Path, summary: dict) -> None:
@@ -44,6 +48,8 @@ def summary_text(summary: dict) -> str:
             f"  {'':<16}taken out every {removed['interval_ps']:g} ps, {removed['times']} times, at most "
             f"{removed['largest_u_A_ps']:.1e} u Å/ps; {removed['energy_kJ_mol']:.1e} kJ/mol in all"
         )
+    if summary["positions"]:
+        lines.append(f"  {'positions':<16}{summary['positions']}: {POSITIONS[summary['positions']]}")
     lines += [f"\n  note: {note}" for note in summary["notes"]]
     if summary["interrupted"]:
         lines += ["", "  interrupted: the figures are those so far"]
@@ -126,24 +132,23 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
 
     stages = system.scene.stages
     n = len(system.model.species)
-    scale = KJ_PER_MOL * n
     time, stage = samples["time"], samples["stage"]
     figure = Figure(figsize=(8, 7), layout="constrained")
     drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
     own = stage == stage[-1]
-    drift.plot(time[own], samples["drift"][own] / scale, color=COOL, lw=0.9)
+    drift.plot(time[own], samples["drift"][own] / n, color=COOL, lw=0.9)
     last = summary["stages"][-1]
     if own.sum() > 2 and last["drift_kJ_mol_ns_per_molecule"] is not None:
         gradient, error = last["drift_kJ_mol_ns_per_molecule"], last["drift_error_kJ_mol_ns_per_molecule"]
-        fitted = (samples["drift"][own] / scale).mean() + gradient / 1000 * (time[own] - time[own].mean())
+        fitted = (samples["drift"][own] / n).mean() + gradient / 1000 * (time[own] - time[own].mean())
         drift.plot(time[own], fitted, color=WARM, lw=1.4)
         drift.set_title(
             f"{last['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
-    parts.plot(time, (samples["potential"] - samples["potential"][-1]) / scale, color=COOL, lw=0.9, label="potential")
-    parts.plot(time, (samples["kinetic"] - samples["kinetic"][-1]) / scale, color=WARM, lw=0.9, label="kinetic")
+    parts.plot(time, (samples["potential"] - samples["potential"][-1]) / n, color=COOL, lw=0.9, label="potential")
+    parts.plot(time, (samples["kinetic"] - samples["kinetic"][-1]) / n, color=WARM, lw=0.9, label="kinetic")
     parts.set_ylabel("less its last value\n(kJ/mol per molecule)")
     for column, color, label in (
         ("temperature_translation", COOL, "translation"),

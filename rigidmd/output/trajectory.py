@@ -8,7 +8,13 @@ from pathlib import Path
 
 import MDAnalysis as mda
 import numpy as np
+from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.coordinates.memory import MemoryReader
+from MDAnalysis.coordinates.PDB import PDBReader
+from MDAnalysis.coordinates.TRJ import NCDFReader
+from MDAnalysis.coordinates.TRR import TRRReader
+from MDAnalysis.coordinates.XTC import XTCReader
+from MDAnalysis.coordinates.XYZ import XYZReader
 
 from rigidmd.build.body import BodySystem
 from rigidmd.build.cells import angles_deg
@@ -18,7 +24,10 @@ from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.forces.space import cell_of
 
-LARGEST_IN_XTC = 2e7  # Å: whole thousandths of a nm in 32 bits
+#: Least and largest coordinate (Å) that a format holds: whole thousandths of a nm in 32 bits, columns of a text.
+LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
+#: Spacings of frames that differ by less than this part of the longest are even.
+EVEN = 1e-6
 
 
 def universe(system: System | BodySystem, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
@@ -66,35 +75,97 @@ def in_memory(system: System | BodySystem, times: list[float], positions: list[n
     """A Universe that holds frames (positions (s, 3) each) in memory, each with its own time (ps)."""
     u = universe(system, system.state)
     box = np.tile(dimensions(system), (len(times), 1)) if system.space.volume < inf else None
-    u.trajectory = _TimedFrames(np.array(positions), times, order="fac", dimensions=box)
+    u.trajectory = _TimedFrames(np.array(positions), times=_checked(times), order="fac", dimensions=box)
     return u
 
 
-class _TimedFrames(MemoryReader):
-    """Frames in memory that need not be evenly spaced, as those of MDAnalysis' own reader must."""
+def from_files(topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
+    """The Universe of a finished run's files, whose frames have these times (ps)."""
+    return mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
 
-    format = "RIGIDMD"
 
-    def __init__(self, positions: np.ndarray, times: list[float], **options):
+def _checked(times: list[float]) -> list[float]:
+    """The times, with a warning where one interval cannot tell them."""
+    gaps = np.diff(times)
+    if len(gaps) and np.ptp(gaps) > EVEN * gaps.max():
+        warnings.warn(
+            f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps): dt is that of the first two; "
+            "use the time of each frame (ts.time)",
+            stacklevel=4,
+        )
+    return times
+
+
+class _Timed:
+    """What makes a reader tell the times of the run (ps), evenly spaced or not, whatever its source holds of them."""
+
+    def __init__(self, *source, times: list[float], **options):
         self._times = times
-        super().__init__(positions, **options)
+        super().__init__(*source, times=times, **options)  # readers give all their options to copies
+        self._timed(self.ts)
 
-    def _read_next_timestep(self, ts=None):
-        frame = super()._read_next_timestep(ts)
+    @property
+    def totaltime(self) -> float:
+        """From the first frame to the last, ps."""
+        return self._times[-1] - self._times[0]
+
+    def _timed(self, frame):
         frame.time = self._times[frame.frame]
+        frame.dt = self._times[1] - self._times[0] if len(self._times) > 1 else 0.0
         return frame
 
+    def _read_frame(self, i):
+        return self._timed(super()._read_frame(i))
 
-def from_files(topology: Path, trajectory: Path) -> mda.Universe:
-    """The Universe of a finished run's files."""
-    return mda.Universe(str(topology), str(trajectory))
+    def _read_next_timestep(self, ts=None):
+        return self._timed(super()._read_next_timestep(ts))
+
+
+class _TimedFrames(_Timed, MemoryReader): ...
+
+
+class _TimedXTC(_Timed, XTCReader): ...
+
+
+class _TimedTRR(_Timed, TRRReader): ...
+
+
+class _TimedDCD(_Timed, DCDReader): ...
+
+
+class _TimedNCDF(_Timed, NCDFReader): ...
+
+
+class _TimedXYZ(_Timed, XYZReader): ...
+
+
+class _TimedPDB(_Timed, PDBReader): ...
+
+
+TIMED = {
+    ".xtc": _TimedXTC, ".trr": _TimedTRR, ".dcd": _TimedDCD, ".nc": _TimedNCDF, ".xyz": _TimedXYZ, ".pdb": _TimedPDB,
+}  # fmt: skip
 
 
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Names, molecules and first positions: what viewers open beside a trajectory."""
+    """Names, molecules and first positions: what viewers open beside a trajectory.
+
+    Raises SimulationError where the format cannot hold a position.
+    """
+    _check_fits(path, system.site_positions(state, wrapped))
     with whole_file(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a format cannot hold (occupancies, ...) is not ours to give
         universe(system, state, wrapped=wrapped).atoms.write(str(temporary))
+
+
+def _check_fits(path: Path, positions: np.ndarray) -> None:
+    least, largest = LIMITS.get(path.suffix, (-inf, inf))
+    for bound, beyond in ((least, positions.min() < least), (largest, positions.max() > largest)):
+        if beyond:
+            raise SimulationError(
+                f"a position is beyond the {bound:g} Å that {path.suffix} can hold: use .trr or .nc, "
+                "output.positions = 'wrapped', or of a body less output.trajectory_A_per_m"
+            )
 
 
 class TrajectoryFile:
@@ -112,16 +183,12 @@ class TrajectoryFile:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self._writer = mda.Writer(str(path), n_atoms=len(system.sites.name), **options.get(path.suffix, {}))
-        self._format = path.suffix
+        self._path, self._format = path, path.suffix
 
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
         set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
-        if self._format == ".xtc" and np.abs(self._universe.trajectory.ts.positions).max() > LARGEST_IN_XTC:
-            raise SimulationError(
-                f"a position is beyond the {LARGEST_IN_XTC:g} Å that .xtc can hold: use .trr or .nc, wrapped "
-                "positions, or less output.trajectory_A_per_m"
-            )
+        _check_fits(self._path, self._universe.trajectory.ts.positions)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if self._format == ".xyz":

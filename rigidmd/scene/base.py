@@ -4,13 +4,18 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable
+from html import escape
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, PrivateAttr, ValidationError
 
 from rigidmd.errors import SceneError
 from rigidmd.validation import Section, faults_of, meant, place, toml_fault
+
+if TYPE_CHECKING:
+    from rigidmd.scene.body import BodyScene
+    from rigidmd.scene.molecules import MolecularScene
 
 
 class Scene(Section):
@@ -24,6 +29,17 @@ class Scene(Section):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.in_short}>"
+
+    def _repr_html_(self) -> str:
+        return escape(self.in_short)
+
+    @property
+    def in_short(self) -> str:
+        """What it is, in a line."""
+        return self.name
 
     @property
     def source(self) -> str:
@@ -50,7 +66,7 @@ class Scene(Section):
         return []
 
     @classmethod
-    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "Scene":
+    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
 
         An override of None removes the key. Files named in the scene must lie in its folder or below; files named in
@@ -77,7 +93,7 @@ class Scene(Section):
         overrides: dict[str, Any] | None = None,
         source: str = "scene",
         text: str = "",
-    ) -> "Scene":
+    ) -> "MolecularScene | BodyScene":
         """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault."""
         folder = Path(folder)
         if cls is Scene:

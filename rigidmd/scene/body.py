@@ -358,6 +358,14 @@ class BodyScene(Scene):
     watch: BodyWatch = BodyWatch()
 
     @property
+    def in_short(self) -> str:
+        """Body, duration, steps."""
+        run = self.run
+        how = "" if run.is_open else f" in {run.steps} steps of {run.timestep_s:g} s"
+        pinned = ", pinned" if self.body.pinned else ""
+        return f"{self.name}: one body{pinned}; {run.duration_s:g} s{how}, {run.integrator}"
+
+    @property
     def interval(self) -> float:
         """Time between samples, s."""
         return self.output.interval_s or self.run.duration_s / 2000

@@ -184,6 +184,11 @@ class Molecules(Section):
             raise ValueError("a molecule of one's own needs a name")
         return self
 
+    @property
+    def label(self) -> str:
+        """Its name, or that of its model or file."""
+        return self.name or self.model or Path(self.file or "").stem
+
 
 def _spans(text: str) -> list[tuple[int, int]]:
     """First and last number of each part of "1-10, 15"."""
@@ -387,8 +392,9 @@ class Output(Section):
     """Time between frames"""
     topology: str = "topology.gro"
     """File with names and first positions that viewers need beside the trajectory (.gro or .pdb)"""
-    positions: Literal["wrapped", "unwrapped"] = "wrapped"
-    """wrapped: centres of mass inside the box; unwrapped: as they travelled. Molecules are whole in both"""
+    positions: Literal["wrapped", "unwrapped"] = "unwrapped"
+    """unwrapped: as molecules travelled, from which displacements follow; wrapped: centres of mass inside the box.
+    Molecules are whole in both"""
     velocities: Flag | None = None
     """Write velocities; where the format holds them when not given"""
     figure: Flag = True
@@ -443,6 +449,14 @@ class MolecularScene(Scene):
             return asked or None
         held = any(species.frozen for species in self.molecules)
         return REMOVE_MOMENTUM_EVERY if self.forces.electrostatics == "pme" and not held else None
+
+    @property
+    def in_short(self) -> str:
+        """Species, where they come from, stages."""
+        species = ", ".join(f"{entry.count or ''} {entry.label}".strip() for entry in self.molecules)
+        origin = "" if self.structure is None else f" of {self.structure.file}"
+        stages = ", ".join(f"{stage.label} {stage.duration_ps:g} ps" for stage in self.stages)
+        return f"{self.name}: {species}{origin}; {stages}"
 
     @property
     def inputs(self) -> dict[str, Path]:

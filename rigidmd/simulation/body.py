@@ -1,13 +1,14 @@
 """A single body: samples at even times, columns at the end, figures."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from math import ceil
+from typing import Any
 
 import numpy as np
 
-from rigidmd.build.body import Pose, build_body
+from rigidmd.build.body import BodySystem, Pose, build_body
 from rigidmd.core.state import NOW
 from rigidmd.errors import SimulationError
 from rigidmd.forces.frame import Inertial
@@ -34,11 +35,19 @@ class BodySimulation(Simulation):
 
     time_unit = "s"
 
+    scene: BodyScene
+    system: BodySystem
+
     def __init__(
-        self, scene: BodyScene, *arguments, applied: dict[str, Callable[[Pose], tuple]] | None = None, **options
+        self,
+        scene: BodyScene,
+        *arguments: Any,
+        applied: Mapping[str, Callable[[Pose], tuple]] | None = None,
+        **options: Any,
     ):
         super().__init__(scene, *arguments, **options)
         self._choice = None
+        applied = dict(applied or {})
         if scene.run.is_open:
             self._say("choosing integrator and step by pilot runs")
             self.scene, self._choice = decided_for_body(scene, applied)
@@ -47,8 +56,14 @@ class BodySimulation(Simulation):
         self._reset()
 
     def observe(self, moment: Moment) -> Pose:
-        """Position and motion in the body's own axes."""
+        """Position and motion in the body's own axes, in SI units."""
+        return moment._seen
+
+    def _look(self, moment: Moment) -> Pose:
         return self.system.pose(moment.time, moment.state)
+
+    def _no_samples(self) -> Motion:
+        return Motion({}, [])
 
     def _reset(self) -> None:
         self.engine = self.system.engine()
@@ -126,11 +141,10 @@ class BodySimulation(Simulation):
     def _writers(self, stack: contextlib.ExitStack, results: Results) -> list[Callable[[Moment], None]]:
         output = self.scene.output
         if self.folder is None:
-            times, frames = results._frames = ([], [])
 
             def keep(moment: Moment) -> None:
-                times.append(moment.time)
-                frames.append(moment.site_positions.astype("float32"))
+                results._times.append(moment.time)
+                results._frames.append(moment.site_positions.astype("float32"))
 
             return [keep] if output.trajectory else []
         from rigidmd.output.scene_file import write_body_scene
@@ -145,7 +159,12 @@ class BodySimulation(Simulation):
         file = TrajectoryFile(path, self.system, self.scene.interval, path.suffix in (".trr", ".nc"), False)
         stack.callback(file.close)
         results.files += [self.folder / output.topology, path]
-        return [lambda moment: file.write(moment.state, moment.time, moment.step)]
+
+        def write(moment: Moment) -> None:
+            file.write(moment.state, moment.time, moment.step)
+            results._times.append(moment.time)
+
+        return [write]
 
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
         results.samples = motion(self.system, self._snapshots)

@@ -4,13 +4,14 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from math import nan
+from typing import Any
 
 import numba
 import numpy as np
 
 from rigidmd.build.momenta import Removed
 from rigidmd.build.relief import Relief, relieve
-from rigidmd.build.system import build
+from rigidmd.build.system import System, build
 from rigidmd.core.schemes import Scheme
 from rigidmd.core.state import NOW, Load, State, state_of
 from rigidmd.core.state_file import write_state
@@ -20,7 +21,7 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.meanings import meanings
-from rigidmd.measure.observables import Observation, observe
+from rigidmd.measure.observables import Observation, Reading, observe
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.summary import summarise
@@ -29,7 +30,7 @@ from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import WITH_VELOCITIES
 from rigidmd.simulation.loop import Every, Moment, Phase, Results, Simulation
 from rigidmd.simulation.subjects import choose_for_molecules
-from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
 LAST_GOOD_STATE = "last_good_state.npz"
 
@@ -39,17 +40,26 @@ class MolecularSimulation(Simulation):
 
     time_unit = "ps"
 
-    def __init__(self, scene: MolecularScene, *arguments, **options):
+    scene: MolecularScene
+    system: System
+
+    def __init__(self, scene: MolecularScene, *arguments: Any, **options: Any):
         super().__init__(scene, *arguments, **options)
         self._built = build(scene)
         self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
         self._reset()
 
-    def observe(self, moment: Moment) -> Observation:
-        """Energies, temperatures, pressure."""
+    def observe(self, moment: Moment) -> Reading:
+        """Energies, temperatures, pressure, in the units of the log."""
+        return moment._seen.reading
+
+    def _look(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]
         step = stage.timestep_fs * FEMTOSECOND if stage.integrator == "velocity_verlet" else nan
         return observe(self.system, self.engine, self.state, step)
+
+    def _no_samples(self) -> Samples:
+        return Samples()
 
     def _reset(self) -> None:
         self.system = self._built  # a run may have decided what its scene leaves open
@@ -72,11 +82,11 @@ class MolecularSimulation(Simulation):
         self._built = replace(self._built, state=begun, from_lattice=False)
         self._reset()
 
-    def start(self) -> tuple[Observation, Relief | None]:
-        """The moment before the first step: what `run` starts from, measured, and the relief it took to get there."""
+    def start(self) -> Relief | None:
+        """Go to the moment before the first step, from which `run` starts; the relief it took to get there."""
         self._reset()
         self._prepare()
-        return observe(self.system, self.engine, self.state), self._relief
+        return self._relief
 
     def _prepare(self) -> None:
         """Compile, and move apart what a lattice put too close."""
@@ -197,7 +207,6 @@ class MolecularSimulation(Simulation):
                 self._removed.remove(self.system.model, self.state)
 
     def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
-        results.samples = Samples()
         log, writers = self._writers(stack, results)
         return [Every(self.scene.output.log_interval_ps, self._sampler(results.samples, log)), *writers]
 
@@ -206,38 +215,41 @@ class MolecularSimulation(Simulation):
         begins: dict[int, int] = {}  # of each stage, the row of the sample at which it began
 
         def sample(moment: Moment) -> None:
-            seen = moment.observation
-            conserved = seen.energy - float(self.state.books.sum())
+            seen: Reading = moment.observation
+            conserved = seen.energy - float(self.state.books.sum()) / KJ_PER_MOL
             begin = begins.setdefault(moment.stage, max(0, len(samples.rows) - 1))
             origin = samples.rows[begin].conserved if samples.rows else conserved
+            boxed = self.system.density > 0
             samples.rows.append(
                 Sample(
-                    moment.step,
-                    moment.time,
-                    moment.stage,
-                    self.scene.stages[moment.stage].label,
-                    seen.potential,
-                    seen.kinetic,
-                    seen.energy,
-                    seen.temperature,
-                    seen.temperature_translation,
-                    seen.temperature_rotation,
-                    seen.temperature_translation_unbiased,
-                    seen.temperature_rotation_unbiased,
-                    seen.pressure_bar,
-                    conserved,
-                    conserved - origin,
-                    float(np.linalg.norm(seen.momentum)),
-                    seen.orthogonality,
+                    step=moment.step,
+                    time=moment.time,
+                    potential=seen.potential,
+                    kinetic=seen.kinetic,
+                    energy=seen.energy,
+                    temperature=seen.temperature,
+                    volume=self.system.space.volume * 1e-3 if boxed else nan,
+                    density=self.system.density if boxed else nan,
+                    stage_name=self.scene.stages[moment.stage].label,
+                    temperature_translation=seen.temperature_translation,
+                    temperature_rotation=seen.temperature_rotation,
+                    temperature_translation_unbiased=seen.temperature_translation_unbiased,
+                    temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
+                    pressure_bar=seen.pressure_bar,
+                    drift=conserved - origin,
+                    momentum=float(np.linalg.norm(seen.momentum)),
+                    orthogonality=seen.orthogonality,
+                    conserved=conserved,
+                    stage=moment.stage,
                 )
             )
             log(samples.rows[-1])
-            self._check_sample(samples.rows, begin, seen.load)
+            self._check_sample(samples.rows, begin, moment._seen)
             self._last_good = (moment.step, moment.time, self.state.copy())
 
         return sample
 
-    def _check_sample(self, rows: list[Sample], begin: int, load: Load) -> None:
+    def _check_sample(self, rows: list[Sample], begin: int, seen: Observation) -> None:
         now = rows[-1]
         since = begin
         if self.scene.stages[now.stage].ensemble == "nvt":
@@ -245,11 +257,11 @@ class MolecularSimulation(Simulation):
             since = len(rows) - 1
             while since > begin and rows[since].time > now.time - memory:
                 since -= 1
-        self._thermal = self._thermal or watch.thermal_energy(self.system, now.kinetic)
-        self._check_step(now.stage, load)
+        self._thermal = self._thermal or watch.thermal_energy(self.system, seen.kinetic)
+        self._check_step(now.stage, seen.load)
         if finding := watch.sample_finding(self.system, self.scene.watch, rows[since], now):
             raise finding
-        self._thermal = watch.thermal_energy(self.system, now.kinetic)
+        self._thermal = watch.thermal_energy(self.system, seen.kinetic)
 
     def _check_step(self, k: int, load: Load) -> None:
         stage = self.scene.stages[k]
@@ -276,12 +288,10 @@ class MolecularSimulation(Simulation):
         output = self.scene.output
         wrapped = output.positions == "wrapped"
         if self.folder is None:
-            times, frames = [], []
-            results._frames = (times, frames)
 
             def keep(moment: Moment) -> None:
-                times.append(moment.time)
-                frames.append(self.system.site_positions(moment.state, wrapped).astype(np.float32))
+                results._times.append(moment.time)
+                results._frames.append(self.system.site_positions(moment.state, wrapped).astype(np.float32))
 
             return lambda sample: None, [Every(output.trajectory_interval_ps, keep)] if output.trajectory else []
         from rigidmd.output.log import Log
@@ -290,7 +300,7 @@ class MolecularSimulation(Simulation):
 
         write_scene(self.folder, self.scene, self.system)
         write_topology(self.folder / output.topology, self.system, self.state, wrapped)
-        log = Log(self.folder / "log.csv", self.system.space.volume, self.system.density)
+        log = Log(self.folder / "log.csv")
         stack.callback(log.close)
         results.files += [self.folder / name for name in (SCENE_FILE, output.topology, "log.csv")]
         writers = []
@@ -300,9 +310,12 @@ class MolecularSimulation(Simulation):
             file = TrajectoryFile(path, self.system, output.trajectory_interval_ps, velocities, wrapped)
             stack.callback(file.close)
             results.files.append(path)
-            writers.append(
-                Every(output.trajectory_interval_ps, lambda moment: file.write(moment.state, moment.time, moment.step))
-            )
+
+            def write(moment: Moment) -> None:
+                file.write(moment.state, moment.time, moment.step)
+                results._times.append(moment.time)
+
+            writers.append(Every(output.trajectory_interval_ps, write))
         return log.write, writers
 
     def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
@@ -360,7 +373,8 @@ class MolecularSimulation(Simulation):
 
         measure_accuracy : also how far Coulomb forces are from those of a longer Ewald sum
         """
-        seen, relief = self.start()
+        relief = self.start()
+        seen = observe(self.system, self.engine, self.state)
         force, molecule = seen.largest_force
         found = {
             "unit": unit,

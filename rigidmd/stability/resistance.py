@@ -123,7 +123,7 @@ def thermostat(find: Finding, quick: bool) -> None:
                 return put_in / (10 * sqrt(4 * ratio * steps / freedom))
             if ratio < 1:
                 return 0.0 if np.isfinite(kinetic).all() else np.inf
-            mean = kinetic[1:].mean() / (0.5 * freedom * 298.0 * 0.8314462618)
+            mean = kinetic[1:].mean() / (0.5 * freedom * 298.0 * 0.008314462618)
             return abs(mean - 1) / sqrt(2 / freedom / steps)
 
         find.add(

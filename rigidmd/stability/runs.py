@@ -152,7 +152,7 @@ def simulate(data: dict, state: State | None = None) -> Results:
 
 
 def energy_error(results: Results, scale: float = 0.0) -> float:
-    """Largest change of what is conserved, relative to the kinetic energy of the start (or a scale, u Å²/ps²)."""
+    """Largest change of what is conserved, relative to the kinetic energy of the start (or a scale, kJ/mol)."""
     wrong = np.abs(results["drift"])
     size = scale or results["kinetic"][0]
     return float(wrong.max() / size) if np.isfinite(wrong).all() and size > 0 else inf

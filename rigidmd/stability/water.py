@@ -22,7 +22,7 @@ from rigidmd.stability.runs import (
     simulate,
     water,
 )
-from rigidmd.units import BOLTZMANN
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: Steps (fs) at which water is tried; the first is nominal.
 STEPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
@@ -38,7 +38,7 @@ def water_steps(find: Finding, quick: bool) -> None:
         # a hundredth of an ångström at thermal speed, but no longer than librations bear
         step = min(0.5, 0.5 * (1000.0 / max(temperature, 1.0)) ** 0.5)
         state = frozen() if temperature == 0 else warm("spce", temperature, step)
-        scale = 0.5 * FREEDOM * BOLTZMANN * max(temperature, 1.0)
+        scale = 0.5 * FREEDOM * BOLTZMANN / KJ_PER_MOL * max(temperature, 1.0)
         for family in QUICK:
             span = (500 if quick else 1000) * step
 
@@ -53,7 +53,7 @@ def water_steps(find: Finding, quick: bool) -> None:
 def tip4p_steps(find: Finding, quick: bool) -> None:
     """TIP4P at 300 K at 0.5 to 12 fs; published for it: unstable near 10 fs."""
     state = warm("tip4p", 300.0, 1.0)
-    scale = 0.5 * FREEDOM * BOLTZMANN * 300.0
+    scale = 0.5 * FREEDOM * BOLTZMANN / KJ_PER_MOL * 300.0
     for family in (SPLIT,) if quick else QUICK:
 
         def at(h: float, family=family) -> Outcome:

@@ -63,7 +63,8 @@ def main() -> None:
     """Run and draw."""
     results = HERE / "results"
     with tempfile.TemporaryDirectory() as folder:
-        run = Simulation(Scene.read(HERE.parent.parent / "systems" / "water.toml"), Path(folder) / "water").run()
+        scene = Scene.read(HERE.parent.parent / "systems" / "water.toml", {"output.positions": "wrapped"})
+        run = Simulation(scene, Path(folder) / "water").run()
         shutil.copyfile(Path(folder) / "water" / "energy.png", results / "water_energy.png")
         universe = run.universe()
         universe.trajectory[-1]

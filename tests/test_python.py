@@ -1,0 +1,243 @@
+"""From Python: units of results, data frames, what notebooks and editors show."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import BODIES, ROOT, small_scene
+
+import rigidmd
+from rigidmd.measure.columns import BODY, BODY_COLUMNS
+from rigidmd.measure.observables import Reading
+from rigidmd.measure.samples import COLUMNS
+from rigidmd.scene import Scene
+from rigidmd.simulation import Every, Simulation
+from rigidmd.units import KJ_PER_MOL
+
+TOP = ROOT / "systems" / "heavy_top_3.toml"
+SHORT = {"run.duration_s": 0.05, "output.figures": False}
+
+
+def argon(folder=None, **options):
+    stages = [{"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0}, {"duration_ps": 0.02}]
+    scene = small_scene({"argon": 20}, 20.0, stages=stages, output={"log_interval_ps": 0.01})
+    return Simulation(scene, folder, **options)
+
+
+def test_results_are_what_the_log_says(tmp_path):
+    results = argon(tmp_path / "out").run()
+    with (tmp_path / "out" / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 5
+    for name, column in COLUMNS.items():
+        assert results.units[name] == column.unit
+        if not column.header:
+            continue
+        for row, value in zip(rows, results[name], strict=True):
+            told = row[column.header]
+            assert (
+                told == value if column.unit == "" else float(told or "nan") == pytest.approx(value, abs=0, nan_ok=True)
+            )
+    potential = rows[0]["Potential Energy (kJ/mole)"]
+    assert -100 < float(potential) < 100  # 20 atoms of a gas, in kJ/mol
+    assert results["potential"][0] == float(potential)
+    own = results["stage"] == 1
+    assert np.diff(results["conserved"][own]) == pytest.approx(np.diff(results["drift"][own]), abs=1e-9)
+    freedom, boltzmann = 3 * 20 - 3, 0.00831446261815324  # kJ/mol/K
+    assert results["kinetic"] == pytest.approx(0.5 * freedom * boltzmann * results["temperature"])
+
+
+def test_the_record_and_its_table_name_the_same_units():
+    said = {"kJ/mol": "(kJ/mole)", "K": "(K)", "bar": "(bar)", "ps": "(ps)", "nm³": "(nm^3)", "g/cm³": "(g/mL)",
+            "u Å/ps": "(u A/ps)"}  # fmt: skip
+    for column in COLUMNS.values():
+        if column.header:
+            assert column.header.endswith(said.get(column.unit, column.header))
+            assert "(" not in column.header or column.unit in said
+        assert column.about
+
+
+def test_observers_see_the_units_of_the_log():
+    seen = []
+
+    def look(moment):  # a state is in u, Å, ps
+        kinetic = 0.5 * 39.948 * (moment.state.velocity**2).sum() / KJ_PER_MOL
+        seen.append((moment.observation, kinetic))
+
+    simulation = argon(observers=Every(0.01, look))
+    results = simulation.run()
+    for k, (reading, kinetic) in enumerate(seen):
+        for name in ("potential", "kinetic", "energy", "temperature", "pressure_bar"):
+            assert getattr(reading, name) == results[name][k]
+        assert sum(reading.components.values()) == pytest.approx(reading.potential)
+        assert reading.kinetic_translation == pytest.approx(kinetic, rel=1e-12)
+    # forces are the slopes of the energy that is told
+    system, engine, state = simulation.system, simulation.engine, simulation.state
+    energy = []
+    for shift in (1e-4, -1e-4):
+        state.position[0, 0] += shift
+        energy.append(sum(tally.energy for tally in engine.evaluate(state)[1].values()) / KJ_PER_MOL)
+        state.position[0, 0] -= shift
+    assert isinstance(seen[-1][0], Reading)
+    assert seen[-1][0].force.shape == (len(system.model.species), 3)
+    assert seen[-1][0].force[0, 0] == pytest.approx(-(energy[0] - energy[1]) / 2e-4, rel=1e-5, abs=1e-9)
+
+
+def test_a_body_has_matrices_and_si_units():
+    results = Simulation(Scene.read(TOP, SHORT)).run()
+    q = results["Q"]
+    assert q.shape == (len(results["t"]), 3, 3)
+    assert q[7, 0, 2] == results["q13"][7]
+    assert q[7, 2, 0] == results["q31"][7]
+    assert results.units["Q"] == "1"
+    assert results.units["omega_body_1"] == "rad/s"
+    assert results["kinetic"] + results["potential"] == pytest.approx(results["energy"])
+    with pytest.raises(KeyError, match=r"no column 'energ'; there are t, x.*, Q"):
+        results["energ"]
+    stone = Simulation(Scene.read(ROOT / "systems" / "dropped_stone.toml")).run()
+    with pytest.raises(KeyError, match="no column 'Q'"):
+        stone["Q"]
+
+
+def test_every_column_of_every_body_is_in_the_table():
+    found = set()
+    for path in BODIES:
+        scene = Scene.read(path)
+        results = Simulation(
+            Scene.read(path, {"run.duration_s": 10 * scene.run.timestep_s, "output.interval_s": None})
+        ).run()
+        assert set(results.units) == set(results.samples.columns) | ({"Q"} if "q11" in results.units else set())
+        found |= set(results.units)
+    assert found - {"Q"} <= set(BODY_COLUMNS)
+    assert {family for family, members in BODY.items() if not found & set(members.names)} == set()
+
+
+def test_a_data_frame_has_the_headers_of_the_log(tmp_path):
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    results = argon(tmp_path / "a").run()
+    frame, log = results.to_dataframe(), pandas.read_csv(tmp_path / "a" / "log.csv")
+    assert list(frame.columns) == list(log.columns)
+    for header in log.columns:
+        if log[header].dtype.kind == "f":
+            np.testing.assert_allclose(frame[header].to_numpy(float), log[header], rtol=1e-15)
+        else:
+            assert list(frame[header]) == list(log[header])
+    results = Simulation(Scene.read(TOP, SHORT), tmp_path / "b").run()
+    frame = results.to_dataframe()
+    assert list(frame.columns) == (tmp_path / "b" / "motion.csv").read_text().splitlines()[0].split(",")
+    assert (frame["theta"] == results["theta"]).all()
+
+
+def test_without_pandas_one_sentence_says_so(monkeypatch):
+    results = Simulation(Scene.read(TOP, SHORT)).run()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"^to_dataframe\(\) needs pandas: pip install pandas$"):
+        results.to_dataframe()
+
+
+def test_values_show_what_they_are(tmp_path):
+    water = Scene.read(ROOT / "systems" / "water.toml")
+    assert repr(water) == "<MolecularScene water: 216 spce; nvt 10 ps, nve 20 ps>"
+    assert "216 spce of structures/water216.gro" in repr(Scene.read(ROOT / "systems" / "water_from_structure.toml"))
+    scene = Scene.read(TOP, SHORT)
+    assert repr(scene) == "<BodyScene heavy_top_3: one body, pinned; 0.05 s in 100 steps of 0.0005 s, kahan_li_8>"
+    simulation = Simulation(scene)
+    assert repr(simulation).startswith("<BodySimulation heavy_top_3: one body (symmetric, pinned)")
+    assert "results stay in memory" in repr(simulation)
+    results = simulation.run()
+    assert repr(results).startswith("<Results of heavy_top_3: 101 samples, no files;")
+    folder = tmp_path / "out"
+    written = Simulation(scene, folder)
+    assert f"writes to {folder}" in repr(written)
+    assert f"5 files in {folder}" in repr(written.run())
+    for value in (water, scene, simulation, results):
+        assert len(repr(value)) < 250
+        assert "\n" not in repr(value)
+        assert scene.name in value._repr_html_() or value is water
+    shown = results._repr_html_()
+    assert "<code>q11</code> <code>q12</code>" in shown
+    assert "<td>rad/s</td>" in shown
+    shown = argon().run()._repr_html_()
+    assert "<td><code>potential</code></td><td>kJ/mol</td>" in shown
+    assert "<td>nvt ... nve</td>" in shown
+
+
+NOTEBOOK = """
+import sys, types
+class Shell: kernel = object()
+sys.modules["IPython"] = types.SimpleNamespace(get_ipython=Shell)
+sys.modules["ipykernel.zmqshell"] = types.ModuleType("ipykernel.zmqshell")
+import rigidmd
+simulation = rigidmd.Simulation(rigidmd.Scene.read(sys.argv[1], {"run.duration_s": 0.05}))
+simulation.run(**eval(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "seen"), [("{}", True), ("{'progress': True}", True), ("{'progress': False}", False)]
+)
+def test_a_notebook_shows_the_bar(options, seen):
+    """As a kernel without ipywidgets sees it: a bar of text, and no warning."""
+    done = subprocess.run([sys.executable, "-c", NOTEBOOK, str(TOP), options], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert ("0.0/0.1 s" in done.stderr) == seen
+    assert "arning" not in done.stderr
+
+
+SCRIPT = """import rigidmd
+
+scene = rigidmd.Scene.read("systems/water.toml", {"stages.0.duration_ps": 1.0})
+watch = rigidmd.Every(1.0, lambda moment: print(moment.time, moment.observation.temperature))
+simulation = rigidmd.Simulation(scene, "runs/water", observers=[watch])
+results = simulation.run(progress=True)
+print(rigidmd.__version__, results["energy"].mean(), results.units["energy"], results.summary["stages"])
+print(results.universe().trajectory, results.to_dataframe(), results.state.position.shape, results.files[0].name)
+if isinstance(scene, rigidmd.BodyScene):
+    rigidmd.Simulation(scene, applied={"wind": lambda pose: ([0, 0, pose.time], [0, 0, 0])}).run()
+"""
+HOVER = {
+    "scene": "MolecularScene | BodyScene",
+    "simulation": "MolecularSimulation | BodySimulation",
+    "results": "Results",
+    'results["energy"]': "ndarray[",
+    "results.universe()": "Universe",
+    "results.state": "State",
+}
+
+
+def pyright(folder, text):
+    """What pyright says of a script: (severity, line, message) of each finding."""
+    (folder / "script.py").write_text(text)
+    (folder / "pyrightconfig.json").write_text(json.dumps({"include": ["script.py"], "extraPaths": [str(ROOT)]}))
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "-p", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    try:
+        found = json.loads(done.stdout)["generalDiagnostics"]
+    except (ValueError, KeyError):
+        pytest.skip(f"pyright cannot run here (pip install 'pyright[nodejs]'): {done.stderr.strip()[-200:]}")
+    return [(entry["severity"], entry["range"]["start"]["line"], entry["message"]) for entry in found]
+
+
+def test_an_editor_knows_the_types(tmp_path):
+    hover = "".join(f"reveal_type({expression})\n" for expression in HOVER)
+    found = pyright(tmp_path, SCRIPT + hover)
+    assert [finding for finding in found if finding[0] != "information"] == []
+    lines = SCRIPT.count("\n")
+    for line, (expression, kind) in enumerate(HOVER.items(), start=lines):
+        (message,) = [message for _, at, message in found if at == line]
+        told = message.removeprefix(f'Type of "{expression}" is "').removesuffix('"')
+        assert told.startswith(kind) or set(told.split(" | ")) == set(kind.split(" | ")), message
+    found = pyright(tmp_path, SCRIPT + "results.temperature\nrigidmd.Simulation(scene, obervers=[watch])\n")
+    assert {at for severity, at, _ in found if severity == "error"} == {lines, lines + 1}  # it does look
+
+
+def test_the_package_says_that_it_has_types():
+    import tomllib
+
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        assert "py.typed" in tomllib.load(file)["tool"]["setuptools"]["package-data"]["rigidmd"]
+    assert (ROOT / "rigidmd" / "py.typed").is_file()
+    assert all(hasattr(rigidmd, name) for name in rigidmd.__all__)
