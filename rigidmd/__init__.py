@@ -11,8 +11,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rigidmd.run import Every, Moment, Results, Simulation
     from rigidmd.scene import BodyScene, MolecularScene, Scene
-    from rigidmd.simulation import Every, Moment, Results, Simulation
 
     __version__: str
 

@@ -236,7 +236,7 @@ def _run(options: argparse.Namespace) -> int:
     from rigidmd.output.folder import check_folder
 
     check_folder(folder, options.force)  # before anything slow is imported
-    from rigidmd.simulation import Simulation
+    from rigidmd.run import Simulation
 
     simulation = Simulation(scene, folder, options.force, say=_say, warn=_warn)
     print(simulation.introduction(), flush=True)
@@ -256,8 +256,8 @@ def _warn(sentence: str) -> None:
 
 
 def _energy(options: argparse.Namespace) -> int:
+    from rigidmd.run import Simulation
     from rigidmd.scene import BodyScene
-    from rigidmd.simulation import Simulation
     from rigidmd.units import ENERGY_UNITS
 
     scene = _read_scene(options)
@@ -296,7 +296,7 @@ def _energy(options: argparse.Namespace) -> int:
 
 def _body_energy(scene, options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
-    from rigidmd.simulation import Simulation
+    from rigidmd.run import Simulation
 
     if options.accuracy:
         raise SceneError(scene.source, ["--accuracy is for molecules with Ewald sums"])
@@ -316,7 +316,7 @@ def _body_energy(scene, options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from rigidmd.build.describe import describe
+    from rigidmd.assemble.describe import describe
     from rigidmd.measure.stable_step import long_steps
     from rigidmd.scene import BodyScene
 
@@ -333,7 +333,7 @@ def _precision(options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.output.folder import check_folder, make_folder
     from rigidmd.output.precision_report import FILES, advice, table_text, write_precision
-    from rigidmd.simulation.precision import precision
+    from rigidmd.study.precision import precision
 
     scene = _read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-precision"
@@ -368,7 +368,7 @@ def _stability(options: argparse.Namespace) -> int:
 
     from rigidmd.output.folder import check_folder, make_folder
     from rigidmd.output.stability_report import FILES, failed, table_text, words, write_stability
-    from rigidmd.stability.cases import battery, chosen
+    from rigidmd.study.stability.battery import battery, chosen
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     check_folder(folder, options.force)

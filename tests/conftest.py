@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigidmd.build.system import System, build
+from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme
 from rigidmd.core.state import NOW, State
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import BodyScene, Scene
 

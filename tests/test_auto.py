@@ -6,8 +6,8 @@ from conftest import ROOT, small_scene
 
 from rigidmd.cli import main
 from rigidmd.errors import SceneError
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 

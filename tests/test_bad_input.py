@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from conftest import MOLECULES, ROOT, small_scene
 
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError, SimulationError, StructureError
 from rigidmd.measure.stable_step import long_steps
 from rigidmd.molecules import Site, load_model, molecule, read_molecule
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene, parse_override
-from rigidmd.simulation import Simulation
 
 GOOD = """\
 [box]
@@ -483,7 +483,7 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
 
 def test_molecules_by_order_and_by_geometry(tmp_path):
     """An .xyz has no residues: waters atom by atom, and one with all oxygens first, split across the boundary."""
-    from rigidmd.build.structure import read_structure
+    from rigidmd.assemble.structure import read_structure
 
     water, nitrogen = load_model("spce"), load_model("nitrogen")
     rng = np.random.default_rng(0)

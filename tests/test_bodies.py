@@ -12,13 +12,13 @@ from rigidmd.compile import kernel
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.body import Body
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.flight import Pinned
 from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
 from rigidmd.mechanics.rotor import ExactRotor, split_rotor, turn
+from rigidmd.run import Simulation
 from rigidmd.scene import BodyScene, Scene
-from rigidmd.simulation import Simulation
 
 
 @cache

@@ -7,20 +7,20 @@ from numba import njit
 from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
 
-from rigidmd.build.body import build_body
+from rigidmd.assemble.body import build_body
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.body import Body
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.forces import resistance
-from rigidmd.forces.fields import SteadyForce
+from rigidmd.forces.body import resistance
+from rigidmd.forces.body.fields import SteadyForce
 from rigidmd.mechanics.course import integral, is_steady, steady, table, total, value_at, window
 from rigidmd.mechanics.flight import Pinned
 from rigidmd.mechanics.rotation import from_vector, hat, random_rotations
 from rigidmd.mechanics.rotor import split_rotor
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 
 PINNED = {
     "body": {"mass_kg": 2.0, "inertia_kg_m2": [0.5, 0.7, 0.9], "pinned": True, "centre_of_mass_m": [0.1, 0.2, 0.3]},

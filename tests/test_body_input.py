@@ -3,7 +3,7 @@
 import pytest
 from conftest import ROOT
 
-from rigidmd.build.body import build_body
+from rigidmd.assemble.body import build_body
 from rigidmd.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene

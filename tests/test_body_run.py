@@ -11,8 +11,8 @@ from conftest import BODIES, ROOT
 import rigidmd
 from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Every, Simulation
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 SHORT = ["--set", "run.duration_s=0.05"]

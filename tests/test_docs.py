@@ -29,7 +29,7 @@ from pydantic import BaseModel
 
 import rigidmd
 from rigidmd import cli
-from rigidmd.build.describe import describe
+from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
 from rigidmd.molecules import read_parameters
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override

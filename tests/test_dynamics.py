@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 from conftest import built, move, small_scene
 
-from rigidmd.build.momenta import draw_momenta
-from rigidmd.build.system import build
+from rigidmd.assemble.momenta import draw_momenta
+from rigidmd.assemble.system import build
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import HEAT, State, state_of
 from rigidmd.dynamics import baths
 from rigidmd.dynamics.baths import VelocityRescaling
-from rigidmd.dynamics.engine import Engine
 from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 from rigidmd.units import BOLTZMANN
 
 VERLET = SCHEMES["velocity_verlet"]

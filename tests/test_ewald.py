@@ -11,22 +11,22 @@ from conftest import ROOT, built, shaken, small_scene
 from reference import KE, EwaldOracle, Oracle, nearest
 from scipy.special import erfc, hyp1f1
 
-from rigidmd.build.describe import describe
-from rigidmd.build.system import build
+from rigidmd.assemble.describe import describe
+from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
-from rigidmd.forces.ewald import sum_of, waves
-from rigidmd.forces.screened import screening
-from rigidmd.forces.space import Triclinic, cell_of
+from rigidmd.forces.laws.screened import screening
+from rigidmd.forces.pairs.space import Triclinic, cell_of
+from rigidmd.forces.waves.ewald import sum_of, waves
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.output.report import summary_text
+from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 from rigidmd.scene.molecules import Box
-from rigidmd.simulation import Every, Simulation
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
 BOXES = [{"lengths_A": [13.0, 12.5, 15.0]}, {"lengths_A": [13.0, 14.0, 15.0], "angles_deg": [75.0, 100.0, 65.0]}]
@@ -868,13 +868,13 @@ def test_scenes_without_pme_need_no_fourier_transforms():
     script = """
 import sys
 sys.modules["rocket_fft"] = None  # an import of it fails
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.scene import Scene
 for forces in ({}, {"electrostatics": "ewald", "cutoff_A": 6.0}):
     data = {"box": {"lengths_A": 18.1}, "molecules": [{"model": "spce", "count": 9}], "forces": forces,
             "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.1}]}
     build(Scene.from_dict(data))
-assert "rigidmd.forces.pme" not in sys.modules
+assert "rigidmd.forces.waves.mesh" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, timeout=300)

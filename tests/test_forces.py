@@ -6,13 +6,13 @@ from conftest import built, move, small_scene
 from numba.core.errors import TypingError
 from reference import Oracle
 
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import no_load
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
-from rigidmd.forces.neighbors import BUILDS, USABLE
-from rigidmd.forces.space import cell_of
+from rigidmd.forces.pairs.lists import BUILDS, USABLE
+from rigidmd.forces.pairs.space import cell_of
 from rigidmd.forces.terms import add_term
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector

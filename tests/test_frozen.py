@@ -5,15 +5,15 @@ import pytest
 from conftest import built, move, shaken, small_scene
 from reference import Oracle
 
-from rigidmd.build.describe import describe
-from rigidmd.build.momenta import mobile
-from rigidmd.build.system import build
+from rigidmd.assemble.describe import describe
+from rigidmd.assemble.momenta import mobile
+from rigidmd.assemble.system import build
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SceneError
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import nearest_rotation
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 
 CALORIE = 4.184
 VERLET = SCHEMES["velocity_verlet"]

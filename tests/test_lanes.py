@@ -12,11 +12,11 @@ import pytest
 from conftest import ROOT, built, move, small_scene
 from numba import types
 
-from rigidmd.build.system import build
-from rigidmd.compile import SIMD_BITS, Parcel, kernel
+from rigidmd.assemble.system import build
+from rigidmd.compile import SIMD_BITS, Parcel, kernel, lanes
 from rigidmd.core.schemes import SCHEMES
-from rigidmd.forces import lanes, pairs
-from rigidmd.forces.neighbors import BUILDS
+from rigidmd.forces.pairs import loop as pairs
+from rigidmd.forces.pairs.lists import BUILDS
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
 W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}
@@ -106,7 +106,7 @@ import hashlib, sys
 sys.path.insert(0, "tests")
 from conftest import small_scene
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
+from rigidmd.run import Simulation
 stage = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.1}
 for precision in ("double", "mixed"):
     scene = small_scene({"spce": 700, "nitrogen": 500}, 40.0, stages=[stage], precision=precision)

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError
 from rigidmd.molecules import GROUPS, MODELS, available_models, load_model, with_masses
 from rigidmd.output.molecule_report import bonds, models_table
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 ALL = available_models()

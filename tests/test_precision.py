@@ -12,7 +12,7 @@ from rigidmd.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.output.precision_report import advice, table_text, write_precision
 from rigidmd.scene import Scene
-from rigidmd.simulation.precision import precision
+from rigidmd.study.precision import precision
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 

@@ -19,8 +19,8 @@ from rigidmd.mechanics.rotation import (
     to_yaw_pitch_roll,
 )
 from rigidmd.mechanics.rotor import ExactRotor, split_rotor, turn
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 
 FEW = settings(max_examples=60, deadline=None, derandomize=True, database=None)
 FEWER = settings(max_examples=25, deadline=None, derandomize=True, database=None)

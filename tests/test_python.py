@@ -13,8 +13,8 @@ import rigidmd
 from rigidmd.measure.columns import BODY, BODY_COLUMNS
 from rigidmd.measure.observables import Reading
 from rigidmd.measure.samples import COLUMNS
+from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Every, Simulation
 from rigidmd.units import KJ_PER_MOL
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.advance import Model
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import StructureError
-from rigidmd.forces.lennard_jones import lennard_jones, tail
-from rigidmd.forces.pairs import pair_forces
-from rigidmd.forces.sites import CentralSites
+from rigidmd.forces.laws.lennard_jones import lennard_jones, tail
+from rigidmd.forces.pairs.loop import pair_forces
+from rigidmd.forces.pairs.sites import CentralSites
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotor import NoRotor
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 from rigidmd.units import BOLTZMANN
 
 

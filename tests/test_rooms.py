@@ -13,30 +13,30 @@ ROOMS = [
     ("mechanics",),
     ("forces",),
     ("dynamics",),
+    ("engines",),
     ("molecules",),
     ("scene",),
-    ("build",),
+    ("assemble",),
     ("measure",),
     ("output",),
     ("shipped",),
-    ("simulation",),
-    ("stability",),
+    ("run",),
+    ("study",),
     ("cli", "__main__"),
 ]
 RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 
 LIBRARIES = {
-    "ase": {"build/structure_files.py", "build/matching.py", "build/cells.py"},
+    "ase": {"assemble/structure_files.py", "assemble/matching.py", "assemble/cells.py"},
     "MDAnalysis": {"output/trajectory.py"},
     "tomli_w": {"output/scene_file.py"},
-    "rocket_fft": {"forces/pme.py"},
+    "rocket_fft": {"forces/waves/mesh.py"},
     "matplotlib": {"output/report.py", "output/body_figures.py", "output/precision_report.py", "output/stability_report.py", "output/molecule_figure.py"},
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/body.py", "scene/actions.py"},
     "numba": {
-        "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/machine.py", "compile/numba_private.py",
-        "forces/terms.py", "forces/sites.py", "forces/neighbors.py", "forces/lanes.py",
-        "forces/clusters.py",
-        "simulation/molecules.py", "measure/summary.py", "measure/body_summary.py",  # number of threads, version
+        "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lanes.py", "compile/machine.py",
+        "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",
+        "run/molecules.py", "measure/summary.py", "measure/body_summary.py",  # number of threads, version
     },
 }  # fmt: skip
 

@@ -14,17 +14,17 @@ import pytest
 from conftest import MOLECULES, ROOT, small_scene
 
 import rigidmd
-from rigidmd.build.describe import describe
-from rigidmd.build.system import build
+from rigidmd.assemble.describe import describe
+from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.core.state import State
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.output import progress
 from rigidmd.output.log import COLUMNS
 from rigidmd.output.report import summary_text
+from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Every, Simulation
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 

@@ -19,7 +19,7 @@ from rigidmd.measure.stability import (
     longest_step,
 )
 from rigidmd.output.stability_report import failed, picture, table_text, words
-from rigidmd.stability.cases import battery, chosen
+from rigidmd.study.stability.battery import battery, chosen
 
 NAMES = [case.name for case in chosen(None)]
 
@@ -122,7 +122,7 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
 
 
 def test_a_silent_case_is_exit_code_1(tmp_path, capsys, monkeypatch):
-    from rigidmd.stability.cases import CASES, Case
+    from rigidmd.study.stability.cases import CASES, Case
 
     def lie(find, quick):
         find.add("always", Outcome(1.0, 0.0), 1e-3)

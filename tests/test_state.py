@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from conftest import ROOT, built, move, small_scene
 
-from rigidmd.build.body import build_body
+from rigidmd.assemble.body import build_body
 from rigidmd.core.schemes import SCHEMES, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
 from rigidmd.core.state_file import read_state, write_state
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.errors import StructureError
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 from rigidmd.units import BOLTZMANN
 
 VERLET = SCHEMES["velocity_verlet"]

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from conftest import BODIES, ROOT, small_scene
 
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.core.schemes import KICK, SCHEMES
 from rigidmd.core.state import NOW
 from rigidmd.dynamics.baths import kinetic_energy
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.stable_step import DIRECTIONS, stable_angle, stiffest
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 PLAIN = {"figures": False, "trajectory": False}

@@ -1,1 +1,1 @@
-"""Steps in time: schemes are rows of coefficients, `advance` is the compiled loop, thermostats are flows of it."""
+"""Steps in time: `advance` is the compiled loop over a row of flows; kicks, drifts and baths are flows of it."""

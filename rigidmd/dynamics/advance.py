@@ -9,7 +9,7 @@ from rigidmd.core.schemes import DRIFT, KICK, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN
 from rigidmd.dynamics.baths import apply
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
-from rigidmd.forces.sites import SERIAL
+from rigidmd.forces.pairs.sites import SERIAL
 from rigidmd.forces.terms import load_bodies
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along

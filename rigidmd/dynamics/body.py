@@ -6,8 +6,8 @@ from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import NOW, WORK
 from rigidmd.dynamics.advance import drift, kick, pay
 from rigidmd.dynamics.gradient import add_gyration, displace
-from rigidmd.forces.frame import Inertial, Turning, follow, frame_rate
-from rigidmd.forces.resistance import NoResistance, Resistance, push
+from rigidmd.forces.body.frame import Inertial, Turning, follow, frame_rate
+from rigidmd.forces.body.resistance import NoResistance, Resistance, push
 from rigidmd.forces.terms import total_power
 from rigidmd.mechanics.flight import Free, Immersed, Pinned, along, carry, inertial_mass
 from rigidmd.mechanics.rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, turn_along

@@ -1,1 +1,1 @@
-"""Force laws, one a file, and the one dispatch over them (`terms`)."""
+"""What acts: the one dispatch over terms (`terms`), laws between pairs, pairs, waves, and what acts on one body."""

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from rigidmd.build.momenta import mobile
-from rigidmd.build.system import System, build
+from rigidmd.assemble.momenta import mobile
+from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
-from rigidmd.forces.sites import place_sites
+from rigidmd.forces.pairs.sites import place_sites
 from rigidmd.units import COULOMB
 
 #: The sum that others are held against leaves out so much of what they are estimated to.

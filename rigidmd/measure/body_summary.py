@@ -6,7 +6,7 @@ from importlib.metadata import version
 import numba
 import numpy as np
 
-from rigidmd.build.body import BodySystem
+from rigidmd.assemble.body import BodySystem
 from rigidmd.measure.motion import Motion
 
 #: Beyond this the motion is not that of the scene.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
-from rigidmd.measure.precision import Subject, Trial, end_of, gap, look
+from rigidmd.measure.trials import Subject, Trial, end_of, gap, look
 
 #: In this order: a later one that costs more at its first good step is not refined.
 CANDIDATES = ("velocity_verlet", "two_stage", "pefrl", "srkn_4", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")

@@ -4,8 +4,8 @@ from math import inf
 
 import numpy as np
 
-from rigidmd.build.electrostatics import NEUTRAL
-from rigidmd.build.system import System
+from rigidmd.assemble.electrostatics import NEUTRAL
+from rigidmd.assemble.system import System
 from rigidmd.units import BAR
 
 

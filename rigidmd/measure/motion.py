@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.body import BodySystem
+from rigidmd.assemble.body import BodySystem
 from rigidmd.core.state import WORK, State
-from rigidmd.forces.fields import Drive, SteadyForce, Told
-from rigidmd.forces.frame import Inertial
-from rigidmd.forces.resistance import NoResistance
+from rigidmd.forces.body.fields import Drive, SteadyForce, Told
+from rigidmd.forces.body.frame import Inertial
+from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.measure.columns import BODY, BODY_COLUMNS, MATRIX, Column
 from rigidmd.mechanics.course import is_steady
 from rigidmd.mechanics.flight import Immersed, inertial_masses

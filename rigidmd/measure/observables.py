@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.system import System
+from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.engine import Engine
+from rigidmd.engines.cpu import Engine
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.body import BodySystem
-from rigidmd.build.system import System, species_of
+from rigidmd.assemble.body import BodySystem
+from rigidmd.assemble.system import System, species_of
 from rigidmd.core.schemes import DRIFT, KICK, RK4, Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.forces.fields import SteadyForce
+from rigidmd.forces.body.fields import SteadyForce
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.mechanics.rotor import SplitRotor
 from rigidmd.molecules import Molecule

@@ -8,9 +8,8 @@ from math import isnan, sqrt
 import numba
 import numpy as np
 
-from rigidmd.build.momenta import Removed, mobile
-from rigidmd.build.relief import Relief
-from rigidmd.build.system import System
+from rigidmd.assemble.momenta import Removed, mobile
+from rigidmd.assemble.system import System
 from rigidmd.core.state import REST, State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.samples import Sample, Samples
@@ -25,7 +24,7 @@ def summarise(
     system: System,
     samples: Samples,
     state: State,
-    relief: Relief | None,
+    relief_steps: int,
     threads: int,
     preparing: float,
     wall: float,
@@ -68,7 +67,7 @@ def summarise(
         "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
-        "relief_steps": relief.steps if relief else 0,
+        "relief_steps": relief_steps,
         "preparing_s": preparing,
         "wall_s": wall,
         "largest_orthogonality_error": max(sample.orthogonality for sample in samples.rows),

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.build.body import BodySystem
-from rigidmd.build.overlaps import OVERLAP, close_pairs
-from rigidmd.build.relief import kicks
-from rigidmd.build.system import System
+from rigidmd.assemble.body import BodySystem
+from rigidmd.assemble.overlaps import OVERLAP, close_pairs
+from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.engine import NotFiniteError
+from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.errors import SimulationError
-from rigidmd.forces.fields import SteadyForce
+from rigidmd.forces.body.fields import SteadyForce
+from rigidmd.measure.kicks import kicks
 from rigidmd.measure.motion import energies, is_balanced
 from rigidmd.measure.samples import Sample
 from rigidmd.mechanics.rotation import orthogonality_error

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.measure.precision import Precision, Trial
+from rigidmd.measure.trials import Precision, Trial
 from rigidmd.output.report import FAINT, INK, signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")

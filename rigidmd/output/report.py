@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.build.system import System
+from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tomli_w
 
-from rigidmd.build.system import System
+from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.output.folder import SCENE_FILE
 from rigidmd.scene import BodyScene, MolecularScene, Scene

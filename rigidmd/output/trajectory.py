@@ -16,13 +16,13 @@ from MDAnalysis.coordinates.TRR import TRRReader
 from MDAnalysis.coordinates.XTC import XTCReader
 from MDAnalysis.coordinates.XYZ import XYZReader
 
-from rigidmd.build.body import BodySystem
-from rigidmd.build.cells import angles_deg
-from rigidmd.build.system import System
+from rigidmd.assemble.body import BodySystem
+from rigidmd.assemble.cells import angles_deg
+from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
-from rigidmd.forces.space import cell_of
+from rigidmd.forces.pairs.space import cell_of
 
 #: Least and largest coordinate (Å) that a format holds: whole thousandths of a nm in 32 bits, columns of a text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}

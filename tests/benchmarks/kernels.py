@@ -24,10 +24,10 @@ from rigidmd import Scene, Simulation
 from rigidmd.compile import SIMD_BITS, call, call_blocks, packed
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import State, no_load
-from rigidmd.dynamics.engine import DTYPES
-from rigidmd.forces.neighbors import BUILDS, MASKED, end_of_row, farthest
-from rigidmd.forces.pairs import PairWorkspace
-from rigidmd.forces.sites import place_sites
+from rigidmd.engines.cpu import DTYPES
+from rigidmd.forces.pairs.lists import BUILDS, MASKED, end_of_row, farthest
+from rigidmd.forces.pairs.loop import PairWorkspace
+from rigidmd.forces.pairs.sites import place_sites
 
 STEP = 2e-3  # ps
 STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step

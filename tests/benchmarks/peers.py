@@ -48,9 +48,9 @@ from scipy.spatial import cKDTree
 from scipy.special import erfc
 
 from rigidmd import Scene, Simulation
-from rigidmd.build.system import build
+from rigidmd.assemble.system import build
 from rigidmd.compile.cache import cache_folder
-from rigidmd.forces.ewald import in_energy_units, intramolecular_energy
+from rigidmd.forces.waves.ewald import in_energy_units, intramolecular_energy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import align

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from peers import WORKLOADS, numbers, write_start
 
 from rigidmd import Scene, Simulation
-from rigidmd.build.describe import array_bytes
+from rigidmd.assemble.describe import array_bytes
 from rigidmd.core.schemes import SCHEMES
 
 WORK = WORKLOADS["W1"]

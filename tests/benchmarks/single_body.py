@@ -22,9 +22,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import known
 
 from rigidmd.core.schemes import SCHEMES, Solver
-from rigidmd.dynamics.odes import OdeEngine
+from rigidmd.engines.textbook import OdeEngine
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results"

@@ -1,0 +1,138 @@
+"""What a scene asks of a single body that this body cannot do, or that would do nothing to it."""
+
+import numpy as np
+
+from rigidmd.assemble.body_parts import frame_of, resistance_of
+from rigidmd.core.schemes import SCHEMES, SOLVERS
+from rigidmd.forces.body.frame import Turning
+from rigidmd.forces.body.resistance import NoResistance
+from rigidmd.mechanics.course import keeps_direction
+from rigidmd.scene import BodyScene
+
+
+def unfit(
+    scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
+) -> list[str]:
+    """What a scene asks of a body that this body cannot do, or what would do nothing to it."""
+    faults, body, fluid = [], scene.body, scene.fluid
+    turning, principal = bool(moments.any()), np.array_equal(axes, np.eye(3))
+    if not turning:
+        faults += _idle_of_points(scene)
+        if body.pinned:
+            faults.append("body: a point at the pivot has nothing to move; give it inertia or a centre_of_mass_m")
+        if added_mass.any():
+            faults.append("fluid.added_mass_kg: a point carries no fluid along; leave it out")
+        for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
+            if fluid is not None and len(set(getattr(fluid, key))) > 1:
+                faults.append(f"fluid.{key}: a point has no axes: give three equal numbers")
+    elif added_mass.any():
+        for k in np.flatnonzero(moments == 0):
+            if added_mass[k - 1] != added_mass[k - 2]:
+                faults.append("fluid.added_mass_kg: a linear body has equal added masses across its axis")
+    if turning and not principal:
+        faults += _needs_principal_axes(scene)
+    if (scene.wheels or scene.changing_inertia) and turning and not (moments > 0).all():
+        faults.append("wheels and changing_inertia need a body with inertia about every axis")
+    if body.pinned:
+        if scene.changing_inertia is not None and centre.any():
+            faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")
+        if scene.gravity is not None and not centre.any() and turning:
+            faults.append("gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m")
+        faults += [
+            f"applied.{k}.force_N does nothing at the pivot; say where it acts with at_m"
+            for k, entry in enumerate(scene.applied)
+            if entry.force_N is not None and not any(entry.at_m or ())
+        ]
+    return faults
+
+
+def _idle_of_points(scene: BodyScene) -> list[str]:
+    """Keys about turning, which a point does not do."""
+    start, none = scene.start, type(scene.start)()
+    named = [f"start.{key}" for key in type(start).model_fields if getattr(start, key) != getattr(none, key)]
+    idle = [key for key in named if key not in ("start.position_m", "start.velocity_m_s")]
+    idle += [key for key in ("friction", "wheels") if getattr(scene, key)]
+    idle += [f"run.{key}" for key in ("formulation", "rotor") if getattr(scene.run, key) is not None]
+    if scene.fluid is not None:
+        turning = (
+            "linear_rotational_resistance_N_m_s",
+            "quadratic_rotational_resistance_N_m_s2",
+            "added_inertia_kg_m2",
+        )
+        idle += [f"fluid.{key}" for key in turning if any(getattr(scene.fluid, key) or ())]
+    if scene.output.axis is not None:
+        idle.append("output.axis")
+    return [f"{key}: the body has no inertia: a point does not turn" for key in idle]
+
+
+def _needs_principal_axes(scene: BodyScene) -> list[str]:
+    """What acts along the body's axes must find them principal, unless it is the same along all."""
+    faults = []
+    for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
+        for key in type(section).model_fields if section else ():
+            value = getattr(section, key)
+            if not isinstance(value, tuple) or key == "centre_of_buoyancy_m":
+                continue
+            if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
+                faults.append(
+                    f"{name}.{key} is told along the body's axes, which are not principal axes of its inertia: "
+                    "give the body in its principal axes"
+                )
+    return faults
+
+
+def unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bool) -> list[str]:
+    """Torques that nothing resists."""
+    if entry.torque_N_m is None and entry.at_m is None:
+        return []
+    if not turning:
+        return [f"applied.{k}: a point cannot be turned"]
+    if (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
+        torques = np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3)) @ axes
+        arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
+        if torques[:, moments == 0].any() or arm[moments > 0].any():
+            return [f"applied.{k}: nothing resists a torque about the axis of a linear body"]
+    return []
+
+
+def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
+    """Integrators that would not be what they are for this body. has_functions : Python functions apply forces."""
+    run, resistance = scene.run, resistance_of(scene)
+    braked = not isinstance(resistance, NoResistance)
+    if run.is_open:
+        return []
+    if run.integrator in SOLVERS:
+        if braked and resistance.rotation_dry.any():
+            return [
+                f"run: dry friction jumps where a body stops, which {run.integrator} cannot step over: "
+                "use velocity_verlet"
+            ]
+        return []
+    scheme = SCHEMES[run.integrator].with_rotor(run.rotor)
+    if braked and min(scheme.kicks) < 0:
+        forward = [name for name, other in SCHEMES.items() if min(other.kicks) >= 0]
+        return [
+            f"run: {run.integrator} takes steps back in time, which a resistance does not allow: use one of "
+            f"{', '.join(forward)}"
+        ]
+    if scheme.has_gradient and (braked or scene.applied or has_functions):
+        plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient]
+        return [
+            f"run: {run.integrator} asks for the gradient of the forces, which resistance and applied forces do not "
+            f"have; use one of {', '.join(plain)}"
+        ]
+    frame = frame_of(scene)
+    wandering = isinstance(frame, Turning) and not keeps_direction(frame.angular_velocity)
+    why = {
+        "wheels": scene.wheels,
+        "changing_inertia": scene.changing_inertia,
+        "added mass": immersed,
+        "a frame that changes its axis": wandering,
+    }
+    split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
+    return [
+        f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be of order 2; "
+        f"use one of {', '.join(split)} with rotor = 'split'"
+        for what, there in why.items()
+        if there and scheme.exact_rotor
+    ]

@@ -1,0 +1,188 @@
+"""The parts of a single body from the tables of its scene: inertia, fluid, rotor, frame, resistance, forces."""
+
+from itertools import permutations
+
+import numpy as np
+
+from rigidmd.forces.body.fields import Drive, SteadyForce
+from rigidmd.forces.body.frame import Inertial, Turning
+from rigidmd.forces.body.resistance import NoResistance, Resistance
+from rigidmd.mechanics.course import Course, integral, is_steady, steady, table, total, window
+from rigidmd.mechanics.inertia import inertia_tensor, shifted
+from rigidmd.mechanics.rotation import direction
+from rigidmd.mechanics.rotor import DrivenRotor, split_rotor
+from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
+from rigidmd.scene import BodyScene
+from rigidmd.scene.actions import Timed
+
+#: Principal moments from a tensor that differ by less than this fraction of the largest differ by rounding.
+ROUNDING = 1e-13
+
+
+def inertia_of(scene: BodyScene):
+    """Mass, tensor about the centre of mass or pivot, centre of mass from there, points to draw and their names."""
+    table_ = scene.body
+    centre = np.array(table_.centre_of_mass_m or (0.0, 0.0, 0.0))
+    mass = table_.mass_kg
+    tensor = table_.tensor
+    if table_.points is not None:
+        masses = np.array([p.mass_kg for p in table_.points])
+        places = np.array([p.position_m for p in table_.points])
+        mass = float(masses.sum())
+        centre = masses @ places / mass
+        points = places - centre
+        tensor = inertia_tensor(masses, points)
+    elif table_.solid is not None:
+        shape = solid(table_.solid.shape, mass, table_.solid.dimensions)
+        points, tensor = shape.outline, np.diag(shape.inertia)
+    else:
+        about_centre = np.zeros((3, 3)) if tensor is None else tensor
+        if table_.inertia_about == "pivot":
+            about_centre = shifted(tensor, -mass, centre)
+        points = _equal_ellipsoid(mass, about_centre)
+    if tensor is None:
+        tensor = np.zeros((3, 3))
+    if table_.pinned:
+        if table_.inertia_about == "centre_of_mass":
+            tensor = shifted(tensor, mass, centre)
+        points = np.vstack([np.zeros(3), centre + points])
+        return mass, tensor, centre, points, ("PIVOT", *(f"P{k}" for k in range(1, len(points))))
+    return mass, tensor, np.zeros(3), points, tuple(f"P{k}" for k in range(1, len(points) + 1))
+
+
+def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
+    """Centre and tips of the axes (7, 3) of the homogeneous ellipsoid of this inertia tensor; of a point, its place."""
+    moments, axes = np.linalg.eigh(tensor)
+    half = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
+    if not half.any():
+        return np.zeros((1, 3))
+    tips = (axes * half).T
+    return np.concatenate([np.zeros((1, 3)), tips, -tips])
+
+
+def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Principal moments (3,) and axes (3, 3) as columns, right-handed, each as near to the body's own as can be."""
+    rounding = ROUNDING * np.abs(tensor).max()
+    if (np.abs(tensor - np.diag(np.diag(tensor))) <= rounding).all():
+        moments, axes = np.diag(tensor).copy(), np.eye(3)
+        return _even(moments), axes
+    moments, axes = np.linalg.eigh(tensor)
+    best = max(permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3)))
+    moments, axes = np.maximum(moments, 0.0)[list(best)], axes[:, best]
+    axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
+    if np.linalg.det(axes) < 0:
+        axes[:, np.abs(np.diag(axes)).argmin()] *= -1
+    return _even(moments), axes
+
+
+def _even(moments: np.ndarray) -> np.ndarray:
+    """Moments that differ by rounding made equal to the last bit, which the rotor turns exactly; rounded zeros zero."""
+    rounding = ROUNDING * moments.max()
+    moments = np.where(moments < rounding, 0.0, moments)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        if abs(moments[i] - moments[j]) <= rounding:
+            moments[[i, j]] = 0.5 * (moments[i] + moments[j])
+    return moments
+
+
+def carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
+    """Added mass (3,), added inertia (3,) and displaced mass."""
+    fluid = scene.fluid
+    if fluid is None:
+        return np.zeros(3), np.zeros(3), 0.0
+    if fluid.density_kg_m3 is None:
+        zero = (0.0, 0.0, 0.0)
+        return (
+            np.array(fluid.added_mass_kg or zero),
+            np.array(fluid.added_inertia_kg_m2 or zero),
+            fluid.displaced_mass_kg or 0.0,
+        )
+    shape = scene.body.solid
+    half = np.array(shape.semi_axes_m or (shape.radius_m,) * 3)
+    return *added_mass_of_ellipsoid(half, fluid.density_kg_m3), fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod()
+
+
+def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, axes: np.ndarray):
+    if not scene.wheels and scene.changing_inertia is None:
+        return split_rotor(moments[None])
+    changing = scene.changing_inertia
+    inertia = steady(moments)
+    if changing is not None:
+        inertia = table(changing.times_s, np.array(changing.inertia_kg_m2) + added_inertia)
+    momenta = []
+    for wheel in scene.wheels:
+        axis = axes.T @ direction(wheel.axis)
+        motor = wheel.motor_torque_N_m
+        values = 0.0 if motor is None else motor
+        torque = _course(wheel, np.multiply.outer(values, axis))
+        momenta.append(integral(torque, wheel.momentum_kg_m2_s * axis))
+    return DrivenRotor(inertia, total(momenta) if momenta else steady(np.zeros(3)))
+
+
+def _course(timed: Timed, values) -> Course:
+    """The course of a constant, of a window of time, or of a table."""
+    if timed.times_s is not None:
+        return table(timed.times_s, values)
+    if timed.from_s is not None or timed.to_s is not None:
+        return window(values, *timed.window)
+    return steady(values)
+
+
+def frame_of(scene: BodyScene):
+    frame = scene.frame
+    if frame is None or (frame.angular_velocity_rad_s is None and frame.angular_acceleration_rad_s2 is None):
+        return Inertial()
+    rate = np.array(frame.angular_velocity_rad_s or (0.0, 0.0, 0.0))
+    if frame.angular_acceleration_rad_s2 is not None:
+        return Turning(integral(steady(frame.angular_acceleration_rad_s2), rate))
+    return Turning(_course(frame, rate))
+
+
+def resistance_of(scene: BodyScene):
+    friction, fluid = scene.friction, scene.fluid
+    zero = (0.0, 0.0, 0.0)
+    parts = (
+        np.array(fluid.linear_resistance_kg_s if fluid else zero),
+        np.array(fluid.quadratic_resistance_kg_m if fluid else zero),
+        np.array(friction.dry_N_m if friction else zero),
+        np.array(friction.viscous_N_m_s if friction else zero)
+        + np.array(fluid.linear_rotational_resistance_N_m_s if fluid else zero),
+        np.array(fluid.quadratic_rotational_resistance_N_m_s2 if fluid else zero),
+    )
+    return Resistance(*parts) if any(part.any() for part in parts) else NoResistance()
+
+
+def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray, displaced: float):
+    terms = {}
+    where = axes.T @ centre
+    if scene.gravity is not None:
+        g = np.array(scene.gravity.acceleration_m_s2)
+        terms["gravity"] = SteadyForce(mass * g, where)
+        if displaced:
+            at = centre if scene.fluid.centre_of_buoyancy_m is None else np.array(scene.fluid.centre_of_buoyancy_m)
+            terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ at)
+    if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
+        course = _course(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
+        terms["origin_acceleration"] = _force(course, steady(np.zeros(3)), where, False)
+    for k, entry in enumerate(scene.applied):
+        force, torque = (
+            steady(np.zeros(3)) if given is None else _course(entry, given)
+            for given in (entry.force_N, entry.torque_N_m)
+        )
+        if entry.axes == "body":
+            force, torque = _turned(force, axes.T), _turned(torque, axes.T)
+        terms[f"applied_{k}"] = _force(
+            force, torque, axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0)), entry.axes == "body"
+        )
+    return terms
+
+
+def _turned(course: Course, matrix: np.ndarray) -> Course:
+    return Course(course.times, *(part @ matrix.T for part in course[1:]))
+
+
+def _force(force: Course, torque: Course, point: np.ndarray, follows_body: bool):
+    """A force that never changes in the lab has an energy; any other keeps an account of its work."""
+    if not follows_body and is_steady(force) and is_steady(torque) and not torque.constant.any():
+        return SteadyForce(force.constant[0], point)
+    return Drive(force, torque, point, follows_body)

@@ -1,0 +1,145 @@
+"""A system in words: what would happen if it ran, and what was left out."""
+
+from collections.abc import Iterator
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.body import BodySystem, build_body
+from rigidmd.assemble.cells import angles_deg, right_angled
+from rigidmd.assemble.system import System, build
+from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.forces.pairs.loop import PairForces
+from rigidmd.forces.pairs.space import cell_of
+from rigidmd.mechanics.rotation import to_euler_angles
+from rigidmd.mechanics.rotor import NoRotor
+from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene.molecules import Stage
+from rigidmd.units import FEMTOSECOND
+
+
+def describe(scene: Scene) -> str:
+    """What a scene would do, in words. Raises as building it does."""
+    if not isinstance(scene, BodyScene):
+        return _molecules(build(scene))
+    text = _body(build_body(scene))
+    if scene.run.is_open:
+        text += "\nthe integrator is chosen before the run, and its step, at most this one"
+    return text
+
+
+def _body(system: BodySystem) -> str:
+    """Kind, inertia, terms, steps."""
+    scene, run = system.scene, system.scene.run
+    pinned = "" if system.flies else ", pinned"
+    moments = " ".join(f"{x:.9g}" for x in system.inertia)
+    about = "the centre of mass" if system.flies else "the pivot"
+    lines = [
+        f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, "
+        f"{system.degrees_of_freedom} degrees of freedom"
+    ]
+    if system.turns:
+        lines.append(f"  principal moments about {about}: {moments} kg m²")
+    if not np.array_equal(system.axes, np.eye(3)):
+        lines.append(f"  principal axes (columns, body's axes): {np.array2string(system.axes, precision=6)}")
+    if system.centre.any():
+        lines.append(f"  centre of mass from the pivot: {' '.join(f'{x:g}' for x in system.centre)} m")
+    if system.turns:
+        pose = system.pose(0.0, system.state)
+        angles = " ".join(f"{x:.6g}" for x in np.degrees(to_euler_angles(pose.rotation)))
+        spin = float(np.linalg.norm(pose.angular_velocity_body))
+        turn = f": a turn in {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
+        lines.append(f"  starts at phi theta psi = {angles} degrees, turning at {spin:.6g} rad/s{turn}")
+    body = system.body
+    if isinstance(system.method, Scheme):
+        body = system.engine().model_for(system.method)
+    parts = [body.flight, body.rotor, body.frame, body.resistance]
+    lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
+    lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
+    lines.append("left out:")
+    lines += [f"  {reason}" for reason in system.left_out]
+    how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
+    lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
+    every = max(1, round(scene.interval / run.timestep_s))
+    lines.append(f"a sample every {every * run.timestep_s:g} s")
+    return "\n".join(lines)
+
+
+def _molecules(system: System) -> str:
+    """Species, degrees of freedom, terms, stages, memory."""
+    scene, freedom = system.scene, system.freedom
+    lines = [f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites"]
+    for k, m in enumerate(system.species):
+        count = int((system.model.species == k).sum())
+        freely = "frozen" if system.model.inverse_mass[k] == 0 else f"{m.degrees_of_freedom} degrees of freedom each"
+        lines.append(f"  {count} {m.name}: {m.words}, {freely}")
+    charges = np.array([m.charge for m in system.species])[system.model.species]
+    if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
+        lines.append(f"  net charge of all of them: {charges.sum():+.6g} e")
+    lines.append(
+        f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
+    )
+    if system.space.volume < inf:
+        cell = cell_of(system.space)
+        edges = " x ".join(f"{edge:.4f}" for edge in np.linalg.norm(cell, axis=1))
+        angles = "" if right_angled(cell) else f", angles {', '.join(f'{x:.4g}' for x in angles_deg(cell))}°"
+        lines.append(f"  box: {edges} Å{angles}, {system.density:.4f} g/cm³")
+    else:
+        lines.append("  no box")
+    lines += [f"  {note}" for note in system.notes]
+    lines.append("\ncompiled in:")
+    for name, term in system.terms.items():
+        lines.append(f"  {name.replace('_', ' ')}: {_term(system, name, term)}")
+    if not isinstance(system.model.rotor, NoRotor):
+        lines.append(f"  rotation: {type(system.model.rotor).__name__}")
+    if any(stage.ensemble == "nvt" for stage in scene.stages):
+        lines.append("  thermostat: velocity rescaling, in the nvt stages only")
+    if (interval := scene.removes_momentum_every) is not None:
+        lines.append(f"  total momentum: taken out every {interval:g} ps")
+    lines.append("left out:")
+    lines += [f"  {reason}" for reason in system.left_out]
+    lines.append("\nstages:")
+    lines += [f"  {k}: {_stage(stage)}" for k, stage in enumerate(scene.stages)]
+    lines.append(f"\nmemory: about {array_bytes(system) / 1e6:.1f} MB for state, forces and neighbour lists")
+    return "\n".join(lines)
+
+
+def _term(system: System, name: str, term: NamedTuple) -> str:
+    if not isinstance(term, PairForces):
+        return type(term).__name__
+    reach = f"cut-off {system.cutoff:g} Å" if system.cutoff < inf else "no cut-off"
+    if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
+        reach += f", {system.scene.forces.truncation}"
+    return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
+
+
+def _stage(stage: Stage) -> str:
+    rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
+    text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
+    if stage.is_open:
+        asked = f"{stage.energy_error_kT:g} kT" if stage.energy_error_kT else f"{stage.trajectory_error:g} of Q or X"
+        text = (
+            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {asked}"
+        )
+    if stage.ensemble == "nvt":
+        text += f", {stage.temperature_K:g} K by {stage.thermostat.replace('_', ' ')}, {stage.thermostat_time_ps:g} ps"
+    return text
+
+
+def array_bytes(value) -> int:
+    """Bytes of all arrays in nested tuples, each array once."""
+    if isinstance(value, System):
+        # The state four times: the start, the one that moves, the last good one, forces and torques.
+        fixed = (value.engine().room(value.state), value.model, value.sites)
+        return 4 * array_bytes(value.state) + array_bytes(fixed)
+    return sum({id(array): array.nbytes for array in _arrays(value)}.values())
+
+
+def _arrays(value) -> Iterator[np.ndarray]:
+    """All arrays in nested tuples."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from _arrays(part)

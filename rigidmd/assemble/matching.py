@@ -1,0 +1,365 @@
+"""Which atoms are which molecule: by residues where a file has them, else by bonding distance; fitted by templates."""
+
+from collections import Counter
+from itertools import groupby
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.cells import pairs_within
+from rigidmd.assemble.structure_files import SAME_MASS, Atoms, element_of
+from rigidmd.mechanics.rotation import align
+from rigidmd.molecules import Molecule
+
+#: Atoms of a molecule are bonded up to this multiple of the template's longest bond between two like them; hydrogen
+#: bonds of water are 1.6 times its bonds or longer.
+BOND_REACH = 1.25
+#: Partial assignments tried before a molecule's atoms count as fitting in no order.
+MOST_TRIES = 20_000
+#: u; what engines that know no massless sites give them instead is less.
+NO_MASS = 0.1
+MOST_LISTED = 6  # atoms of a molecule that a message lists
+
+
+class Fit(NamedTuple):
+    """Rigid templates laid onto m molecules of s massive sites."""
+
+    centre: np.ndarray  # (m, 3) Å
+    rotation: np.ndarray  # (m, 3, 3)
+    deviation: np.ndarray  # (m,) largest of an atom, Å
+    square: np.ndarray  # (m,) mean square of all atoms, Å²
+
+
+class Matched(NamedTuple):
+    """The molecules of a file, in its order."""
+
+    species: np.ndarray  # (n,)
+    atoms: list[np.ndarray]  # of each molecule, in the order of its massive sites
+    centre: np.ndarray  # (n, 3) Å
+    rotation: np.ndarray  # (n, 3, 3)
+    deviation: np.ndarray  # (n,) Å
+    square: np.ndarray  # (n,) Å²
+    massless: Counter  # how many atoms without mass the file has, by name
+    notes: list[str]
+    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
+
+
+def massive(molecule: Molecule) -> np.ndarray:
+    """The sites of a molecule that are atoms: those with mass."""
+    return np.flatnonzero(molecule.masses > 0)
+
+
+def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float) -> Matched | list[str]:
+    """The molecules among the atoms, or every reason why they are none.
+
+    cell: lattice (3, 3) across whose faces molecules may be split, or None. tolerance: see Scene.structure.
+    """
+    kinds = _kinds(atoms, species)
+    runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
+    by_residue = _attempt(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
+    if isinstance(by_residue, Matched):
+        numbers = [atoms.residue[run[0]][0] for run in runs]
+        return by_residue if None in numbers else by_residue._replace(number=np.array(numbers))
+    runs_by_bonds = _bonded(atoms, kinds, species, cell)
+    by_bonds = _attempt(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
+    if isinstance(by_bonds, Matched):
+        if by_residue:
+            by_bonds.notes.append("its residues are no molecules of the scene; they were told by bonding distance")
+        return by_bonds
+    if by_residue and len(runs) > 1:
+        return by_residue
+    known = {"X"}.union(*map(_labels, species))
+    strange = sorted({name for name, kind in zip(atoms.names, kinds, strict=True) if kind not in known})
+    if strange:
+        called = ", ".join(name or "(no name)" for name in strange[:5]) + (", ..." if len(strange) > 5 else "")
+        wanted = ", ".join(f"{molecule.name} ({_composition(molecule)})" for molecule in species)
+        return [f"has atoms called {called}, which are in no molecule of the scene: {wanted}"]
+    return by_bonds
+
+
+def _labels(molecule: Molecule) -> list[str]:
+    """What makes atoms exchangeable: the element of each site, its name where it has none."""
+    return [e if e != "X" else name for e, name in zip(molecule.elements, molecule.site_names, strict=True)]
+
+
+def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
+    """The element of every atom (or what stands for it in the templates), X for massless ones; with "?" a mere guess.
+
+    An element that the file gives is believed. A name is that of a site, or begins with an element of the scene, or
+    tells nothing that counts. Where the file gives masses, a name that is that of a site or an element counts for more
+    than they do, and they for more than how any other name begins.
+    """
+    by_name, by_mass = {}, []
+    for molecule in species:
+        for name, label, mass in zip(molecule.site_names, _labels(molecule), molecule.masses, strict=True):
+            by_name.setdefault(name, set()).add(label if mass > 0 else "X")
+            if mass > 0:
+                by_mass.append((mass, label))
+    by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
+    vocabulary = frozenset(label for _, label in by_mass)
+    own_names = set(by_name) - vocabulary
+    known = {}
+    hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
+
+    def isotope(element: str) -> str:
+        """Hydrogen that the scene does not tell from its own counts as its own: heavy water starts like light."""
+        return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
+
+    def kind(name: str, element: str, mass: float, residue: tuple) -> str:
+        if 0 < mass < NO_MASS:
+            return "X"
+        if mass > 0:
+            if name == "X" or isotope(name) in vocabulary:
+                return isotope(name)
+            if name in own_names:
+                return by_name[name]
+            nearest, label = min(by_mass, key=lambda entry: abs(entry[0] - mass))
+            if abs(nearest - mass) <= SAME_MASS * mass:
+                return label
+            if (guess := isotope(element_of(name, vocabulary))) in vocabulary:
+                return guess
+        if name in own_names and (not element or element == "X"):
+            return by_name[name]
+        if element:
+            return isotope(element)
+        if residue and residue[1] == name:  # an ion or a noble gas: NA, CL, AR
+            name = name.capitalize()
+        guess = isotope(element_of(name, vocabulary))
+        return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
+
+    found = []
+    masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
+    for name, element, mass, residue in zip(atoms.names, atoms.elements, masses, atoms.residue, strict=True):
+        key = (name, element, mass, bool(residue) and residue[1] == name)
+        if key not in known:
+            known[key] = kind(name, element, mass, residue)
+        found.append(known[key])
+    return found
+
+
+def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
+    """Atoms connected by bonds as long as those of the templates, in file order; massless ones stay out.
+
+    Bonds of a template: the shortest set of distances that holds it together.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+    numbers = {kind: k for k, kind in enumerate({*kinds}.union(*map(_labels, species)))}
+    reach = np.zeros((len(numbers), len(numbers)))
+    for molecule in species:
+        sites = massive(molecule)
+        points = molecule.positions_body[sites]
+        number = [numbers[_labels(molecule)[s]] for s in sites]
+        tree = minimum_spanning_tree(np.linalg.norm(points[:, None] - points, axis=2)).tocoo()
+        for i, j, length in zip(tree.row, tree.col, tree.data, strict=True):
+            one, other = number[i], number[j]
+            reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
+    chosen = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
+    number = np.array([numbers[kinds[i]] for i in chosen], int)
+    i, j, distance = pairs_within(atoms.position[chosen], cell, reach.max())
+    i, j = np.array([i, j])[:, distance <= reach[number[i], number[j]]]
+    shape = (len(chosen), len(chosen))
+    count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
+    runs = [[] for _ in range(count)]
+    for atom, component in zip(chosen, label, strict=True):
+        runs[component].append(atom)
+    return sorted(runs)
+
+
+class _Candidate(NamedTuple):
+    species: int
+    order: list[int]  # places in the run, in the order of the massive sites
+    nameless: bool
+
+
+def _attempt(
+    atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
+) -> Matched | list[str]:
+    """Each run of atoms as one molecule. Runs that look alike are dealt with together. how: told of runs at fault."""
+    alike = {}
+    for number, run in enumerate(runs):
+        residue = atoms.residue[run[0]]
+        key = (residue[1] if residue else "", tuple(atoms.names[i] for i in run), tuple(kinds[i] for i in run))
+        alike.setdefault(key, []).append(number)
+    n = len(runs)
+    found = Matched(
+        species=np.full(n, -1),
+        atoms=[np.zeros(0, int)] * n,
+        centre=np.zeros((n, 3)),
+        rotation=np.zeros((n, 3, 3)),
+        deviation=np.zeros(n),
+        square=np.zeros(n),
+        massless=Counter(name for name, kind in zip(atoms.names, kinds, strict=True) if kind == "X"),
+        notes=[],
+    )
+    faults = {}
+    for (residue, names, run_kinds), members in alike.items():
+        called = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]
+        eligible = called or list(range(len(species)))
+        candidates = [c for k in eligible if (c := _candidate(names, run_kinds, species[k], k))]
+        if not candidates:
+            has = _formula(kind.rstrip("?") for kind in run_kinds)
+            wanted = " or ".join(f"{species[k].name} ({_composition(species[k])})" for k in eligible)
+            faults |= {m: f"has atoms {has}, expected {wanted}" for m in members}
+            continue
+        _place(atoms, kinds, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
+        if any(c.nameless for c in candidates) and not faults:
+            listed = ", ".join(name or "(no name)" for name in names)
+            by_shape = species[found.species[members[0]]].name
+            found.notes.append(f"atoms called {listed} tell no element: {by_shape} by shape")
+    if faults:
+        return [f"{_address(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
+    return found
+
+
+def _address(atoms: Atoms, run: list[int], number: int, how: str) -> str:
+    listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
+    if run == list(range(run[0], run[-1] + 1)):
+        listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
+    residue = f", residue {atoms.residue[run[0]][1]!r}" if atoms.residue[run[0]] else ""
+    return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
+
+
+def _formula(elements) -> str:
+    return " ".join(f"{element}{count if count > 1 else ''}" for element, count in Counter(elements).items())
+
+
+def _composition(molecule: Molecule) -> str:
+    return _formula(_labels(molecule)[i] for i in massive(molecule))
+
+
+def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
+    """A run as this species: sites by name if all names are its own, else by element; or None."""
+    sites = massive(molecule)
+    labels = [_labels(molecule)[s] for s in sites]
+    places = [i for i, kind in enumerate(kinds) if kind != "X"]
+    if len(places) != len(sites):
+        return None
+    if len(places) > 1 and all(kinds[i].endswith("?") for i in places):
+        return _Candidate(k, places, nameless=True)
+    if Counter(kinds[i] for i in places) != Counter(labels):
+        return None
+    called = [names[i] for i in places]
+    if set(called) == {molecule.site_names[s] for s in sites}:
+        return _Candidate(k, [places[called.index(molecule.site_names[s])] for s in sites], nameless=False)
+    left = list(places)
+    order = []
+    for label in labels:
+        order.append(next(i for i in left if kinds[i] == label))
+        left.remove(order[-1])
+    return _Candidate(k, order, nameless=False)
+
+
+def _place(atoms, kinds, runs, members, candidates, species, cell, tolerance, found: Matched, faults: dict) -> None:
+    """Fit like runs to their candidates; write into `found`, or into `faults`."""
+    fits = []
+    for c in candidates:
+        order = np.array(runs)[:, c.order]
+        molecule = species[c.species]
+        labels = [_labels(molecule)[s] for s in massive(molecule)]
+        wild = [None if c.nameless else kinds[i] for i in order[0]]
+        allowed = np.array([[kind in (None, label) for kind in wild] for label in labels])
+        fits.append((order, _fit_in_any_order(atoms.position, order, molecule, cell, allowed, tolerance)))
+    for row, m in enumerate(members):
+        limits = [tolerance * species[c.species].radius for c in candidates]
+        good = [k for k, (_, fit) in enumerate(fits) if len(fits[k][0][row]) == 1 or fit.deviation[row] <= limits[k]]
+        if len(good) == 1:
+            order, fit = fits[good[0]]
+            found.species[m] = candidates[good[0]].species
+            found.atoms[m] = order[row]
+            found.centre[m], found.rotation[m] = fit.centre[row], fit.rotation[row]
+            found.deviation[m], found.square[m] = fit.deviation[row], fit.square[row]
+        elif good:
+            names = " or ".join(species[candidates[k].species].name for k in good)
+            faults[m] = f"may be {names}: give them residue_names in the scene"
+        else:
+            k = int(np.argmin([fit.deviation[row] / limit for (_, fit), limit in zip(fits, limits, strict=True)]))
+            faults[m] = (
+                f"is no {species[candidates[k].species].name}: an atom is {fits[k][1].deviation[row]:.3f} Å from the "
+                f"rigid template, more than {limits[k]:.3f} Å (structure.tolerance)"
+            )
+
+
+def _fit_in_any_order(
+    position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: np.ndarray, tolerance: float
+) -> Fit:
+    """The fit of molecules by their atoms `order` (m, s), which is put right in place where another order fits.
+
+    allowed (s, s): whether a site may be an atom of the order given.
+    """
+    limit = tolerance * molecule.radius
+    points = _whole(position[order], cell)
+    fit = _fit(points, molecule)
+    bad = np.flatnonzero(fit.deviation > limit)
+    while len(bad) and allowed.sum() > len(allowed):
+        better = _search(points[bad[0]], molecule, allowed, limit)
+        if better is None:
+            bad = bad[1:]
+            continue
+        again = _fit(points[bad][:, better], molecule)  # files repeat themselves: what mends one mends the others
+        mended = again.deviation <= limit
+        for old, new in zip(fit, again, strict=True):
+            old[bad[mended]] = new[mended]
+        order[bad[mended]] = order[bad[mended]][:, better]
+        mended[0] = True  # or, by a rounding, as good as
+        bad = bad[~mended]
+    return fit
+
+
+def _whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
+    """Molecules (m, s, 3) with every atom at the image nearest to the first."""
+    if cell is None or points.shape[1] == 1:
+        return points
+    from ase.geometry import find_mic
+
+    step, _ = find_mic((points - points[:, :1]).reshape(-1, 3), cell, pbc=True)
+    return points[:, :1] + step.reshape(points.shape)
+
+
+def _fit(points: np.ndarray, molecule: Molecule) -> Fit:
+    """Best rigid fit of a template to whole molecules (m, s, 3), their centres of mass in one place."""
+    sites = massive(molecule)
+    masses, template = molecule.masses[sites], molecule.positions_body[sites]
+    centre = points[:, 0] + np.einsum("s,nsk->nk", masses, points - points[:, :1]) / masses.sum()
+    relative = points - centre[:, None]
+    rotation = align(template, relative, masses)
+    off = np.linalg.norm(relative - np.einsum("nij,sj->nsi", rotation, template), axis=2)
+    return Fit(centre, rotation, off.max(axis=1), (off**2).mean(axis=1))
+
+
+def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> list[int] | None:
+    """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
+
+    Sites are given atoms one by one, such that all distances between them agree: first closely, then up to twice the
+    limit, beyond which no fit within it exists.
+    """
+    template = molecule.positions_body[massive(molecule)]
+    wanted = np.linalg.norm(template[:, None] - template, axis=2)
+    there = np.linalg.norm(points[:, None] - points, axis=2)
+    tries = 0
+
+    def extended(order: list[int], closeness: float) -> list[int] | None:
+        nonlocal tries
+        site = len(order)
+        if site == len(points):
+            return order if _fit(points[None, order], molecule).deviation[0] <= limit else None
+        tries += 1
+        if tries > MOST_TRIES:
+            return None
+        off = np.abs(there[:, order] - wanted[site, :site]).max(axis=1, initial=0.0)
+        off[order] = inf
+        off[~allowed[site]] = inf
+        for atom in np.argsort(off):
+            if off[atom] > closeness:
+                return None
+            if found := extended([*order, int(atom)], closeness):
+                return found
+        return None
+
+    for closeness in (0.1, 0.5, 2.0):
+        tries = 0
+        if found := extended([], closeness * limit):
+            return found
+    return None

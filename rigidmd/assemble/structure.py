@@ -1,0 +1,311 @@
+"""A start from a structure file: its atoms as the scene's molecules, in the scene's box."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.cells import (
+    angles_deg,
+    basis_in_words,
+    basis_of,
+    edges_in_words,
+    reduced,
+    right_angled,
+    roomiest,
+    same_lattice,
+    standard_rotation,
+)
+from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
+from rigidmd.assemble.structure_files import SAME_MASS, Atoms, read_atoms
+from rigidmd.core.state_file import read_state
+from rigidmd.errors import StructureError
+from rigidmd.forces.waves.ewald import AS_GIVEN
+from rigidmd.molecules import Molecule
+from rigidmd.validation import meant
+
+MOST_NAMED = 5  # how many molecules a message names before it only counts
+ROUNDING = 1e-12  # of the longest edge: what turning a cell leaves
+SAME_BOX = 1e-4  # boxes of file and scene that differ by less, relatively, are the same as printed
+#: Units in which files are given by mistake, in Å.
+OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
+CLOSE = 1.2  # how well distances between atoms agree with bonds of the templates, as a factor
+
+
+class Arrangement(NamedTuple):
+    """Where molecules are and how they move, as a file says."""
+
+    species: np.ndarray  # (n,) index into the scene's molecules
+    position: np.ndarray  # (n, 3) Å
+    rotation: np.ndarray  # (n, 3, 3)
+    velocity: np.ndarray | None  # (n, 3) Å/ps
+    angular_momentum_body: np.ndarray | None  # (n, 3) u Å²/ps
+    cell: np.ndarray | None  # (3, 3), rows a along x, b in xy, c; Å
+    residual_rms: float  # Å, of all atoms against their templates
+    residual_max: float  # Å
+    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
+    notes: tuple[str, ...] = ()  # what was made of the file beyond reading it
+    basis: np.ndarray = AS_GIVEN  # (3, 3) integers: the edges of the cell in those of the cell that was described
+
+
+def read_structure(
+    path: Path,
+    species: list[Molecule],
+    wanted: np.ndarray | None,
+    periodic: bool,
+    tolerance: float,
+    frame: int | None = None,
+    repeat: tuple[int, int, int] = (1, 1, 1),
+    atom_types: dict[str, str] | None = None,
+) -> Arrangement:
+    """The molecules of a structure file. Raises StructureError.
+
+    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types: see
+    Scene.structure.
+    """
+    if path.suffix == ".npz":
+        if frame is not None:
+            raise StructureError(str(path), ["holds one state: leave out structure.frame"])
+        found = _read_state(path, species)
+        if periodic and wanted is None:
+            _check_box(path, found.cell, [])
+    else:
+        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types)
+    notes = list(found.notes)
+    if not periodic:
+        cell = None
+    elif wanted is not None:
+        cell = wanted
+        if found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
+            notes.append("the scene's box counts, not that of the file")
+    else:
+        cell = found.cell
+    found = found._replace(cell=cell, notes=tuple(notes))
+    if repeat != (1, 1, 1):
+        found = _repeated(found, repeat)
+    return leaning_less(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
+
+
+def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
+    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off.
+
+    whose : the lattice, in words
+    """
+    if found.cell is None:
+        return found
+    cell, turn = roomiest(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
+    if np.array_equal(cell, found.cell):
+        return found
+    basis = basis_of(cell @ turn, found.cell)
+    told = (
+        f"{whose} lattice is described by the cell with {edges_in_words(cell)}, {basis_in_words(basis)}, "
+        f"in place of {edges_in_words(found.cell)}"
+    )
+    if np.array_equal(turn, np.eye(3)):
+        return found._replace(cell=cell, notes=(*found.notes, told), basis=basis)
+    return found._replace(
+        cell=cell,
+        position=found.position @ turn.T,
+        rotation=turn @ found.rotation,
+        velocity=None if found.velocity is None else found.velocity @ turn.T,
+        notes=(*found.notes, f"{told}; turned, contents included"),
+        basis=basis,
+    )
+
+
+def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
+    """The cell and its molecules beside one another, `repeat` times along each edge."""
+    shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ found.cell
+
+    def tiled(values):
+        return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))
+
+    return found._replace(
+        species=tiled(found.species),
+        number=tiled(found.number),
+        position=(found.position + shifts[:, None]).reshape(-1, 3),
+        rotation=tiled(found.rotation),
+        velocity=tiled(found.velocity),
+        angular_momentum_body=tiled(found.angular_momentum_body),
+        cell=found.cell * np.array(repeat)[:, None],
+        notes=(*found.notes, f"its {len(found.species)} molecules stand {' x '.join(map(str, repeat))} times"),
+    )
+
+
+def _read_molecules(
+    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types
+) -> Arrangement:
+    _check_types(path, atom_types or {}, species)
+    atoms = read_atoms(path, frame, atom_types)
+    notes = list(atoms.notes)
+    if atoms.cell is not None:
+        cell, turn = standard_rotation(atoms.cell)
+        if not np.array_equal(turn, np.eye(3)):
+            velocity = None if atoms.velocity is None else atoms.velocity @ turn.T
+            atoms = atoms._replace(position=atoms.position @ turn.T, velocity=velocity)
+            notes.append("its cell was turned, contents included, so that a is along x and b in the xy plane")
+        if np.linalg.det(atoms.cell) < 0:
+            notes.append("its cell is left-handed: -c stands for c, which leaves the lattice as it is")
+        if right_angled(cell):
+            upright = np.diag(np.linalg.norm(cell, axis=1))
+            if np.abs(upright - cell).max() > ROUNDING * cell.max():
+                told = ", ".join(f"{x:.7g}" for x in angles_deg(cell))
+                notes.append(f"its angles of {told}° were taken for right ones")
+            cell = upright
+        atoms = atoms._replace(cell=cell)
+    if periodic and wanted is None:
+        _check_box(path, atoms.cell, notes)
+    across = atoms.cell if atoms.cell is not None or not periodic else wanted
+    matched = match(atoms, species, across, tolerance)
+    if isinstance(matched, list):
+        more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
+        faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        raise StructureError(str(path), faults)
+    notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
+    velocity, angular = _momenta(atoms, matched, species, notes)
+    sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]
+    return Arrangement(
+        species=matched.species,
+        position=matched.centre,
+        rotation=matched.rotation,
+        velocity=velocity,
+        angular_momentum_body=angular,
+        cell=atoms.cell,
+        residual_rms=float(np.sqrt(matched.square @ sizes / sizes.sum())),
+        residual_max=float(matched.deviation.max()),
+        number=matched.number,
+        notes=tuple(notes),
+    )
+
+
+def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
+    """Refuse names of atom types that are in no molecule of the scene."""
+    known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
+    faults = [
+        f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
+        f"{', '.join(known)}{meant(name, known)}"
+        for number, name in atom_types.items()
+        if name not in (*known, "X")
+    ]
+    if faults:
+        raise StructureError(str(path), faults)
+
+
+def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
+    """Which atoms of a file with masses weigh what no site of the scene does."""
+    if atoms.masses is None:
+        return []
+    masses = np.unique([mass for m in species for mass in m.masses[massive(m)]])
+    strange = {
+        f"{name} ({mass:g} u)": None
+        for name, mass in zip(atoms.names, atoms.masses.tolist(), strict=True)
+        if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
+    }
+    if not strange:
+        return []
+    there = ", ".join(f"{mass:g}" for mass in masses)
+    return [
+        f"its atom types {', '.join(strange)} weigh what no site of the scene's molecules does ({there} u): say what "
+        "they are by structure.atom_types, or give the molecules these masses by masses_u"
+    ]
+
+
+def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> list[str]:
+    """A note where atoms weigh other than the sites that they became."""
+    if atoms.masses is None:
+        return []
+    other = {}
+    for k, molecule in enumerate(species):
+        for s, site in enumerate(massive(molecule)):
+            own = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
+            mass = float(molecule.masses[site])
+            for i in own[np.abs(atoms.masses[own] - mass) > SAME_MASS * mass]:
+                other[f"{atoms.names[i]} {atoms.masses[i]:g} against {molecule.site_names[site]} {mass:g} u"] = None
+    if not other:
+        return []
+    return [f"masses of the scene count, not those of the file ({'; '.join(other)}): masses_u changes them"]
+
+
+def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
+    """Refuse a start without a box."""
+    if cell is None:
+        told = f" ({'; '.join(notes)})" if notes else ""
+        raise StructureError(str(path), [f"has no box{told}: give [box] lengths_A, or periodic = false"])
+
+
+def _massless(matched: Matched, species: list[Molecule]) -> list[str]:
+    """What became of sites without mass, which are where the template has them, whatever the file says."""
+    lacking = [len(molecule.masses) - len(massive(molecule)) for molecule in species]
+    expected = int(np.array(lacking)[matched.species].sum())
+    there = sum(matched.massless.values())
+    if there > expected:
+        return [f"{there - expected} sites without mass ({', '.join(matched.massless)}) that no model has: left out"]
+    if there < expected:
+        names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
+        return [f"{expected - there} sites without mass that the file lacks ({names}): built by the rigid template"]
+    return []
+
+
+def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: list[str]):
+    """Velocities (n, 3) and body angular momenta (n, 3) with the linear and angular momentum of the atoms', or None.
+
+    Of linear bodies and points only what they have inertia for.
+    """
+    if atoms.velocity is None:
+        return None, None
+    without = np.isnan(atoms.velocity).any(axis=1)
+    if lost := sorted(i for run in matched.atoms for i in run[without[run]]):
+        notes.append(f"{len(lost)} of its atoms have no velocity (the first is atom {lost[0] + 1}): none is used")
+        return None, None
+    n = len(matched.species)
+    velocity, angular = np.zeros((n, 3)), np.zeros((n, 3))
+    for k, molecule in enumerate(species):
+        members = np.flatnonzero(matched.species == k)
+        if len(members) == 0:
+            continue
+        sites = massive(molecule)
+        masses = molecule.masses[sites]
+        v = atoms.velocity[np.array([matched.atoms[m] for m in members])]
+        velocity[members] = np.einsum("s,nsk->nk", masses, v) / masses.sum()
+        rotation = matched.rotation[members]
+        arm = np.einsum("nij,sj->nsi", rotation, molecule.positions_body[sites])
+        lab = np.einsum("s,nsk->nk", masses, np.cross(arm, v - velocity[members][:, None]))
+        angular[members] = np.einsum("nij,ni->nj", rotation, lab) * (molecule.inertia > 0)
+    return velocity, angular
+
+
+def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
+    """A guess at the units, where atoms are as close to one another as those of molecules in other units than Å."""
+    from scipy.spatial import cKDTree
+    from scipy.spatial.distance import pdist
+
+    bonds = [pdist(m.positions_body[massive(m)]).min() for m in species if len(massive(m)) > 1]
+    if not bonds or len(atoms.position) < 2:
+        return []
+    nearest = float(np.median(cKDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
+    found = [
+        f"the coordinates seem to be in {unit}, not in Å as this format has them: atoms are {nearest:.3g} apart"
+        for unit, angstrom in OTHER_UNITS.items()
+        if min(bonds) / CLOSE <= nearest * angstrom <= max(bonds) * CLOSE
+    ]
+    return [] if min(bonds) / CLOSE <= nearest <= max(bonds) * CLOSE else found
+
+
+def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
+    """The final state of an earlier run; every bit of it."""
+    saved = read_state(path)
+    known = [molecule.name for molecule in species]
+    if missing := [name for name in saved.names if name not in known]:
+        raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
+    state, n, turning = saved.state, len(saved.species), len(saved.state.rotation) > 0
+    return Arrangement(
+        species=np.array([known.index(name) for name in saved.names])[saved.species],
+        position=state.position,
+        rotation=state.rotation if turning else np.tile(np.eye(3), (n, 1, 1)),
+        velocity=state.velocity,
+        angular_momentum_body=state.angular_momentum_body if turning else np.zeros((n, 3)),
+        cell=state.cell if np.isfinite(state.cell).all() else None,
+        residual_rms=0.0,
+        residual_max=0.0,
+        number=saved.residue_number,
+    )

@@ -1,0 +1,184 @@
+"""The Python side of the compiled code: it owns lists, grids, sums and machine code, gives kernels room when they ask
+for it, and tells apart what they report."""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.schemes import Scheme
+from rigidmd.core.state import (
+    ASK,
+    CELL_CHANGED,
+    EXAMPLE,
+    LIST_FULL,
+    NOT_FINITE,
+    NOW,
+    ORIGIN,
+    TALLY_SIZE,
+    Load,
+    State,
+    no_load,
+)
+from rigidmd.dynamics.advance import Model, advance, code_of, row_of
+from rigidmd.dynamics.baths import NoBath
+from rigidmd.dynamics.body import Body
+from rigidmd.dynamics.gradient import Probe, probe_for
+from rigidmd.engines import Tally
+from rigidmd.errors import SimulationError
+from rigidmd.forces.body.fields import answer
+from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room, workspace_of
+from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
+
+Precision = Literal["double", "mixed"]
+DTYPES = {"double": np.float64, "mixed": np.float32}
+
+
+class Engine:
+    """What moves states of a model under terms, on this machine's processor.
+
+    Parameters
+    ----------
+    model : what never changes
+    terms : name -> term, in the order in which forces are added
+    precision : arithmetic between sites; "mixed" is single, summed and moved in double
+    skin : extra radius of neighbour lists, Å; speed only
+    applied : functions of (time, state) that terms of type `Told` stand for: name -> function
+    """
+
+    def __init__(
+        self,
+        model: Model | Body,
+        terms: dict[str, NamedTuple],
+        precision: Precision = "double",
+        skin: float = 1.6,
+        applied: dict[str, Callable[[float, State], tuple]] | None = None,
+    ):
+        self.model = model
+        self.terms = terms
+        self.names = list(terms)
+        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin)
+        self._applied = applied or {}
+        self._workspaces: tuple[NamedTuple, ...] | None = None
+        self._codes: dict = {}
+        self.load: Load | None = None
+        self._probe: Probe | None = None
+        self._stale = True
+        self._moved: State | None = None
+
+    @property
+    def workspaces(self) -> dict[str, NamedTuple]:
+        """The workspaces by the names of their terms, as they are now; there are none before the first use."""
+        return dict(zip(self.names, self._workspaces or (), strict=False))
+
+    def change(self, model: Model | Body, terms: dict[str, NamedTuple]) -> None:
+        """Go on with others of the same types: what follows time as told enters its next piece."""
+        self.model, self.terms = model, terms
+        self._workspaces = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Say that positions were changed from outside since the last step."""
+        self._stale = True
+
+    def begin(self, state: State, scheme: Scheme) -> State:
+        """A copy of a state with room for all that evolves when a scheme moves it."""
+        return state.copy()
+
+    def advance(self, state: State, scheme: Scheme, dt: float, until: int) -> None:
+        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
+        self._prepare(state)
+        keep_time(state, dt)
+        self._moved = state
+        if self.load is None:
+            self.load = no_load(state)
+        if scheme.has_gradient and self._probe is None:
+            self._probe = probe_for(state)
+        probe = self._probe if scheme.has_gradient else None
+        model = self.model_for(scheme)
+        kind = type(model.rotor)
+        if kind not in self._codes:
+            self._codes[kind] = code_of(model)
+        code, bath, row = self._codes[kind], scheme.bath or NoBath(), row_of(scheme)
+        cursor = np.array([0, not self._stale], np.int64)
+        while status := advance(model, code, state, self.load, self._workspaces, bath, row, probe, dt, until, cursor):
+            self._answer(status, state)
+        self._stale = False
+
+    def model_for(self, scheme: Scheme) -> Model | Body:
+        """The model with the rotor that a scheme needs; only an asymmetric body turns differently by an exact one."""
+        rotor = self.model.rotor
+        if scheme.exact_rotor and isinstance(rotor, SplitRotor) and (rotor.symmetry == NONE).any():
+            return self.model._replace(rotor=ExactRotor(*rotor))
+        return self.model
+
+    def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
+        self._prepare(state)
+        load = no_load(state)
+        tallies = {}
+        for k, name in enumerate(self.names):
+            tally = np.zeros(TALLY_SIZE)
+            while status := add_term(self._workspaces[k], state, load, tally):
+                self._answer(status, state)
+            tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
+        return load, tallies
+
+    def snapshot(self) -> State:
+        """A copy of the state that was last moved."""
+        if self._moved is None:
+            raise ValueError("this engine has moved no state yet")
+        return self._moved.copy()
+
+    def room(self, state: State) -> tuple[NamedTuple, ...]:
+        """Workspaces for the cell of a state, new ones, without machine code: what they hold in memory."""
+        setup = self._setup._replace(cell=state.cell)
+        return tuple(workspace_of(term, setup) for term in self.terms.values()) or (NoForce(),)
+
+    def _prepare(self, state: State) -> None:
+        """Check what compiled code is to work on, and make its workspaces."""
+        _check_arrays(state)
+        if self._workspaces is None:
+            self._workspaces = tuple(with_code(workspace) for workspace in self.room(state))
+
+    def _answer(self, status: int, state: State) -> None:
+        if status in (LIST_FULL, CELL_CHANGED):
+            self._workspaces = tuple(with_room(workspace, state.cell) for workspace in self._workspaces)
+        elif status == NOT_FINITE:
+            raise NotFiniteError(state)
+        elif status == ASK:
+            for name, function in self._applied.items():
+                answer(self.workspaces[name], function, state)
+
+
+def keep_time(state: State, dt: float) -> None:
+    """Begin a new stretch of equal steps, in place, where the last one was of others, or time was set from outside."""
+    if state.time[NOW] != state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt:
+        state.begin_stretch()
+
+
+def _check_arrays(state: State) -> None:
+    """Raise TypeError if an array of a state is not of the type that code is compiled for."""
+    for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
+        if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
+            raise TypeError(
+                f"state.{name} must be a contiguous, writable array of {example.dtype} in C order with "
+                f"{example.ndim} axes (core.state.state_of makes a state of any arrays)"
+            )
+
+
+class NotFiniteError(SimulationError):
+    """Positions or momenta that are no numbers any more, or positions that say nothing about forces."""
+
+    def __init__(self, state: State):
+        moving = [array for array in state[:4] if len(array)]
+        rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in moving]
+        size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
+        if np.isfinite(size).all():
+            self.molecule = int(rows[0].argmax())
+            distance = rows[0][self.molecule]
+            self.fault = f"it is {distance:.3g} Å from the origin, too far to tell in which image of the box"
+        else:
+            self.molecule = int(size.argmax())
+            self.fault = "its position or momentum is no finite number"
+        super().__init__(f"molecule {self.molecule + 1} is nowhere: {self.fault}")

@@ -1,0 +1,1 @@
+"""What acts on a single body: fields, resistance, the axes it is told in."""

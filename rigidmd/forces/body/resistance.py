@@ -1,0 +1,263 @@
+"""Resistance: bearings, air and fluids that take energy from a single body, along and about its own axes.
+
+It acts within the kick: momentum under a constant load and resistance, positions held, follows each axis in closed
+form. So a body in a thick fluid moves at its terminal speed whatever the step, and dry friction holds what it can hold.
+The step is of order 2.
+"""
+
+from math import copysign, exp, expm1, log1p, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a, kernel
+from rigidmd.core.state import WORK
+from rigidmd.forces.body.frame import frame_rate
+from rigidmd.mechanics.flight import Pinned, along, inertial_mass
+from rigidmd.mechanics.rotor import NoRotor, moments
+
+MOST_TRIALS = 100  # of |v|; some six are needed
+SAME_SIZE = 1e-14
+
+
+class NoResistance(NamedTuple):
+    """Nothing is lost."""
+
+    nothing: float = 0.0
+
+
+class Resistance(NamedTuple):
+    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), by body axis.
+
+    v and w are relative to the frame, |v| and |w| their whole size, so equal coefficients mean resistance alike in all
+    directions. Dry friction is that of a bearing about a body axis under constant load.
+    """
+
+    linear: np.ndarray  # (3,)
+    quadratic: np.ndarray  # (3,)
+    rotation_dry: np.ndarray  # (3,)
+    rotation_linear: np.ndarray  # (3,)
+    rotation_quadratic: np.ndarray  # (3,)
+
+
+def push(resistance, flight, rotor, frame, state, load, h):
+    """Momentum of a single body under a load and resistance for a time h, positions held, in place."""
+    raise TypeError("compiled code only")
+
+
+@implements(push, inline=True)
+def _push(resistance, flight, rotor, frame, state, load, h):
+    flies, turns = not is_a(flight, Pinned), not is_a(rotor, NoRotor)
+    if is_a(resistance, NoResistance):
+
+        def push_freely(resistance, flight, rotor, frame, state, load, h):
+            for m in range(len(load.force)):
+                for k in range(3):
+                    state.velocity[m, k] += h / flight.mass * load.force[m, k]
+            for m in range(len(load.torque_body)):
+                for k in range(3):
+                    if moments(rotor, state.time[0], k)[0] > 0:  # no momentum gathers on an axis without inertia
+                        state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
+
+        return push_freely
+
+    def push_against(resistance, flight, rotor, frame, state, load, h):
+        if flies:
+            push_flight(resistance, flight, rotor, frame, state, load, h)
+        if turns:
+            push_spin(resistance, rotor, frame, state, load, h)
+
+    return push_against
+
+
+@kernel
+def push_spin(resistance, rotor, frame, state, load, h):
+    """L under torque and resistance; |w| is that of the middle of the kick."""
+    W = frame_rate(frame, state.time[0])
+    q = state.rotation[0]
+    L = state.angular_momentum_body[0]
+    i0, h0 = moments(rotor, state.time[0], 0)
+    i1, h1 = moments(rotor, state.time[0], 1)
+    i2, h2 = moments(rotor, state.time[0], 2)
+    inverse, carried = (i0, i1, i2), (h0, h1, h2)
+    dragged = (along(q, W, 0), along(q, W, 1), along(q, W, 2))
+    before = ((L[0] - h0) * i0 - dragged[0], (L[1] - h1) * i1 - dragged[1], (L[2] - h2) * i2 - dragged[2])
+    torque = load.torque_body[0]
+    pushes = (i0 * torque[0], i1 * torque[1], i2 * torque[2])
+    dry, linear, quadratic = resistance.rotation_dry, resistance.rotation_linear, resistance.rotation_quadratic
+    dries = (i0 * dry[0], i1 * dry[1], i2 * dry[2])
+    size = middle_size(before, pushes, dries, inverse, linear, quadratic, h)
+    for k in range(3):
+        if inverse[k] > 0.0:
+            rate = inverse[k] * (linear[k] + quadratic[k] * size)
+            after, turned = pushed(before[k], pushes[k], dries[k], rate, h)
+            L[k] = (after + dragged[k]) / inverse[k] + carried[k]
+            state.books[WORK] += (0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned) / inverse[k]
+
+
+@kernel
+def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
+    """|v| at the middle of a kick whose resistance is that of this very |v|, v its start, per unit inertia.
+
+    Between 0 and the most that the push can make of v, |v| found less |v| assumed changes sign: a root by regula falsi
+    (Illinois). A first guess alone would brake a fast body to nothing at the middle, and then not at all.
+    """
+    if quadratic[0] == 0.0 and quadratic[1] == 0.0 and quadratic[2] == 0.0:
+        return 0.0
+    low, high = 0.0, 0.0
+    for k in range(3):
+        high += (abs(before[k]) + 0.5 * h * abs(pushes[k])) ** 2
+    high = sqrt(high)
+    above = size_found(before, pushes, dries, inverse, linear, quadratic, h, low)
+    below = size_found(before, pushes, dries, inverse, linear, quadratic, h, high) - high
+    if not above > 0.0 or not below < 0.0:
+        return low if not above > 0.0 else high
+    side = 0
+    for _ in range(MOST_TRIALS):
+        size = (low * below - high * above) / (below - above)
+        found = size_found(before, pushes, dries, inverse, linear, quadratic, h, size) - size
+        if abs(found) <= SAME_SIZE * size or high - low <= SAME_SIZE * high:
+            return size
+        if found > 0.0:
+            low, above = size, found
+            below *= 0.5 if side == 1 else 1.0
+            side = 1
+        else:
+            high, below = size, found
+            above *= 0.5 if side == -1 else 1.0
+            side = -1
+    return size
+
+
+@kernel
+def size_found(before, pushes, dries, inverse, linear, quadratic, h, size):
+    """|v| after half of h with the resistance of a |v|."""
+    squares = 0.0
+    for k in range(3):
+        if inverse[k] > 0.0:
+            rate = inverse[k] * (linear[k] + quadratic[k] * size)
+            middle, _ = pushed(before[k], pushes[k], dries[k], rate, 0.5 * abs(h))
+            squares += middle * middle
+    return sqrt(squares)
+
+
+def push_flight(resistance, flight, rotor, frame, state, load, h):
+    """Velocity (or impulse over mass) under force and resistance; |v| as |w| in `push_spin`."""
+    raise TypeError("compiled code only")
+
+
+@implements(push_flight)
+def _push_flight(resistance, flight, rotor, frame, state, load, h):
+    turns = not is_a(rotor, NoRotor)
+
+    def push_flight(resistance, flight, rotor, frame, state, load, h):
+        W = frame_rate(frame, state.time[0])
+        x = state.position[0]
+        V = state.velocity[0]
+        F = load.force[0]
+        wind = (W[1] * x[2] - W[2] * x[1], W[2] * x[0] - W[0] * x[2], W[0] * x[1] - W[1] * x[0])
+        mass = (inertial_mass(flight, 0), inertial_mass(flight, 1), inertial_mass(flight, 2))
+        inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
+        if turns:
+            q = state.rotation[0]
+            share = (flight.mass * inverse[0], flight.mass * inverse[1], flight.mass * inverse[2])
+            before = (
+                share[0] * along(q, V, 0) - along(q, wind, 0),
+                share[1] * along(q, V, 1) - along(q, wind, 1),
+                share[2] * along(q, V, 2) - along(q, wind, 2),
+            )
+            pulls = (along(q, F, 0) * inverse[0], along(q, F, 1) * inverse[1], along(q, F, 2) * inverse[2])
+        else:
+            before = (V[0] - wind[0], V[1] - wind[1], V[2] - wind[2])
+            pulls = (F[0] * inverse[0], F[1] * inverse[1], F[2] * inverse[2])
+        linear, quadratic = resistance.linear, resistance.quadratic
+        size = middle_size(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
+        for k in range(3):
+            after, flown = pushed(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
+            state.books[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
+            gain = (after - before[k]) * mass[k] / flight.mass
+            if turns:
+                for i in range(3):  # along axis k only: what the other axes see stays as it was
+                    V[i] += state.rotation[0, i, k] * gain
+            else:
+                V[k] += gain
+
+    return push_flight
+
+
+@kernel
+def pushed(speed, push, dry, linear, h):
+    """(s, integral of s) after h of s' = push - dry sign(s) - linear s, per unit inertia; dry and linear not negative.
+
+    Dry friction brings it to rest in finite time, and holds it there unless the push is stronger.
+    """
+    s = abs(speed)
+    sign = copysign(1.0, speed)
+    if s == 0.0:
+        if abs(push) <= dry:
+            return 0.0, 0.0
+        sign = copysign(1.0, push)
+    net = sign * push - dry
+    if net < 0.0:
+        rest = log1p(linear * s / -net) / linear if linear > 0.0 else s / -net
+        if rest <= h:  # it stops, and may then be pushed the other way
+            back = max(0.0, abs(push) - dry) if sign * push < 0.0 else 0.0
+            there = eased(linear, rest)
+            after, way = run_up(0.0, back, linear, h - rest)
+            return -sign * after, sign * (s * there[0] + net * there[1] - way)
+    after, way = run_up(s, net, linear, h)
+    return sign * after, sign * way
+
+
+@kernel(inline=True)
+def run_up(s, net, linear, h):
+    """(s, way) of s' = net - linear s."""
+    first, second = eased(linear, h)
+    return s * exp(-linear * h) + net * first, s * first + net * second
+
+
+@kernel(inline=True)
+def eased(linear, h):
+    """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h: h and h²/2 where nothing resists."""
+    x = linear * h
+    if x < 1e-2:  # the difference of nearly equal numbers, by its series
+        return (
+            h * (1 - x / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6 * (1 - x / 7)))))),
+            h * h / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6 * (1 - x / 7))))),
+        )
+    first = -expm1(-x) / linear
+    return first, (h - first) / linear
+
+
+def braking(resistance, state, load, velocity, omega):
+    """Add resistance to a load at a velocity (lab) and angular velocity (body), relative to the frame; its power."""
+    raise TypeError("compiled code only")
+
+
+@implements(braking)
+def _braking(resistance, state, load, velocity, omega):
+    if is_a(resistance, NoResistance):
+        return lambda resistance, state, load, velocity, omega: 0.0
+
+    def brake(resistance, state, load, velocity, omega):
+        power = 0.0
+        for m in range(len(load.force)):
+            size = sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+            for k in range(3):
+                v = along(state.rotation[m], velocity, k) if len(state.rotation) else velocity[k]
+                f = -(resistance.linear[k] + resistance.quadratic[k] * size) * v
+                power += f * v
+                if len(state.rotation):
+                    for i in range(3):
+                        load.force[m, i] += state.rotation[m, i, k] * f
+                else:
+                    load.force[m, k] += f
+        for m in range(len(load.torque_body)):
+            size = sqrt(omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2)
+            for k in range(3):
+                torque = -(resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size) * omega[k]
+                load.torque_body[m, k] += torque
+                power += torque * omega[k]
+        return power
+
+    return brake

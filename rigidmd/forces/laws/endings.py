@@ -1,0 +1,154 @@
+"""How a radial law ends at its cut-off: plain, shift, force_shift, force_switch, switch or smooth_switch.
+
+A law is a sum of radial parts v(r). Inside the cut-off a part becomes
+
+    v(r) + constant - integral of p(x) dx,   x = r - start,   p(x) = linear + quadratic x² + cubic x³   (r > start)
+
+so p is what is added to the force -v'; or, for `switch` and `smooth_switch`, v(r) S(r) with S falling from 1 to 0.
+
+| name | what it does | continuous at the cut-off |
+|---|---|---|
+| plain | nothing | nothing |
+| shift | adds a constant (GROMACS potential-shift) | energy |
+| force_shift | subtracts a linear term from the start | energy, force |
+| force_switch | adds a cubic to the force beyond `start` (GROMACS) | energy, force, its derivative |
+| switch | multiplies the energy by a quintic beyond `start` (OpenMM) | energy, force, its derivative |
+| smooth_switch | multiplies the energy by a polynomial of degree 9 beyond `start` | also three more derivatives |
+
+An integrator has its order only where forces have as many derivatives: with `switch` those of order 4 and 6 fall off to
+about 3 in liquid water, with `smooth_switch` from 5 to 9 Å they have 4.0 and 6.
+"""
+
+from collections.abc import Callable
+from math import inf
+from typing import Literal, NamedTuple, get_args
+
+from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile.lanes import larger
+
+Name = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
+NAMES: tuple[str, ...] = get_args(Name)
+
+
+class Plain(NamedTuple):
+    """Nothing happens before the cut-off; `plain` and `shift`."""
+
+    cutoff: float  # Å, may be infinite
+
+
+class Bent(NamedTuple):
+    """A polynomial is added to the force from the start on; `force_shift` and `force_switch`."""
+
+    cutoff: float  # Å
+    start: float  # Å
+
+
+class Switched(NamedTuple):
+    """The energy is multiplied by a polynomial of degree 5 that falls from 1 at the start to 0; `switch`."""
+
+    cutoff: float  # Å
+    start: float  # Å
+
+
+class SmoothlySwitched(NamedTuple):
+    """The same by one of degree 9; `smooth_switch`."""
+
+    cutoff: float  # Å
+    start: float  # Å
+
+
+Shape = Plain | Bent | Switched | SmoothlySwitched
+Polynomial = tuple[float, float, float, float]
+SWITCHES = {"switch": Switched, "smooth_switch": SmoothlySwitched}
+
+
+def shape_of(name: Name, cutoff: float, start: float) -> Shape:
+    """The shape of the ending called `name`; `start` (Å) counts for force_switch and switch only."""
+    if cutoff == inf or name in ("plain", "shift"):
+        return Plain(cutoff)
+    if name in SWITCHES:
+        return SWITCHES[name](cutoff, start)
+    return Bent(cutoff, 0.0 if name == "force_shift" else start)
+
+
+def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, float, float]]) -> Polynomial:
+    """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) is its energy v, force -v' and -v''."""
+    if shape.cutoff == inf or name == "plain" or name in SWITCHES:
+        return (0.0, 0.0, 0.0, 0.0)
+    v, force, slope = at_cutoff(shape.cutoff)
+    if name == "shift":
+        return (-v, 0.0, 0.0, 0.0)
+    d = shape.cutoff - shape.start
+    if name == "force_shift":
+        return (-v - force * d, -force, 0.0, 0.0)
+    quadratic = (slope - 3 * force / d) / d
+    cubic = (2 * force / d - slope) / d**2
+    return (quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic)
+
+
+def ended(shape, end, r, inverse, u, w):
+    """(energy, force/r) with the ending: u, w without it at distance r = 1/inverse; numbers or vectors.
+
+    The constant of `end` is part of u already.
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(ended, PAIR_FLAGS, inline=True)
+def _ended(shape, end, r, inverse, u, w):
+    if is_a(shape, Plain):
+        return lambda shape, end, r, inverse, u, w: (u, w)
+    if is_a(shape, Bent):
+
+        def bent(shape, end, r, inverse, u, w):
+            du, df = added(end, larger(r - shape.start, 0.0))
+            return u + du, w + df * inverse
+
+        return bent
+
+    if is_a(shape, Switched):
+
+        def switched(shape, end, r, inverse, u, w):
+            s, slope = quintic(shape, r)
+            return s * u, s * w - slope * u * inverse
+
+        return switched
+
+    def smoothly_switched(shape, end, r, inverse, u, w):
+        s, slope = nonic(shape, r)
+        return s * u, s * w - slope * u * inverse
+
+    return smoothly_switched
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+def added(end, x):
+    """(energy, force) that an ending adds at x = r - start >= 0, its constant not counted."""
+    linear = end[1]
+    quadratic = end[2]
+    cubic = end[3]
+    x2 = x * x
+    return -1.0 * x * (linear + x2 * (quadratic / 3 + x * (cubic / 4))), linear + x2 * (quadratic + x * cubic)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+def quintic(shape, r):
+    """(S, dS/dr) of 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start), and 1 before the start."""
+    per_width = 1 / (shape.cutoff - shape.start)
+    t = larger((r - shape.start) * per_width, 0.0)
+    left = 1.0 - t
+    return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), t * t * left * left * (-30.0 * per_width)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+def nonic(shape, r):
+    """The same of 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹."""
+    per_width = 1 / (shape.cutoff - shape.start)
+    t = larger((r - shape.start) * per_width, 0.0)
+    four = t * t * t * t
+    left2 = (1.0 - t) * (1.0 - t)
+    s = 1.0 - four * t * (126.0 - t * (420.0 - t * (540.0 - t * (315.0 - 70.0 * t))))
+    return s, four * left2 * left2 * (-630.0 * per_width)
+
+
+POLYNOMIALS = {Switched: quintic, SmoothlySwitched: nonic}

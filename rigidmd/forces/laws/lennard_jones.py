@@ -1,0 +1,224 @@
+"""Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), its endings at the cut-off, mixing rules, tail correction."""
+
+from math import pi
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.integrate import quad
+
+from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile.lanes import inverse, inverse_root, load, zeros
+from rigidmd.forces.laws.endings import (
+    POLYNOMIALS,
+    Bent,
+    Name,
+    Plain,
+    Polynomial,
+    Shape,
+    added,
+    ended,
+    ending,
+    shape_of,
+)  # fmt: skip
+from rigidmd.forces.pairs import loop as pairs
+
+Mixing = Literal["lorentz-berthelot", "geometric"]
+
+
+class LennardJones(NamedTuple):
+    """c12/r¹² - c6/r⁶ between kinds of sites, each power with its own ending."""
+
+    cutoff: float  # Å
+    shape: Shape
+    end12: Polynomial  # see truncation.ending
+    end6: Polynomial
+    kind: np.ndarray  # (s,) kind of each site, index into c6 and c12
+    c12: np.ndarray  # (kinds, kinds) u Å¹⁴/ps²
+    c6: np.ndarray  # (kinds, kinds) u Å⁸/ps²
+
+    def room(self, slots: int, dtype: type) -> "OneKind | ManyKinds":
+        """What the loop reads: two numbers where all sites are of one kind, else a table with room for all slots."""
+        head, kinds = self[:4], len(self.c12)
+        if kinds == 1:
+            return OneKind(*head, float(self.c12[0, 0]), float(self.c6[0, 0]))
+        table = zeros((2, kinds * slots), dtype)
+        return ManyKinds(*head, np.zeros(slots, np.int32), *table)
+
+
+class OneKind(NamedTuple):
+    """The law between sites that are all of one kind."""
+
+    cutoff: float
+    shape: Shape
+    end12: Polynomial
+    end6: Polynomial
+    c12: float
+    c6: float
+
+
+class ManyKinds(NamedTuple):
+    """The law with what each kind does to the site in each slot, so that the loop loads it without gathering."""
+
+    cutoff: float
+    shape: Shape
+    end12: Polynomial
+    end6: Polynomial
+    kind: np.ndarray  # (slots,)
+    c12: np.ndarray  # (kinds slots,)
+    c6: np.ndarray  # (kinds slots,)
+
+
+def lennard_jones(
+    kind: np.ndarray,
+    sigma: np.ndarray,
+    epsilon: np.ndarray,
+    cutoff: float,
+    name: Name = "plain",
+    start: float = 0.0,
+    mixing: Mixing = "lorentz-berthelot",
+    special: dict[tuple[int, int], tuple[float, float]] | None = None,
+) -> LennardJones:
+    """The law for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps².
+
+    special : (kind, kind) -> (sigma, epsilon) in place of the mixing rule, for both orders of the kinds
+    """
+    shape = shape_of(name, cutoff, start)
+    sigma_ij = (sigma[:, None] + sigma) / 2 if mixing == "lorentz-berthelot" else np.sqrt(sigma[:, None] * sigma)
+    epsilon_ij = np.sqrt(epsilon[:, None] * epsilon)
+    for (i, j), (own_sigma, own_epsilon) in (special or {}).items():
+        sigma_ij[[i, j], [j, i]] = own_sigma
+        epsilon_ij[[i, j], [j, i]] = own_epsilon
+    return LennardJones(
+        cutoff,
+        shape,
+        ending(name, shape, _inverse_power(12)),
+        ending(name, shape, _inverse_power(6)),
+        kind,
+        4 * epsilon_ij * sigma_ij**12,
+        4 * epsilon_ij * sigma_ij**6,
+    )
+
+
+def _inverse_power(p: int):
+    """r⁻ᵖ, its force and the derivative of its force."""
+    return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
+
+
+@implements(pairs.pair, PAIR_FLAGS, inline=True)
+def _pair(law, i, j, r2):
+    if is_a(law, OneKind):
+        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, r2)
+    if not is_a(law, ManyKinds):
+        return None
+
+    def pair(law, i, j, r2):
+        at = law.kind[i] * len(law.kind) + j
+        return energy_and_force(law, load(law.c12, at), load(law.c6, at), r2)
+
+    return pair
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def energy_and_force(law, c12, c6, r2):
+    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
+    inverse2, inverse1 = inverses(law.shape, r2)
+    six = inverse2 * inverse2 * inverse2
+    end = mixed(law.end12, law.end6, c12, c6)
+    u = (c12 * six - c6) * six + end[0]
+    w = (12 * c12 * six - 6 * c6) * six * inverse2
+    return ended(law.shape, end, r2 * inverse1, inverse1, u, w)
+
+
+def inverses(shape, r2):
+    """(1/r², 1/r) at squared distances r2; the second is for endings, and no root is taken where there is none."""
+    raise TypeError("compiled code only")
+
+
+@implements(inverses, PAIR_FLAGS, inline=True)
+def _inverses(shape, r2):
+    if is_a(shape, Plain):
+        return lambda shape, r2: (inverse(r2), 0.0)
+
+    def with_root(shape, r2):
+        inverse1 = inverse_root(r2)
+        return inverse1 * inverse1, inverse1
+
+    return with_root
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def mixed(end12, end6, c12, c6):
+    """The ending of a whole potential from those of its powers."""
+    return (
+        c12 * end12[0] - c6 * end6[0],
+        c12 * end12[1] - c6 * end6[1],
+        c12 * end12[2] - c6 * end6[2],
+        c12 * end12[3] - c6 * end6[3],
+    )
+
+
+@implements(pairs.arrange)
+def _arrange(law, arranged, order):
+    if not is_a(law, LennardJones):
+        return None
+    if is_a(arranged, OneKind):
+        return lambda law, arranged, order: None
+
+    def arrange(law, arranged, order):
+        for slot, i in enumerate(order):
+            arranged.kind[slot] = law.kind[i]
+            for k in range(len(law.c12)):
+                arranged.c12[k * len(order) + slot] = law.c12[k, law.kind[i]]
+                arranged.c6[k * len(order) + slot] = law.c6[k, law.kind[i]]
+
+    return arrange
+
+
+class Tail(NamedTuple):
+    """What the cut-off takes away, at any volume."""
+
+    energy_volume: float  # energy times the volume, u Å⁵/ps²
+    pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
+
+    def energy(self, volume: float) -> float:
+        """u Å²/ps²"""
+        return self.energy_volume / volume
+
+    def pressure(self, volume: float) -> float:
+        """u/(Å ps²)"""
+        return self.pressure_square / volume**2
+
+
+def tail(law: LennardJones) -> Tail:
+    """Energy and pressure that the cut-off takes away, for g(r) = 1 beyond where it acts.
+
+    U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated); for endings that shift the whole
+    potential the constant inside counts too, as in GROMACS' dispersion correction. Allen & Tildesley (2017), 2.8.
+    All N² pairs are counted, those of a molecule with itself among them: a relative error of 1/(number of molecules).
+    """
+    count = np.bincount(law.kind, minlength=len(law.c6))
+    energy = pressure = 0.0
+    for sign, c, p, end in ((1, law.c12, 12, law.end12), (-1, law.c6, 6, law.end6)):
+        lost = _lost(law, end, p)
+        # The pressure is that of the force alone: a jump of the energy at the cut-off (plain) has none.
+        jump = law.cutoff ** (3 - p) / 3 if end[0] == 0 and isinstance(law.shape, Plain) else 0.0
+        strength = sign * count @ c @ count
+        energy += 2 * pi * strength * lost
+        pressure += 2 * pi * strength * (lost + jump)
+    return Tail(energy, pressure)
+
+
+def _lost(law: LennardJones, end: np.ndarray, p: int) -> float:
+    """Integral of r² (r⁻ᵖ - truncated r⁻ᵖ) over all r."""
+    beyond = law.cutoff ** (3 - p) / (p - 3)
+    inside = -end[0] * law.cutoff**3 / 3
+    if isinstance(law.shape, Plain):
+        return beyond + inside
+    start = law.shape.start
+
+    def lost(r: float) -> float:
+        if isinstance(law.shape, Bent):
+            return -(r**2) * added(end, r - start)[0]
+        return (1 - POLYNOMIALS[type(law.shape)](law.shape, r)[0]) * r ** (2 - p)
+
+    return beyond + inside + quad(lost, start, law.cutoff)[0]

@@ -1,0 +1,279 @@
+"""Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
+
+A slot is a place in that order. Positions are kept relative to the origin of their cluster, where a float32 has digits
+enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three
+vectors one after the other; slot k of cluster c has its x at `3 * width * c + k`.
+"""
+
+from math import ceil, floor, inf, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import BLOCKS, PAIR_FLAGS, kernel
+from rigidmd.compile.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
+from rigidmd.forces.pairs.sites import place
+
+SERIAL_SITES = 1000  # up to this many there is one block, and no thread is started
+
+
+class Clusters(NamedTuple):
+    """The sites of one law in clusters. The last cluster is filled up with copies of the last site."""
+
+    bounds: np.ndarray  # (blocks + 1,) block b holds clusters bounds[b] ... bounds[b + 1] - 1
+    order: np.ndarray  # (slots,) int32 the site in each slot
+    slot: np.ndarray  # (s,) int32 the slot of each site
+    group: np.ndarray  # (slots,) int32 group of the site in each slot
+    boxes: np.ndarray  # (s, 3) int32 how many times a site is taken back along each edge, into the brick
+    origin: np.ndarray  # (4 clusters,) x, y, z, 0 in the box, Å
+    local: np.ndarray  # (3 slots,) positions relative to the origins, Å
+    square: np.ndarray  # (3 slots,) squared distances from the origins when sorted, Å²; then for others to use
+    reference: np.ndarray  # (3 slots,) `local` when last sorted
+    moved: np.ndarray  # (slots,) how far each has gone since, Å
+    farthest: np.ndarray  # (blocks,) the largest of them; infinite where that is too far for a list, Å
+    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z of the sites of a share of molecules, in the brick, Å
+
+
+def clusters_of(sites: int, dtype: type) -> Clusters:
+    """Room for clusters of this many sites with positions of a NumPy dtype."""
+    width = lane_count(dtype)
+    count = max(1, ceil(sites / width))
+    blocks = min(BLOCKS, count) if sites > SERIAL_SITES else 1
+    slots = count * width
+    return Clusters(
+        bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
+        order=np.zeros(slots, np.int32),
+        slot=np.zeros(sites, np.int32),
+        group=zeros(slots, np.int32),
+        boxes=np.zeros((sites, 3), np.int32),
+        origin=zeros(4 * count, np.float64),
+        local=zeros(3 * slots, dtype),
+        square=zeros(3 * slots, dtype),
+        reference=zeros(3 * slots, dtype),
+        moved=zeros(slots, dtype),
+        extent=np.zeros((blocks, 6)),
+        farthest=np.zeros(blocks),
+    )
+
+
+@kernel(inline=True)
+def _share(sites, blocks, block):
+    """The first molecule of a block, and the first that is no more in it."""
+    n = len(sites.first) - 1
+    return n * block // blocks, n * (block + 1) // blocks
+
+
+@kernel(counted=False)
+def wrap_block(clusters, cell, sites, state, farthest, block):
+    """Count the boxes that take sites of a share of the molecules into the brick; its extent is theirs there.
+
+    The brick is upright and has the diagonal of the cell (3, 3) for edges; it fills space as well as the cell. NaN for
+    an extent if a coordinate is farther from the origin than that, or no number.
+    """
+    extent = clusters.extent[block]
+    for k in range(3):
+        extent[k], extent[3 + k] = inf, -inf
+    first, end = _share(sites, len(clusters.extent), block)
+    for m in range(first, end):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            at = place(sites, state, m, i)
+            if not max(abs(at[0]), abs(at[1]), abs(at[2])) < farthest:
+                extent[0] = nan
+                return
+            _count_boxes(clusters.boxes, cell, i, at)
+            at = _in_brick(clusters.boxes, cell, i, at)
+            for k in range(3):
+                extent[k] = min(extent[k], at[k])
+                extent[3 + k] = max(extent[3 + k], at[k])
+
+
+@kernel(counted=False)
+def bin_block(clusters, cell, sites, state, block):
+    """Bins and, within them, heights of the sites of a share of the molecules, into `slot` and `moved`.
+
+    Columns along z as wide as a cluster, up one and down the next, so that a cluster that begins in one column and ends
+    in the next is compact too.
+    """
+    low, extent, (nx, ny, nz) = _bins(clusters)
+    first, end = _share(sites, len(clusters.extent), block)
+    for m in range(first, end):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            at = _in_brick(clusters.boxes, cell, i, place(sites, state, m, i))
+            x = _bin(at[0] - low[0], extent[0], nx)
+            y = _bin(at[1] - low[1], extent[1], ny)
+            z = _bin(at[2] - low[2], extent[2], nz)
+            column = x * ny + (y if x % 2 == 0 else ny - 1 - y)
+            up = column % 2 == 0
+            clusters.moved[i] = at[2] if up else -at[2]
+            clusters.slot[i] = column * nz + (z if up else nz - 1 - z)
+
+
+@kernel
+def sort_into_clusters(clusters):
+    """Sort sites by their bins and heights; they must then be settled. False if they have no extent."""
+    s = len(clusters.slot)
+    _, extent, (nx, ny, nz) = _bins(clusters)
+    if not extent[0] >= 0:
+        return False
+    order, bin_of, height = clusters.order, clusters.slot, clusters.moved
+    start = np.zeros(nx * ny * nz + 1, np.int64)
+    for i in range(s):
+        start[bin_of[i] + 1] += 1
+    for p in range(1, len(start)):
+        start[p] += start[p - 1]
+    for i in range(s):
+        order[start[bin_of[i]]] = i
+        start[bin_of[i]] += 1
+    # now start[p] is where bin p ends; sites of a bin are in the order of their indices and few
+    for a in range(1, s):
+        i = order[a]
+        b = a
+        while b > 0 and bin_of[order[b - 1]] == bin_of[i] and height[order[b - 1]] > height[i]:
+            order[b] = order[b - 1]
+            b -= 1
+        order[b] = i
+    for a in range(s, len(order)):
+        order[a] = order[s - 1]
+    return True
+
+
+@kernel(inline=True)
+def _bins(clusters):
+    """Lowest corner of all sites in the brick, their extents, and how many bins there are along each.
+
+    NaN for the first extent if there is none.
+    """
+    low, high = (inf, inf, inf), (-inf, -inf, -inf)
+    lost = False
+    for block in range(len(clusters.extent)):
+        of = clusters.extent[block]
+        low = (min(low[0], of[0]), min(low[1], of[1]), min(low[2], of[2]))
+        high = (max(high[0], of[3]), max(high[1], of[4]), max(high[2], of[5]))
+        lost |= of[0] != of[0]
+    x, y, z = nan if lost else high[0] - low[0], high[1] - low[1], high[2] - low[2]
+    s = len(clusters.slot)
+    edge = (x * y * z * width_of(clusters.local) / s) ** (1 / 3)
+    nx = max(1, min(s, round(x / edge))) if edge > 0 else 1
+    ny = max(1, min(s // nx, round(y / edge))) if edge > 0 else 1
+    return low, (x, y, z), (nx, ny, max(1, s // (nx * ny)))
+
+
+@kernel(inline=True)
+def _count_boxes(boxes, cell, i, at):
+    """Count what takes a site at (x, y, z) into the brick."""
+    x, y, z = at
+    c = floor(z / cell[2, 2]) if cell[2, 2] < inf else 0.0
+    if c != 0.0:
+        x, y = x - c * cell[2, 0], y - c * cell[2, 1]
+    b = floor(y / cell[1, 1]) if cell[1, 1] < inf else 0.0
+    if b != 0.0:
+        x -= b * cell[1, 0]
+    a = floor(x / cell[0, 0]) if cell[0, 0] < inf else 0.0
+    boxes[i, 0], boxes[i, 1], boxes[i, 2] = a, b, c
+
+
+@kernel(inline=True)
+def _in_brick(boxes, cell, i, at):
+    """Where site i, at (x, y, z), is once it has been taken to where it was in the brick when sites were sorted, Å."""
+    x, y, z = at
+    a, b, c = boxes[i, 0], boxes[i, 1], boxes[i, 2]
+    if c != 0:
+        x, y, z = x - c * cell[2, 0], y - c * cell[2, 1], z - c * cell[2, 2]
+    if b != 0:
+        x, y = x - b * cell[1, 0], y - b * cell[1, 1]
+    if a != 0:
+        x -= a * cell[0, 0]
+    return x, y, z
+
+
+@kernel(inline=True)
+def _bin(x, extent, count):
+    return min(count - 1, int(x / extent * count)) if extent > 0 else 0
+
+
+@kernel(counted=False)
+def settle_block(clusters, cell, sites, state, group, block):
+    """Origins and places of newly sorted clusters; their origin is the middle of their box."""
+    width = width_of(clusters.local)
+    order, origin, reference = clusters.order, clusters.origin, clusters.reference
+    clusters.farthest[block] = 0.0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        low, high = (inf, inf, inf), (-inf, -inf, -inf)
+        for slot in range(width * c, width * (c + 1)):
+            i = order[slot]
+            x, y, z = _in_brick(clusters.boxes, cell, i, place(sites, state, sites.molecule[i], i))
+            low = (min(low[0], x), min(low[1], y), min(low[2], z))
+            high = (max(high[0], x), max(high[1], y), max(high[2], z))
+            at = slot + 2 * width * c
+            reference[at], reference[at + width], reference[at + 2 * width] = x, y, z
+        for k in range(3):
+            origin[4 * c + k] = 0.5 * (low[k] + high[k])
+        _pair_up(order, reference, width, width * c, min(width * (c + 1), len(clusters.slot)))
+        for slot in range(width * c, width * (c + 1)):
+            i = order[slot]
+            if slot < len(clusters.slot):
+                clusters.slot[i] = slot
+            clusters.group[slot] = group[i]
+            clusters.moved[slot] = 0.0
+            clusters.square[slot] = 0.0
+            at = _in_brick(clusters.boxes, cell, i, place(sites, state, sites.molecule[i], i))
+            for k in range(3):
+                n = slot + 2 * width * c + k * width
+                clusters.local[n] = at[k] - origin[4 * c + k]
+                reference[n] = clusters.local[n]
+                clusters.square[slot] += clusters.local[n] ** 2
+
+
+@kernel(inline=True)
+def _pair_up(order, at, width, first, end):
+    """Change the order of slots first ... end - 1 of a cluster so that the two sites of each row are near one another.
+
+    Where they are stands in `at`, which follows them.
+    """
+    vectors = 2 * (first // width) * width
+    for a in range(first, end - 2, 2):
+        nearest, nearest2 = a + 1, inf
+        for b in range(a + 1, end):
+            d2 = 0.0
+            for n in range(vectors, vectors + 3 * width, width):
+                d2 += (at[n + a] - at[n + b]) ** 2
+            if d2 < nearest2:
+                nearest, nearest2 = b, d2
+        order[a + 1], order[nearest] = order[nearest], order[a + 1]
+        for n in range(vectors, vectors + 3 * width, width):
+            at[n + a + 1], at[n + nearest] = at[n + nearest], at[n + a + 1]
+
+
+@kernel(counted=False)
+def place_block(clusters, cell, sites, state, block):
+    """Bring `local` of the sites of a share of the molecules to where the molecules are."""
+    width = width_of(clusters.local)
+    local, origin = clusters.local, clusters.origin
+    first, end = _share(sites, len(clusters.extent), block)
+    for m in range(first, end):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            x, y, z = _in_brick(clusters.boxes, cell, i, place(sites, state, m, i))
+            slot = clusters.slot[i]
+            c = slot // width
+            at = slot + 2 * width * c
+            local[at] = x - origin[4 * c]
+            local[at + width] = y - origin[4 * c + 1]
+            local[at + 2 * width] = z - origin[4 * c + 2]
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def follow_block(clusters, limit, block):
+    """How far the sites of a block have gone: `moved` and `farthest`, for which the limit holds."""
+    width = width_of(clusters.local)
+    local, reference = clusters.local, clusters.reference
+    full = (1 << width) - 1
+    worst = 0.0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        at = 3 * width * c
+        dx = load(local, at) - load(reference, at)
+        dy = load(local, at + width) - load(reference, at + width)
+        dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
+        moved = root(dx * dx + dy * dy + dz * dz)
+        store(clusters.moved, width * c, moved)
+        worst = max(worst, largest(moved)) if bits(moved <= limit) == full else inf
+    clusters.farthest[block] = worst

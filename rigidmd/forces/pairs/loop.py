@@ -1,0 +1,358 @@
+"""Forces between pairs of sites: the one loop for every such law.
+
+A law says only what one site and a vector of others at their distances do: an `@implements(pair)` for its NamedTuple,
+and how its numbers for each site follow the sites into another order (`arrange`). This loop finds the pairs, takes the
+images, sums energies, virial and forces, and hands the forces to the bodies.
+"""
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile.lanes import (
+    double,
+    fill,
+    lane,
+    lane_count,
+    load,
+    load_four,
+    mask_of,
+    narrowed,
+    select,
+    store,
+    total,
+    width_of,
+    zeros,
+)  # fmt: skip
+from rigidmd.core.state import EXAMPLE, LIST_FULL, OK, TALLY_SIZE
+from rigidmd.forces import terms
+from rigidmd.forces.pairs import lists as neighbors
+from rigidmd.forces.pairs.lists import (
+    BUILDS,
+    STATUS,
+    USABLE,
+    WINDOW,
+    PairList,
+    cluster_of,
+    empty_list,
+    end_of_row,
+    farthest,
+    image_of,
+    lanes_of_first,
+    lanes_of_second,
+    list_code,
+    most_needed,
+    update_list,
+)  # fmt: skip
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
+from rigidmd.forces.terms import Setup
+
+
+class Sums(NamedTuple):
+    """Where forces and energies are added up."""
+
+    own: np.ndarray  # (3 slots,) what its own row does to each site, then all rows; stored as Clusters.local
+    others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
+    tallies: np.ndarray  # (blocks, 10)
+
+
+class PairForces(NamedTuple):
+    """A pair law and the sites that take part in it."""
+
+    law: NamedTuple  # in the order of the sites
+    sites: BodySites | CentralSites
+    group: np.ndarray  # (s,) sites of one group do not act on one another
+
+    def workspace(self, setup: Setup) -> "PairWorkspace":
+        """Room for a neighbour list, which is built at the first use, and for sums."""
+        law, sites = self.law, self.sites
+        reach = _diameter(sites) if np.array_equal(self.group, sites.molecule) else inf
+        pairs = empty_list(setup.cell, self.group, reach, law.cutoff, setup.skin, setup.dtype)
+        blocks, slots = len(pairs.needed), len(pairs.clusters.order)
+        sums = Sums(
+            own=pairs.clusters.square,  # while forces are summed nobody builds a list
+            others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
+            tallies=np.zeros((blocks, TALLY_SIZE)),
+        )
+        return PairWorkspace(law, law.room(slots, setup.dtype), sites, pairs, sums)
+
+
+class PairWorkspace(NamedTuple):
+    """Workspace of a `PairForces`."""
+
+    law: NamedTuple
+    arranged: NamedTuple  # what the loop reads: numbers for each site in the order of slots, in the precision of lanes
+    sites: BodySites | CentralSites
+    pairs: PairList
+    sums: Sums
+    list_code: Code | None = None
+    code: Code | None = None
+
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.forces_in_slots.of_sites()
+
+    @property
+    def forces_in_slots(self) -> InSlots:
+        """The same in the order of the lists."""
+        return InSlots(self.sums.own, self.pairs.clusters.slot)
+
+    def with_code(self) -> "PairWorkspace":
+        """With the machine code that finds pairs and computes their forces."""
+        state, load = EXAMPLE
+        lists = list_code(self.pairs, self.sites)
+        content = (self.arranged, self.pairs, self.sums)
+        code = Code(
+            find=(_find, (lists, self.law, self.arranged, self.sites, self.pairs, self.sums, state)),
+            forces=(_forces, content),
+            forces_and_energies=(_forces_and_energies, content),
+            gather=(_gather, content),
+            hand_over=(_hand_over, (self.sites, self.forces_in_slots, state, load)),
+        )
+        return self._replace(code=code, list_code=lists)
+
+    def with_room(self, cell: np.ndarray) -> "PairWorkspace":
+        """With as much room as the last list asked for."""
+        pairs = neighbors.with_room(self.pairs, cell)
+        others, clusters = self.sums.others, int(pairs.needed[:, WINDOW].max())
+        if 3 * lane_count(others.dtype) * clusters > others.shape[1]:
+            others = _room_for_others(pairs, len(others), int(1.1 * clusters) + 1)
+        return self._replace(pairs=pairs, sums=self.sums._replace(others=others))
+
+
+def _room_for_others(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
+    dtype = pairs.clusters.local.dtype
+    return zeros((blocks, 3 * lane_count(dtype) * clusters), dtype)
+
+
+def pair_forces(law: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None) -> PairForces:
+    """The term for a law with a `cutoff`; sites of one molecule do not act on one another if no groups are given."""
+    return PairForces(law, sites, sites.molecule if group is None else group)
+
+
+def _diameter(sites: BodySites | CentralSites) -> float:
+    """A bound on how far apart the sites of a molecule are, Å."""
+    return 2 * float(np.linalg.norm(sites.offsets(), axis=1).max()) if isinstance(sites, BodySites) else 0.0
+
+
+def pair(law, i, j, r2):
+    """(energy, force/r) of the site in slot i and those in slots j, j + 1, ... at squared distances r2, as vectors.
+
+    Below cutoff² only; force > 0 repels.
+    """
+    raise TypeError(f"{type(law).__name__} is no pair law, or this was called outside compiled code")
+
+
+def arrange(law, arranged, order):
+    """Fill the numbers that an arranged law has for each slot from those of the sites that are there now."""
+    raise TypeError("compiled code only")
+
+
+@implements(terms.add_forces, counted=False)
+def _add_pair_forces(term, state, load, tally):
+    if not is_a(term, PairWorkspace):
+        return None
+
+    def add_pair_forces(term, state, load, tally):
+        code, pairs, sums = term.code, term.pairs, term.sums
+        call(code, "find", packed((term.list_code, term.law, term.arranged, term.sites, pairs, sums, state)))
+        if pairs.counters[STATUS] != OK:
+            return pairs.counters[STATUS]
+        parcel = packed((term.arranged, pairs, sums))
+        blocks = len(sums.tallies)
+        if tally is None:
+            call_blocks(code, "forces", parcel, blocks)
+        else:
+            call_blocks(code, "forces_and_energies", parcel, blocks)
+        call_blocks(code, "gather", parcel, blocks)
+        force = InSlots(sums.own, pairs.clusters.slot)
+        call(code, "hand_over", packed((term.sites, force, state, load)))
+        if tally is not None:
+            for block in range(blocks):
+                for k in range(len(tally)):
+                    tally[k] += sums.tallies[block, k]
+            virial_of_offsets(term.sites, state, force, tally)
+        return OK
+
+    return add_pair_forces
+
+
+@task()
+def _find(parcel, block):
+    """Bring sites, and what the loop reads of them, to where the bodies are; a status code into counters[STATUS]."""
+    code, law, arranged, sites, pairs, sums, state = opened(parcel)
+    builds = pairs.counters[BUILDS]
+    status = update_list(pairs, code, sites, state)
+    if pairs.counters[BUILDS] != builds:
+        arrange(law, arranged, pairs.clusters.order)
+        if 3 * width_of(sums.others) * most_needed(pairs, WINDOW) > sums.others.shape[1]:
+            pairs.counters[USABLE] = 0
+            status = LIST_FULL
+    pairs.counters[STATUS] = status
+
+
+@task()
+def _hand_over(parcel, block):
+    sites, force, state, load = opened(parcel)
+    load_from_sites(sites, state, load, force)
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _forces(parcel, block):
+    law, pairs, sums = opened(parcel)
+    block_forces(law, pairs, sums.own, sums.others, None, block)
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _forces_and_energies(parcel, block):
+    law, pairs, sums = opened(parcel)
+    block_forces(law, pairs, sums.own, sums.others, sums.tallies, block)
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _gather(parcel, block):
+    _, pairs, sums = opened(parcel)
+    gather_block(pairs, sums.own, sums.others, block)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def block_forces(law, pairs, own, others, tallies, block):
+    """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    others = others[block]
+    others[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
+    if tallies is not None:
+        tallies[block] = 0.0
+    entries = pairs.entries[block]
+    masked = pairs.masked[block]
+    zero = fill(0.0, clusters.local)
+    moved = farthest(pairs)
+    first_entry = first_special = 0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for i in range(width * c, width * (c + 1), 2):
+            at = 2 * width * c + i
+            here = (
+                (clusters.local[at], clusters.local[at + width], clusters.local[at + 2 * width]),
+                (clusters.local[at + 1], clusters.local[at + width + 1], clusters.local[at + 2 * width + 1]),
+            )
+            still = (zero, zero, zero)
+            sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
+            for n in range(first_special, pairs.special[i // 2]):
+                between = _displacements(pairs, c, here, masked[n, 0])
+                masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
+                sums = _meet(law, pairs, block, i, masked[n, 0], between, masks, others, sums, tallies)
+            # Displacements one entry ahead: what waits for them would fill the processor's queues before the next
+            # entry's could enter.
+            last = end_of_row(pairs, i // 2, moved) - 1
+            entry = np.int32(0)
+            between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
+            if first_entry <= last:
+                entry = entries[first_entry]
+                between = _displacements(pairs, c, here, entry)
+            for n in range(first_entry, last + 1):
+                ahead = entries[min(n + 1, last)]
+                after = _displacements(pairs, c, here, ahead)
+                sums = _meet(law, pairs, block, i, entry, between, (None, None), others, sums, tallies)
+                entry, between = ahead, after
+            first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
+            first, second, totals = sums
+            for k in range(3):
+                own[at + k * width] = total(first[k])
+                own[at + k * width + 1] = total(second[k])
+            if tallies is not None:
+                for k, of in enumerate((0, 1, 2, 3, 2, 4, 5, 3, 5, 6)):
+                    tallies[block, k] += total(totals[of])
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _displacements(pairs, c, here, entry):
+    """From a vector of other sites, those of an entry, to each of two sites of cluster c."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    other = cluster_of(entry)
+    at = 3 * width * other
+    offset = narrowed(
+        load_four(clusters.origin, 4 * c)
+        - load_four(pairs.shift, 4 * image_of(entry))
+        - load_four(clusters.origin, 4 * other),
+        clusters.local,
+    )
+    x = load(clusters.local, at) - lane(offset, 0)
+    y = load(clusters.local, at + width) - lane(offset, 1)
+    z = load(clusters.local, at + 2 * width) - lane(offset, 2)
+    return _separation(here[0], x, y, z), _separation(here[1], x, y, z)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _separation(here, x, y, z):
+    """Displacements, and their squares, of a site from a vector of others."""
+    dx, dy, dz = here[0] - x, here[1] - y, here[2] - z
+    return dx, dy, dz, dx * dx + dy * dy + dz * dz
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
+    """The sites in slots i, i + 1 meet those of an entry: forces into `others` and, with energies, onto `sums`."""
+    width = width_of(pairs.clusters.local)
+    other = cluster_of(entry)
+    first, second, totals = sums
+    gx, gy, gz, totals = _act(law, i, width * other, between[0], masks[0], totals, tallies)
+    hx, hy, hz, totals = _act(law, i + 1, width * other, between[1], masks[1], totals, tallies)
+    ahead = other - pairs.clusters.bounds[block]
+    if ahead < 0:
+        ahead += len(pairs.clusters.origin) // 4
+    at = 3 * width * ahead
+    store(others, at, load(others, at) - (gx + hx))
+    store(others, at + width, load(others, at + width) - (gy + hy))
+    store(others, at + 2 * width, load(others, at + 2 * width) - (gz + hz))
+    return (
+        (first[0] + gx, first[1] + gy, first[2] + gz),
+        (second[0] + hx, second[1] + hy, second[2] + hz),
+        totals,
+    )
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _act(law, i, j, between, mask, totals, tallies):
+    """Force on a site from each of a vector of others; energy and virial, where wanted, onto the vectors `totals`."""
+    dx, dy, dz, r2 = between
+    counts = r2 < law.cutoff * law.cutoff
+    if mask is not None:
+        counts = counts & mask_of(mask, r2)
+    u, w = pair(law, i, j, r2)
+    w = select(counts, w, 0.0)
+    gx = w * dx
+    gy = w * dy
+    gz = w * dz
+    energy, xx, xy, xz, yy, yz, zz = totals
+    if tallies is not None:
+        energy = energy + select(counts, u, 0.0)
+        xx = xx + gx * dx
+        xy = xy + gx * dy
+        xz = xz + gx * dz
+        yy = yy + gy * dy
+        yz = yz + gy * dz
+        zz = zz + gz * dz
+    return gx, gy, gz, (energy, xx, xy, xz, yy, yz, zz)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def gather_block(pairs, own, others, block):
+    """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        for k in range(3):
+            at = 3 * width * c + k * width
+            on_cluster = double(load(own, at))
+            for b in range(len(others)):
+                ahead = c - clusters.bounds[b]
+                if ahead < 0:
+                    ahead += len(clusters.origin) // 4
+                if ahead < pairs.needed[b, WINDOW]:
+                    on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
+            store(own, at, narrowed(on_cluster, own))

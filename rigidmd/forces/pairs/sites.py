@@ -1,0 +1,203 @@
+"""Sites of one law: where they are when the bodies are where they are, and what their forces do to the bodies.
+
+Each law has its own sites, only those that take part in it. Sites of one molecule are consecutive.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange, types
+
+from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile.lanes import lane_count, width_of
+
+# Up to this many molecules loops over molecules stay on one thread. Measured, two threads: starting them costs about
+# 40 µs, placing the sites of a water 9.5 ns; so placing alone would gain only beyond some 8000 molecules. The bound is
+# shared with the drift, whose sines and cosines make a molecule dearer.
+SERIAL = 512
+
+
+class BodySites(NamedTuple):
+    """Sites fixed in bodies."""
+
+    first: np.ndarray  # (n + 1,) int32 sites of molecule m are first[m] ... first[m + 1] - 1
+    molecule: np.ndarray  # (s,) int32
+    kind: np.ndarray  # (n,) int32 offsets of molecule m are offset_body[kind[m]], offset_body[kind[m] + 1] ...
+    offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; once for all molecules of a species
+
+    def offsets(self) -> np.ndarray:
+        """Offsets (s, 3) of all sites, body frame, Å."""
+        return self.offset_body[(self.kind - self.first[:-1])[self.molecule] + np.arange(len(self.molecule))]
+
+
+class CentralSites(NamedTuple):
+    """Sites that are their molecules' centres of mass: nothing to rotate, no torque."""
+
+    first: np.ndarray
+    molecule: np.ndarray
+
+    def offsets(self) -> np.ndarray:
+        """Offsets (s, 3) of all sites: none."""
+        return np.zeros((len(self.molecule), 3))
+
+
+class InSlots(NamedTuple):
+    """Vectors of sites in the order in which `clusters` keeps them."""
+
+    value: np.ndarray  # (3 slots,) x, y, z of a cluster as three vectors one after the other
+    slot: np.ndarray  # (s,) where each site is
+
+    def of_sites(self) -> np.ndarray:
+        """The vectors (s, 3) in the order of the sites, float64."""
+        width = lane_count(self.value.dtype)
+        at = self.slot + 2 * width * (self.slot // width)
+        return np.stack([self.value[at + k * width] for k in range(3)], axis=1).astype(np.float64)
+
+
+def of_site(vectors, i):
+    """(x, y, z) of site i, from an array (s, 3) or from slots."""
+    raise TypeError("compiled code only")
+
+
+@implements(of_site, inline=True)
+def _of_site(vectors, i):
+    if isinstance(vectors, types.Array):
+        return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
+
+    def from_slot(vectors, i):
+        width = width_of(vectors.value)
+        slot = vectors.slot[i]
+        at = slot + 2 * width * (slot // width)
+        return vectors.value[at], vectors.value[at + width], vectors.value[at + 2 * width]
+
+    return from_slot
+
+
+def place(sites, state, m, i):
+    """Where site i, of molecule m, is: (x, y, z) in the lab frame, Å."""
+    raise TypeError("compiled code only")
+
+
+@implements(place, inline=True)
+def _place(sites, state, m, i):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
+
+    def place(sites, state, m, i):
+        x, y, z = turned(sites, state, m, i)
+        return state.position[m, 0] + x, state.position[m, 1] + y, state.position[m, 2] + z
+
+    return place
+
+
+@kernel(inline=True)
+def turned(sites, state, m, i):
+    """From the centre of molecule m to its site i: (x, y, z) in the lab frame, Å."""
+    at = sites.kind[m] - sites.first[m] + i
+    q = state.rotation[m]
+    x, y, z = sites.offset_body[at, 0], sites.offset_body[at, 1], sites.offset_body[at, 2]
+    return (
+        q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
+        q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
+        q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
+    )
+
+
+def load_molecule(sites, state, load, m, site_force):
+    """Add the sum of molecule m's site forces, and their torque about its centre, to its load."""
+    raise TypeError("compiled code only")
+
+
+@implements(load_molecule, inline=True)
+def _load_molecule(sites, state, load, m, site_force):
+    if is_a(sites, CentralSites):
+
+        def load_central(sites, state, load, m, site_force):
+            for i in range(sites.first[m], sites.first[m + 1]):
+                fx, fy, fz = of_site(site_force, i)
+                load.force[m, 0] += fx
+                load.force[m, 1] += fy
+                load.force[m, 2] += fz
+
+        return load_central
+
+    def load_body(sites, state, load, m, site_force):
+        q = state.rotation[m]
+        begin = sites.kind[m] - sites.first[m]
+        for i in range(sites.first[m], sites.first[m + 1]):
+            fx, fy, fz = of_site(site_force, i)
+            load.force[m, 0] += fx
+            load.force[m, 1] += fy
+            load.force[m, 2] += fz
+            # n_body = d x (Q^T f), with the site's offset d in the body frame
+            bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
+            by = q[0, 1] * fx + q[1, 1] * fy + q[2, 1] * fz
+            bz = q[0, 2] * fx + q[1, 2] * fy + q[2, 2] * fz
+            x = sites.offset_body[begin + i, 0]
+            y = sites.offset_body[begin + i, 1]
+            z = sites.offset_body[begin + i, 2]
+            load.torque_body[m, 0] += y * bz - z * by
+            load.torque_body[m, 1] += z * bx - x * bz
+            load.torque_body[m, 2] += x * by - y * bx
+
+    return load_body
+
+
+@kernel(inline=True)
+def place_molecule(sites, state, m, site_position):
+    """Positions (lab) of molecule m's sites into site_position (s, 3)."""
+    for i in range(sites.first[m], sites.first[m + 1]):
+        site_position[i, 0], site_position[i, 1], site_position[i, 2] = place(sites, state, m, i)
+
+
+@kernel(parallel=True)
+def _place_threaded(sites, state, site_position):
+    for m in prange(len(state.position)):
+        place_molecule(sites, state, m, site_position)
+
+
+@kernel(parallel=True)
+def _load_threaded(sites, state, load, site_force):
+    for m in prange(len(state.position)):
+        load_molecule(sites, state, load, m, site_force)
+
+
+@kernel(outer=True)
+def place_sites(sites, state, site_position):
+    """Positions of all sites (s, 3) in the lab frame, molecules whole."""
+    if len(state.position) <= SERIAL:
+        for m in range(len(state.position)):
+            place_molecule(sites, state, m, site_position)
+    else:
+        _place_threaded(sites, state, site_position)
+
+
+@kernel
+def load_from_sites(sites, state, load, site_force):
+    """Add the site forces, an array (s, 3) or in slots, to the bodies' forces and torques."""
+    if len(state.position) <= SERIAL:
+        for m in range(len(state.position)):
+            load_molecule(sites, state, load, m, site_force)
+    else:
+        _load_threaded(sites, state, load, site_force)
+
+
+def virial_of_offsets(sites, state, site_force, tally):
+    """Turn the site virial in `tally` into the molecular one: subtract sum f (x) (x_site - X_molecule)."""
+    raise TypeError("compiled code only")
+
+
+@implements(virial_of_offsets)
+def _virial_of_offsets(sites, state, site_force, tally):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, site_force, tally: None
+
+    def virial_of_offsets(sites, state, site_force, tally):
+        for i in range(len(sites.molecule)):
+            offset = turned(sites, state, sites.molecule[i], i)
+            force = of_site(site_force, i)
+            for row in range(3):
+                for k in range(3):
+                    tally[1 + 3 * row + k] -= force[row] * offset[k]
+
+    return virial_of_offsets

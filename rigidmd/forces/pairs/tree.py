@@ -1,0 +1,98 @@
+"""A tree of boxes around clusters, to find those within reach of one another in O(N log N), whatever the shape.
+
+A node holds as many children as a vector of float64 has lanes; one look tells which of them are within reach.
+"""
+
+from math import ceil, inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import PAIR_FLAGS, kernel
+from rigidmd.compile.lanes import bits, lane_count, larger, load, lowest_bit, width_of
+
+
+class BoxTree(NamedTuple):
+    """Boxes of clusters (level 0), of families of those (level 1), and so on up to one family."""
+
+    low: np.ndarray  # (3, nodes) all levels one after the other, each filled up with boxes that are nowhere
+    high: np.ndarray  # (3, nodes)
+    level: np.ndarray  # (levels + 1,) where each level begins
+
+
+def box_tree(count: int) -> BoxTree:
+    """Room for the tree of this many clusters."""
+    arity = lane_count(np.float64)
+    level = [0]
+    while len(level) == 1 or count > 1:
+        count = ceil(count / arity)
+        level.append(level[-1] + count * arity)
+    nodes = (3, level[-1])
+    return BoxTree(np.full(nodes, inf), np.full(nodes, -inf), np.array(level))
+
+
+@kernel(counted=False)
+def grow(tree, clusters):
+    """Fit the boxes to the clusters as they are."""
+    arity = width_of(tree.low)
+    width = width_of(clusters.local)
+    tree.low[:] = inf
+    tree.high[:] = -inf
+    for c in range(len(clusters.origin) // 4):
+        for k in range(3):
+            for at in range(3 * width * c + k * width, 3 * width * c + (k + 1) * width):
+                x = clusters.origin[4 * c + k] + clusters.local[at]
+                tree.low[k, c] = min(tree.low[k, c], x)
+                tree.high[k, c] = max(tree.high[k, c], x)
+    for upper in range(1, len(tree.level) - 1):
+        for child in range(tree.level[upper - 1], tree.level[upper]):
+            node = tree.level[upper] + (child - tree.level[upper - 1]) // arity
+            for k in range(3):
+                tree.low[k, node] = min(tree.low[k, node], tree.low[k, child])
+                tree.high[k, node] = max(tree.high[k, node], tree.high[k, child])
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
+    """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,); ascending.
+
+    Only those that are at most half a round ahead of cluster c, all clusters being thought of as a ring. Returns the
+    new count, which may exceed the room; stack (levels, 2) is scratch.
+    """
+    arity = width_of(tree.low)
+    top = len(tree.level) - 2
+    half = clusters // 2
+    depth = 0
+    size = arity**top  # clusters under a child of the family
+    stack[0, 0] = 0  # family
+    stack[0, 1] = _near(tree, tree.level[top], low, high, radius2)
+    while depth >= 0:
+        if stack[depth, 1] == 0:
+            depth -= 1
+            size *= arity
+            continue
+        child = lowest_bit(stack[depth, 1])
+        stack[depth, 1] &= stack[depth, 1] - 1
+        node = stack[depth, 0] * arity + child
+        first = node * size
+        if not ((first <= c + half and first + size > c) or first <= c + half - clusters):
+            continue
+        if depth == top:
+            if count < len(found):
+                found[count] = node
+            count += 1
+        else:
+            depth += 1
+            size //= arity
+            stack[depth, 0] = node
+            stack[depth, 1] = _near(tree, tree.level[top - depth] + node * arity, low, high, radius2)
+    return count
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _near(tree, node, low, high, radius2):
+    """Which boxes of the family that begins at a node are within reach, as bits."""
+    dx = larger(larger(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
+    dy = larger(larger(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
+    dz = larger(larger(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
+    return bits(dx * dx + dy * dy + dz * dz < radius2)

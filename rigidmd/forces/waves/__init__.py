@@ -1,0 +1,1 @@
+"""Sums over periodic images: Ewald's, wave by wave and on a mesh."""

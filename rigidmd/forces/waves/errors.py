@@ -1,0 +1,181 @@
+"""What Ewald sums leave out, estimated before anything is computed, and settings that keep it to what is asked for.
+
+An error here is the root mean square over sites of the vector by which the force on a site is wrong, for charges whose
+molecules stand and turn at random. It is given in units of COULOMB: of the force between two charges e, 1 Å apart, as
+the accuracy of LAMMPS' kspace_style is.
+"""
+
+from math import exp, pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from rigidmd.forces.waves.ewald import Waves, waves_within
+from rigidmd.forces.waves.splines import aliases
+
+FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
+PROXY = 32  # points along an edge that stand for a grid of more: errors depend on the spacing, not on their number
+ORDERS = (4, 5, 6, 7, 8)
+SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
+
+
+class Charges(NamedTuple):
+    """What errors depend on: how much charge there is, and how it stands together in rigid molecules."""
+
+    count: int  # charged sites
+    square: float  # sum of q², e²
+    pairs: np.ndarray  # (p, 2) q_i q_j (e²) of pairs of sites inside molecules, both orders, and their distance (Å)
+
+    def form(self, k: np.ndarray) -> np.ndarray:
+        """sum over molecules of |sum q exp(i k r)|², averaged over how they are turned, e²; k (1/Å) of any shape."""
+        found = np.full(np.shape(k), self.square)
+        for product, distance in self.pairs:
+            found += product * np.sinc(k * distance / pi)
+        return found
+
+
+def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
+    """Of (how many, charges (s,) in e, positions (s, 3) in Å) for each species."""
+    square, count, pairs = 0.0, 0, {}
+    for n, charge, position in molecules:
+        count += n * len(charge)
+        square += n * float(charge @ charge)
+        for i in range(len(charge)):
+            for j in range(i):
+                r = round(float(np.linalg.norm(position[i] - position[j])), 6)
+                pairs[r] = pairs.get(r, 0.0) + 2 * n * float(charge[i] * charge[j])
+    return Charges(count, square, np.array([(product, r) for r, product in pairs.items()]).reshape(-1, 2))
+
+
+def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
+    """Of pairs beyond the cut-off (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
+    return 2 * charges.square / sqrt(charges.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
+
+
+def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> float:
+    """alpha (1/Å) with which pairs beyond the cut-off are missed by this error."""
+    most = real_error(charges, 0.0, cutoff, volume)
+    # a large demand is met by hardly any screening at all; half a screening length is as far as the formula holds
+    return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
+
+
+def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
+    """Of waves beyond k = radius (1/Å): the integral of what they would do over all of them.
+
+    As Kolafa & Perram's (eq. 32), with charges that are not independent inside molecules, and without their expansion
+    for large radius/alpha.
+    """
+    k = np.linspace(radius, radius + 12 * alpha, 600)
+    # k² (4 pi/k² e^(-k²/4 alpha²))² 4 pi k² / (8 pi³)
+    density = 8 * np.exp(-(k**2) / (2 * alpha**2)) * charges.form(k)
+    return sqrt(charges.square / charges.count * np.trapezoid(density, k) / volume)
+
+
+def waves_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> Waves:
+    """All waves up to a length beyond which this error is left."""
+    volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
+    least = np.linalg.norm(reciprocal, axis=1).min()
+    longest = 12 * alpha + least
+
+    def left(radius: float) -> float:
+        return np.log(max(wave_error(charges, alpha, radius, volume), 1e-300) / error)
+
+    radius = least if left(0.0) <= 0 else brentq(left, 0.0, longest)
+    return waves_within(reciprocal, max(radius, least) * (1 + 1e-9))
+
+
+def radius_of(count: int, volume: float) -> float:
+    """Radius (1/Å) of a sphere with as many waves."""
+    return (6 * pi**2 * count / volume) ** (1 / 3)
+
+
+def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
+    """Of smooth PME with the influence function of `pme`, on a grid in a cell (3, 3), rows the edges.
+
+    A wave k of charge becomes waves k' = k + aliases of potential, each weakened by U(k) U(k'), times the influence G.
+    Wrong are k - k, where G U² is not g, and all k - k' else; they add up in the mean square, each with k'² for the
+    force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106).
+    """
+    grid = np.array(grid)
+    volume = abs(np.linalg.det(cell))
+    points = np.minimum(grid, PROXY)
+    proxy = cell * (points / grid)[:, None]
+    b = 2 * pi * np.linalg.inv(proxy).T
+    metric = b @ b.T
+    of = [aliases(int(n), order) for n in points]
+    of[2] = type(of[2])(*(part[: points[2] // 2 + 1] for part in of[2]))
+    n2, odd, own, every, first, second = (
+        [np.expand_dims(getattr(of[d], name), [e for e in range(3) if e != d]) for d in range(3)]
+        for name in ("n", "odd", "own", "all", "first", "second")
+    )
+    square = weakened = 0.0
+    for d in range(3):
+        o, e = (d + 1) % 3, (d + 2) % 3
+        square = square + metric[d, d] * n2[d] ** 2 + 2 * metric[d, o] * odd[d] * odd[o]
+        weakened = weakened + metric[d, d] * second[d] * every[o] * every[e]
+        weakened = weakened + 2 * metric[d, o] * first[d] * first[o] * every[e]
+    square = square * np.ones_like(weakened)
+    square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # the wave 0 is left out
+    kept, whole = own[0] * own[1] * own[2], every[0] * every[1] * every[2]
+    g = 4 * pi / square * np.exp(-square / (4 * alpha**2))
+    influence = square * g * kept / (whole * weakened)
+    here = charges.form(np.sqrt(square))
+    wrong = square * (g - influence * kept) ** 2 * here
+    wrong += influence**2 * (kept * here * (weakened - kept * square) + (whole - kept) * weakened * charges.square)
+    wrong[0, 0, 0] = 0.0
+    twice = np.full(wrong.shape[2], 2.0)
+    twice[0] = 1.0
+    if points[2] % 2 == 0:
+        twice[-1] = 1.0
+    left = float((wrong * twice).sum()) / (volume * abs(np.linalg.det(proxy)))
+    beyond = wave_error(charges, alpha, radius_of(int(np.prod(grid)), volume), volume)
+    return float(np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond))  # rounding can be negative
+
+
+def smooth_size(least: float) -> int:
+    """The least number of points, not below `least`, without prime factors above 7, as fast transforms like it."""
+    n = max(8, int(np.ceil(least - 1e-9)))
+    while True:
+        left = n
+        for factor in (2, 3, 5, 7):
+            while left % factor == 0:
+                left //= factor
+        if left == 1:
+            return n
+        n += 1
+
+
+def mesh_for(
+    charges: Charges,
+    alpha: float,
+    cell: np.ndarray,
+    error: float,
+    order: int | None = None,
+    grid: tuple[int, int, int] | None = None,
+) -> tuple[tuple[int, int, int], int] | None:
+    """The grid and order of splines that leave at most this error with the least work; None where none does.
+
+    order, grid : what is given already
+    """
+    edges = np.linalg.norm(cell, axis=1)
+    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in SPACINGS] if grid is None else [grid]
+    best = None
+    for p in ORDERS if order is None else (order,):
+        low, high = 0, len(grids)
+        while low < high:
+            middle = (low + high) // 2
+            if mesh_error(charges, alpha, cell, grids[middle], p) <= error:
+                high = middle
+            else:
+                low = middle + 1
+        if low < len(grids):
+            cost = work_of(charges.count, grids[low], p)
+            if best is None or cost < best[0]:
+                best = (cost, grids[low], p)
+    return best[1:] if best else None
+
+
+def work_of(sites: int, grid: tuple[int, int, int], order: int) -> float:
+    """About how many ns a reciprocal part takes on one core; measured with 12288 sites, grids of 32³ to 48³."""
+    return sites * (20 + 2.4 * order**2) + 8.0 * float(np.prod(grid))

@@ -1,0 +1,476 @@
+"""Ewald sums: charges in a periodic box and all their images, however far.
+
+    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r                          screened.ScreenedCoulomb
+      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²,  S(k) = sum q_i exp(i k r_i)   EwaldSum, or pme.Pme
+      - alpha/sqrt(pi) sum q_i²                                                             self_energy
+      - sum over pairs inside molecules q_i q_j erf(alpha r)/r                              intramolecular_energy
+      - pi/(2 V alpha²) (sum q_i)²                                                          Background
+      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                                                 SurfaceDipole
+
+(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with q in units where q²/r is an energy. The last term is
+that of a large sphere of boxes in a medium of permittivity eps; it is 0 for a conductor, "tin foil", the usual choice.
+
+The sum over k has the pairs inside molecules too. In a rigid body the force between such a pair has no net force and no
+torque, so all there is to take out is the constant energy. The cell may have any shape: k = 2 pi (n_x, n_y, n_z) of the
+reciprocal cell.
+"""
+
+from math import pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erf
+
+from rigidmd.compile import BLOCKS, PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile.lanes import fill, lane_count, load, store, total, width_of
+from rigidmd.core.state import OK, TALLY_SIZE
+from rigidmd.forces import terms
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
+from rigidmd.forces.pairs.space import follow_cell, volume_of
+from rigidmd.forces.terms import Setup
+from rigidmd.units import COULOMB
+
+WIDTH = lane_count(np.float64)
+#: The basis of a cell that stands as it was described.
+AS_GIVEN = np.eye(3, dtype=int)
+
+
+class Waves(NamedTuple):
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns of n_z; the others are their opposites."""
+
+    column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, where in the sum that one stands
+    count: np.ndarray  # (columns,) how many n_z there are
+    most: np.ndarray  # (3,) largest |n| of each axis
+    bounds: np.ndarray  # (blocks + 1,) columns of each block
+
+    @property
+    def total(self) -> int:
+        """How many vectors there are, with their opposites."""
+        return 2 * int(self.count.sum())
+
+
+def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = AS_GIVEN) -> Waves:
+    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` where it is given.
+
+    basis (3, 3) : integers; both bound n in another cell of the lattice, and this cell's edges are `basis` times those
+    """
+    square = np.inf if largest_square is None else largest_square
+
+    def inside(n: np.ndarray) -> np.ndarray:
+        other = _in_other(n, basis)
+        return (np.abs(other) <= most).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
+
+    return _waves(np.abs(basis) @ most, inside)
+
+
+def waves_within(
+    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = AS_GIVEN
+) -> Waves:
+    """All n != 0 whose k is no longer than `radius` (1/Å), with |n_x|, |n_y|, |n_z| up to `limit` where it is given.
+
+    reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
+    basis : of the limit, see `waves`
+    """
+    cell = 2 * pi * np.linalg.inv(reciprocal).T
+    most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
+
+    def inside(n: np.ndarray) -> np.ndarray:
+        short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
+        return short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
+
+    return _waves(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
+
+
+def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """The n (..., 3) of the same waves in the cell of which `basis` makes this one."""
+    return n @ np.rint(np.linalg.inv(basis)).astype(int).T
+
+
+def _waves(most, inside) -> Waves:
+    mx, my, mz = (int(m) for m in most)
+    z = np.arange(-mz, mz + 1)
+    columns, counts, start = [], [], 0
+    for x in range(mx + 1):
+        for y in range(-my if x else 0, my + 1):
+            n = np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=-1)
+            found = z[inside(n) & ((x > 0) | (y > 0) | (z > 0))]
+            if len(found):
+                columns.append((x, y, found[0], start))
+                counts.append(len(found))
+                start += len(found)
+    blocks = max(1, min(BLOCKS, len(columns)))
+    shares = np.searchsorted(np.cumsum(counts), np.linspace(0, start, blocks + 1)[1:-1]) if columns else []
+    return Waves(
+        np.array(columns, np.int64).reshape(-1, 4),
+        np.array(counts, np.int64),
+        np.array([mx, my, mz]),
+        np.array([0, *shares, len(columns)], np.int64),
+    )
+
+
+class WaveSums(NamedTuple):
+    """Where an Ewald sum is added up. Sites are filled up to whole vectors with charges 0."""
+
+    cell: np.ndarray  # (3, 3) that the strengths are for
+    reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
+    position: np.ndarray  # (s, 3)
+    force: np.ndarray  # (s, 3)
+    charge: np.ndarray  # (slots,)
+    cosine: np.ndarray  # (3, largest n + 1, slots) of 2 pi n times the fractional coordinate
+    sine: np.ndarray
+    strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k² for either of n, -n, the energy of |S|² of both
+    real: np.ndarray  # (waves,) of S(k), then of strength S(k)
+    imaginary: np.ndarray
+    push: np.ndarray  # (3, slots) forces, as vectors of sites
+    tallies: np.ndarray  # (blocks, 10)
+
+
+class EwaldSum(NamedTuple):
+    """The sum over k vectors one by one."""
+
+    alpha: float  # 1/Å
+    charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
+    sites: BodySites | CentralSites
+    waves: Waves
+
+    def workspace(self, setup: Setup) -> "EwaldWorkspace":
+        """Room for the sums; their arithmetic is double whatever the setup says."""
+        s, over = len(self.charge), self.waves
+        slots = -(-s // WIDTH) * WIDTH
+        angles = (3, int(over.most.max()) + 1, slots)
+        sums = WaveSums(
+            cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)),
+            position=np.zeros((s, 3)),
+            force=np.zeros((s, 3)),
+            charge=np.concatenate([self.charge, np.zeros(slots - s)]),
+            cosine=np.zeros(angles),
+            sine=np.zeros(angles),
+            strength=np.zeros(over.total // 2),
+            real=np.zeros(over.total // 2),
+            imaginary=np.zeros(over.total // 2),
+            push=np.zeros((3, slots)),
+            tallies=np.zeros((len(over.bounds) - 1, TALLY_SIZE)),
+        )
+        return EwaldWorkspace(self.alpha, self.sites, over, sums)
+
+
+class EwaldWorkspace(NamedTuple):
+    """Workspace of an `EwaldSum`."""
+
+    alpha: float
+    sites: BodySites | CentralSites
+    waves: Waves
+    sums: WaveSums
+    code: Code | None = None
+
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.sums.force
+
+    def with_code(self) -> "EwaldWorkspace":
+        """With its machine code."""
+        content = (self.alpha, self.waves, self.sums)
+        return self._replace(code=Code(turn=(_turn, content), sum=(_sum, content), push=(_push, content)))
+
+
+@kernel
+def invert_cell(cell, reciprocal):
+    """Rows 2 pi times the reciprocal edges of a cell (3, 3) into `reciprocal`; the volume."""
+    volume = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        for c in range(3):
+            a, b = (c + 1) % 3, (c + 2) % 3
+            reciprocal[k, c] = cell[i, a] * cell[j, b] - cell[i, b] * cell[j, a]
+        volume = cell[k, 0] * reciprocal[k, 0] + cell[k, 1] * reciprocal[k, 1] + cell[k, 2] * reciprocal[k, 2]
+    for k in range(3):
+        for c in range(3):
+            reciprocal[k, c] *= 2 * pi / volume
+    return volume
+
+
+@implements(terms.add_forces, counted=False)
+def _add_ewald_sum(term, state, load, tally):
+    if not is_a(term, EwaldWorkspace):
+        return None
+
+    def add_ewald_sum(term, state, load, tally):
+        own = term.sums
+        place_sites(term.sites, state, own.position)
+        if follow_cell(state.cell, own.cell):
+            volume = abs(invert_cell(own.cell, own.reciprocal))
+            _set_strengths(term.waves, own, term.alpha, volume)
+        parcel = packed((term.alpha, term.waves, own))
+        blocks = len(own.tallies)
+        call_blocks(term.code, "turn", parcel, blocks)
+        call_blocks(term.code, "sum", parcel, blocks)
+        call_blocks(term.code, "push", parcel, blocks)
+        if tally is not None:
+            for block in range(blocks):
+                for k in range(len(tally)):
+                    tally[k] += own.tallies[block, k]
+            virial_of_offsets(term.sites, state, own.force, tally)
+        load_from_sites(term.sites, state, load, own.force)
+        return OK
+
+    return add_ewald_sum
+
+
+@kernel
+def _set_strengths(over, own, alpha, volume):
+    for c in range(len(over.column)):
+        first = over.column[c, 3]
+        for n in range(over.count[c]):
+            k2 = 0.0
+            for d in range(3):
+                k = (
+                    over.column[c, 0] * own.reciprocal[0, d]
+                    + over.column[c, 1] * own.reciprocal[1, d]
+                    + (over.column[c, 2] + n) * own.reciprocal[2, d]
+                )
+                k2 += k * k
+            own.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
+
+
+@task(counted=False)
+def _turn(parcel, block):
+    """Cosines and sines of a share of the sites, by the angle sum: each power costs one complex product."""
+    _alpha, over, own = opened(parcel)
+    blocks, s = len(own.tallies), len(own.position)
+    for i in range(s * block // blocks, s * (block + 1) // blocks):
+        for d in range(3):
+            turns = 0.0
+            for c in range(3):
+                turns += own.position[i, c] * own.reciprocal[d, c] / (2 * pi)
+            angle = 2 * pi * (turns - np.floor(turns))
+            cosine, sine = np.cos(angle), np.sin(angle)
+            own.cosine[d, 0, i] = 1.0
+            own.sine[d, 0, i] = 0.0
+            for n in range(1, over.most[d] + 1):
+                a, b = own.cosine[d, n - 1, i], own.sine[d, n - 1, i]
+                own.cosine[d, n, i] = a * cosine - b * sine
+                own.sine[d, n, i] = b * cosine + a * sine
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def _phase(own, d, n, at):
+    """exp(2 pi i n x_d) of a vector of sites, as (cosine, sine)."""
+    cosine = load(own.cosine[d, abs(n)], at)
+    sine = load(own.sine[d, abs(n)], at)
+    return (cosine, sine) if n >= 0 else (cosine, -1.0 * sine)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _times(a, b):
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _sum(parcel, block):
+    """S(k) of the columns of a block, its energy and virial; times the strength, for the forces."""
+    alpha, over, own = opened(parcel)
+    width = width_of(own.charge)
+    own.tallies[block] = 0.0
+    for c in range(over.bounds[block], over.bounds[block + 1]):
+        first, count = over.column[c, 3], over.count[c]
+        for n in range(count):
+            own.real[first + n] = 0.0
+            own.imaginary[first + n] = 0.0
+        # sites in batches that stay in the first cache for all of a column
+        for batch in range(0, len(own.charge), 32 * width):
+            end = min(batch + 32 * width, len(own.charge))
+            for n in range(count):
+                real = fill(0.0, own.charge)
+                imaginary = fill(0.0, own.charge)
+                for at in range(batch, end, width):
+                    plane = _times(_phase(own, 0, over.column[c, 0], at), _phase(own, 1, over.column[c, 1], at))
+                    phase = _times(plane, _phase(own, 2, over.column[c, 2] + n, at))
+                    charge = load(own.charge, at)
+                    real = real + charge * phase[0]
+                    imaginary = imaginary + charge * phase[1]
+                own.real[first + n] += total(real)
+                own.imaginary[first + n] += total(imaginary)
+        for n in range(count):
+            _count_wave(own, alpha, over.column[c, 0], over.column[c, 1], over.column[c, 2] + n, first + n, block)
+
+
+@kernel(inline=True, counted=False)
+def _count_wave(own, alpha, nx, ny, nz, wave, block):
+    tally = own.tallies[block]
+    real, imaginary, strength = own.real[wave], own.imaginary[wave], own.strength[wave]
+    energy = strength * (real * real + imaginary * imaginary)
+    own.real[wave] = 2 * strength * real
+    own.imaginary[wave] = 2 * strength * imaginary
+    k = (
+        nx * own.reciprocal[0, 0] + ny * own.reciprocal[1, 0] + nz * own.reciprocal[2, 0],
+        nx * own.reciprocal[0, 1] + ny * own.reciprocal[1, 1] + nz * own.reciprocal[2, 1],
+        nx * own.reciprocal[0, 2] + ny * own.reciprocal[1, 2] + nz * own.reciprocal[2, 2],
+    )
+    k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
+    tally[0] += energy
+    add_wave_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+
+
+@kernel(inline=True)
+def add_wave_virial(tally, energy, k, slope):
+    """Virial of a wave whose energy is that of |S|² exp(-k²/4 alpha²)/(k² V): energy (1 - slope k k), slope = 2/k² +
+    1/(2 alpha²), with S of sites that move with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)."""
+    for row in range(3):
+        for column in range(3):
+            unit = 1.0 if row == column else 0.0
+            tally[1 + 3 * row + column] += energy * (unit - slope * k[row] * k[column])
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _push(parcel, block):
+    """Forces on a share of the sites."""
+    _alpha, over, own = opened(parcel)
+    width = width_of(own.charge)
+    blocks, vectors = len(own.tallies), len(own.charge) // width
+    for at in range(width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width):
+        zero = fill(0.0, own.charge)
+        fx, fy, fz = zero, zero, zero
+        for c in range(len(over.column)):
+            plane = _times(_phase(own, 0, over.column[c, 0], at), _phase(own, 1, over.column[c, 1], at))
+            flat, high = zero, zero
+            for n in range(over.count[c]):
+                z = over.column[c, 2] + n
+                phase = _times(plane, _phase(own, 2, z, at))
+                wave = over.column[c, 3] + n
+                push = phase[1] * own.real[wave] - phase[0] * own.imaginary[wave]
+                flat = flat + push
+                high = high + push * (z + 0.0)
+            x, y = over.column[c, 0] + 0.0, over.column[c, 1] + 0.0
+            fx = fx + flat * (x * own.reciprocal[0, 0] + y * own.reciprocal[1, 0]) + high * own.reciprocal[2, 0]
+            fy = fy + flat * (x * own.reciprocal[0, 1] + y * own.reciprocal[1, 1]) + high * own.reciprocal[2, 1]
+            fz = fz + flat * (x * own.reciprocal[0, 2] + y * own.reciprocal[1, 2]) + high * own.reciprocal[2, 2]
+        charge = load(own.charge, at)
+        for k, f in enumerate((charge * fx, charge * fy, charge * fz)):
+            store(own.push[k], at, f)
+        for i in range(at, min(at + width, len(own.force))):
+            for k in range(3):
+                own.force[i, k] = own.push[k, i]
+
+
+def sum_of(
+    charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, over: Waves
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3); for once, nothing compiled."""
+    reciprocal = 2 * pi * np.linalg.inv(cell).T
+    turns = position @ reciprocal.T
+    energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))
+    for (x, y, z, _), count in zip(over.column, over.count, strict=True):
+        n = np.stack([np.full(count, x), np.full(count, y), z + np.arange(count)], axis=1)
+        k = n @ reciprocal
+        k2 = (k**2).sum(axis=1)
+        strength = 4 * pi / abs(np.linalg.det(cell)) * np.exp(-k2 / (4 * alpha**2)) / k2
+        phase = charge[:, None] * np.exp(1j * (turns @ n.T))
+        total = phase.sum(axis=0)
+        of = strength * np.abs(total) ** 2
+        energy += of.sum()
+        force += (2 * strength * (np.conj(total) * phase).imag) @ k
+        virial += of.sum() * np.eye(3) - np.einsum("k,ki,kj->ij", of * (2 / k2 + 1 / (2 * alpha**2)), k, k)
+    return float(energy), force, virial
+
+
+class Background(NamedTuple):
+    """The charge, spread evenly, that makes a charged box neutral."""
+
+    strength: float  # energy times the volume, u Å⁵/ps²
+
+
+def background(square: float, alpha: float) -> Background:
+    """The term for a net charge whose square is given, in units where q²/r is an energy in u Å²/ps²."""
+    return Background(-pi / (2 * alpha**2) * square)
+
+
+@implements(terms.add_forces)
+def _add_background(term, state, load, tally):
+    if not is_a(term, Background):
+        return None
+
+    def add_background(term, state, load, tally):
+        if tally is not None:
+            energy = term.strength / volume_of(state.cell)
+            for k in (0, 1, 5, 9):
+                tally[k] += energy
+        return OK
+
+    return add_background
+
+
+class SurfaceDipole(NamedTuple):
+    """The medium around a large sphere of boxes answers its dipole: 2 pi/((2 eps + 1) V) |sum q r|²."""
+
+    strength: float  # 2 pi/(2 eps + 1)
+    charge: np.ndarray  # (s,)
+    sites: BodySites | CentralSites
+
+    def workspace(self, setup: Setup) -> "SurfaceWorkspace":
+        """Room for positions and forces."""
+        return SurfaceWorkspace(*self, *np.zeros((2, len(self.charge), 3)))
+
+
+class SurfaceWorkspace(NamedTuple):
+    """Workspace of a `SurfaceDipole`."""
+
+    strength: float
+    charge: np.ndarray
+    sites: BodySites | CentralSites
+    position: np.ndarray  # (s, 3)
+    site_force: np.ndarray  # (s, 3) as last evaluated, lab frame, u Å/ps²
+
+
+def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | CentralSites) -> SurfaceDipole:
+    """The term for charges (s,) that sum to 0, in units where q²/r is an energy in u Å²/ps²."""
+    return SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
+
+
+@implements(terms.add_forces)
+def _add_surface_dipole(term, state, load, tally):
+    if not is_a(term, SurfaceWorkspace):
+        return None
+
+    def add_surface_dipole(term, state, load, tally):
+        place_sites(term.sites, state, term.position)
+        share = term.strength / volume_of(state.cell)
+        energy = 0.0
+        for k in range(3):
+            dipole = 0.0
+            for i in range(len(term.charge)):
+                dipole += term.charge[i] * term.position[i, k]
+            for i in range(len(term.charge)):
+                term.site_force[i, k] = -2 * share * term.charge[i] * dipole
+            energy += share * dipole * dipole
+        if tally is not None:
+            # at a fixed volume the energy follows the sites, f (x) x; it also falls with the volume
+            for k in (0, 1, 5, 9):
+                tally[k] += energy
+            for i in range(len(term.charge)):
+                for row in range(3):
+                    for k in range(3):
+                        tally[1 + 3 * row + k] += term.site_force[i, row] * term.position[i, k]
+            virial_of_offsets(term.sites, state, term.site_force, tally)
+        load_from_sites(term.sites, state, load, term.site_force)
+        return OK
+
+    return add_surface_dipole
+
+
+def self_energy(charge: np.ndarray, alpha: float) -> float:
+    """Energy of charges (s,), in units where q²/r is an energy in u Å²/ps², less that of their own images near them."""
+    return -alpha / sqrt(pi) * float(charge @ charge)
+
+
+def intramolecular_energy(charge: np.ndarray, position: np.ndarray, alpha: float) -> float:
+    """What the sum over k has of the pairs inside one molecule, taken out; position (s, 3) in Å. Constant."""
+    i, j = np.triu_indices(len(charge), 1)
+    r = np.linalg.norm(position[i] - position[j], axis=1)
+    return -float(np.sum(charge[i] * charge[j] * erf(alpha * r) / r))
+
+
+def in_energy_units(charge_e: np.ndarray) -> np.ndarray:
+    """Charges in e as charges whose product over a distance in Å is an energy in u Å²/ps²."""
+    return charge_e * sqrt(COULOMB)

@@ -1,0 +1,434 @@
+"""Smooth particle mesh Ewald: the reciprocal part of an Ewald sum on a grid, by fast Fourier transforms.
+
+    charges -> grid -> waves, times what a wave does -> potential on the grid -> forces
+
+Charges are spread over order³ grid points by B-splines, and forces are the exact gradient of the energy that the grid
+gives (Essmann et al. 1995, J. Chem. Phys. 103, 8577): a run keeps that energy. What a wave does is not their formula
+but the one with the least error in the forces (Hockney & Eastwood 1988, ch. 8; Ballenegger, Cerda & Holm 2012,
+J. Chem. Theory Comput. 8, 936, for forces by differentiation): the same work, smaller errors.
+
+Forces on the grid do not add up to zero, and pairs inside a rigid molecule act on it; both are parts of the error that
+`ewald_errors.mesh_error` estimates. Taking them out would leave forces that are no gradient.
+
+The work is cut into blocks: of planes, each written by one block from sites that are sorted by plane, of rows of waves,
+and of sites. Their number does not depend on that of threads, so neither does any bit of the result.
+
+This file needs rocket-fft and is imported by scenes with PME only.
+"""
+
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+from rocket_fft import c2c, c2r, r2c
+
+from rigidmd.compile import BLOCKS, PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile.lanes import load_eight, load_four, store, total
+from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
+from rigidmd.forces import terms
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
+from rigidmd.forces.pairs.space import follow_cell
+from rigidmd.forces.terms import Setup
+from rigidmd.forces.waves.ewald import add_wave_virial, invert_cell
+from rigidmd.forces.waves.splines import aliases, weights
+
+SERIAL_POINTS = 16**3  # up to this many grid points there is one block, and no thread is started
+
+
+class UpToFour(NamedTuple):
+    """Splines of order 3 and 4: weights as vectors of four."""
+
+    nodes: tuple[int, ...]  # 0 ... order - 1; its length is known when compiled
+    value: np.ndarray  # (4 order,) coefficients of the weights, see splines.weights
+    slope: np.ndarray  # (4 (order - 1),) of their derivatives
+
+
+class UpToEight(NamedTuple):
+    """Splines of order 5 to 8: weights as vectors of eight."""
+
+    nodes: tuple[int, ...]
+    value: np.ndarray
+    slope: np.ndarray
+
+
+class Mesh(NamedTuple):
+    """The grid and what stands on it; a row of points is longer than the grid, so that no spline has to wrap around."""
+
+    points: np.ndarray  # (3,) along a, b, c
+    bounds: np.ndarray  # (3, blocks + 1) of planes, rows of waves and sites
+    cell: np.ndarray  # (3, 3)
+    reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
+    position: np.ndarray  # (s, 3)
+    force: np.ndarray  # (s, 3)
+    corner: np.ndarray  # (s, 3) int32 first grid point that a site reaches
+    part: np.ndarray  # (s, 4) how far beyond it and half a cell the site is, in cells; its charge
+    order: np.ndarray  # (s,) int32 sites sorted by the plane of their corner
+    first: np.ndarray  # (n_a + 1,) sites of plane p are order[first[p]] ... order[first[p + 1] - 1]
+    grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
+    wave: np.ndarray  # (n_a, n_b, n_c//2 + 1)
+    influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) what a wave of charge is multiplied by
+    alias: np.ndarray  # (3, 6, most points) splines.Aliases of the axes
+    axes: np.ndarray  # (3, 1) names of the axes
+    tallies: np.ndarray  # (blocks, 10)
+    lost: np.ndarray  # (blocks,) whether a position is no number
+    weight: np.ndarray  # (blocks, 64) the weights of one site, to be taken one by one
+
+
+class Pme(NamedTuple):
+    """The reciprocal part by smooth particle mesh Ewald."""
+
+    alpha: float  # 1/Å
+    charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
+    sites: BodySites | CentralSites
+    grid: tuple[int, int, int]  # points along a, b, c
+    order: int  # of the splines
+
+    def workspace(self, setup: Setup) -> "PmeWorkspace":
+        """Room for the grid, in the precision of the setup."""
+        grid, order = self.grid, self.order
+        kind = np.dtype(setup.dtype)
+        pair = np.complex64 if kind == np.float32 else np.complex128
+        s, width = len(self.charge), 4 if order <= 4 else 8
+        blocks = max(1, min(BLOCKS, grid[0] // order)) if np.prod(grid) > SERIAL_POINTS else 1
+        value = np.zeros((order, width))
+        value[:, :order] = weights(order)
+        slope = value[1:] * np.arange(1, order)[:, None]
+        spline = (UpToFour if width == 4 else UpToEight)(
+            tuple(range(order)), value.ravel().astype(kind), slope.ravel().astype(kind)
+        )
+        table = np.zeros((3, 6, max(grid)))
+        for d in range(3):
+            table[d, :, : grid[d]] = aliases(grid[d], order)
+        waves = (grid[0], grid[1], grid[2] // 2 + 1)
+        mesh = Mesh(
+            points=np.array(grid, np.int64),
+            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
+            cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)),
+            position=np.zeros((s, 3)),
+            force=np.zeros((s, 3)),
+            corner=np.zeros((s, 3), np.int32),
+            part=np.zeros((s, 4), kind),
+            order=np.zeros(s, np.int32),
+            first=np.zeros(grid[0] + 1, np.int64),
+            grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
+            wave=np.zeros(waves, pair),
+            influence=np.zeros(waves, kind),
+            alias=table,
+            axes=np.arange(3)[:, None],
+            tallies=np.zeros((blocks, TALLY_SIZE)),
+            lost=np.zeros(blocks, np.bool_),
+            weight=np.zeros((blocks, 64), kind),
+        )
+        return PmeWorkspace(self.alpha, self.charge, self.sites, spline, mesh)
+
+
+class PmeWorkspace(NamedTuple):
+    """Workspace of a `Pme`."""
+
+    alpha: float
+    charge: np.ndarray
+    sites: BodySites | CentralSites
+    spline: UpToFour | UpToEight
+    mesh: Mesh
+    code: Code | None = None
+
+    @property
+    def site_force(self) -> np.ndarray:
+        """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
+        return self.mesh.force
+
+    def with_code(self) -> "PmeWorkspace":
+        """With its machine code."""
+        content = (self.alpha, self.charge, self.spline, self.mesh)
+        tasks = (_weigh, _scale, _sort, _spread, _convolve, _convolve_and_count, _back, _pull)
+        names = ("weigh", "scale", "sort", "spread", "convolve", "convolve_and_count", "back", "pull")
+        return self._replace(code=Code(**{name: (one, content) for name, one in zip(names, tasks, strict=True)}))
+
+
+@implements(terms.add_forces, counted=False)
+def _add_pme(term, state, load, tally):
+    if not is_a(term, PmeWorkspace):
+        return None
+
+    def add_pme(term, state, load, tally):
+        code, mesh = term.code, term.mesh
+        blocks = len(mesh.tallies)
+        parcel = packed((term.alpha, term.charge, term.spline, mesh))
+        place_sites(term.sites, state, mesh.position)
+        if follow_cell(state.cell, mesh.cell):
+            invert_cell(mesh.cell, mesh.reciprocal)
+            call_blocks(code, "weigh", parcel, blocks)
+        call_blocks(code, "scale", parcel, blocks)
+        for block in range(blocks):
+            if mesh.lost[block]:
+                return NOT_FINITE
+        call(code, "sort", parcel)
+        call_blocks(code, "spread", parcel, blocks)
+        if tally is None:
+            call_blocks(code, "convolve", parcel, blocks)
+        else:
+            call_blocks(code, "convolve_and_count", parcel, blocks)
+        call_blocks(code, "back", parcel, blocks)
+        call_blocks(code, "pull", parcel, blocks)
+        if tally is not None:
+            for block in range(blocks):
+                for k in range(len(tally)):
+                    tally[k] += mesh.tallies[block, k]
+            virial_of_offsets(term.sites, state, mesh.force, tally)
+        load_from_sites(term.sites, state, load, mesh.force)
+        return OK
+
+    return add_pme
+
+
+@task(counted=False)
+def _weigh(parcel, block):
+    """What waves do, for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
+    alpha, _charge, _spline, mesh = opened(parcel)
+    b, of = mesh.reciprocal, mesh.alias
+    volume = (
+        8
+        * pi**3
+        / abs(
+            b[0, 0] * (b[1, 1] * b[2, 2] - b[1, 2] * b[2, 1])
+            - b[0, 1] * (b[1, 0] * b[2, 2] - b[1, 2] * b[2, 0])
+            + b[0, 2] * (b[1, 0] * b[2, 1] - b[1, 1] * b[2, 0])
+        )
+    )
+    for x in range(mesh.wave.shape[0]):
+        for y in range(mesh.bounds[1, block], mesh.bounds[1, block + 1]):
+            for z in range(mesh.wave.shape[2]):
+                at = (x, y, z)
+                square = weakened = 0.0
+                for d in range(3):
+                    for e in range(3):
+                        metric = b[d, 0] * b[e, 0] + b[d, 1] * b[e, 1] + b[d, 2] * b[e, 2]
+                        if d == e:
+                            other, last = (d + 1) % 3, (d + 2) % 3
+                            square += metric * of[d, 0, at[d]] ** 2
+                            weakened += metric * of[d, 5, at[d]] * of[other, 3, at[other]] * of[last, 3, at[last]]
+                        else:
+                            last = 3 - d - e
+                            square += metric * of[d, 1, at[d]] * of[e, 1, at[e]]
+                            weakened += metric * of[d, 4, at[d]] * of[e, 4, at[e]] * of[last, 3, at[last]]
+                own = of[0, 2, x] * of[1, 2, y] * of[2, 2, z]
+                whole = of[0, 3, x] * of[1, 3, y] * of[2, 3, z]
+                mesh.influence[x, y, z] = 0.0
+                if x + y + z > 0:
+                    g = 4 * pi / volume * np.exp(-square / (4 * alpha * alpha))
+                    mesh.influence[x, y, z] = g * own / (whole * weakened)
+
+
+@task(counted=False)
+def _scale(parcel, block):
+    """Positions of a share of the sites in grid cells."""
+    _alpha, charge, _spline, mesh = opened(parcel)
+    mesh.lost[block] = False
+    for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
+        for d in range(3):
+            turns = (
+                mesh.position[i, 0] * mesh.reciprocal[d, 0]
+                + mesh.position[i, 1] * mesh.reciprocal[d, 1]
+                + mesh.position[i, 2] * mesh.reciprocal[d, 2]
+            ) * (0.5 / pi)
+            x = (turns - np.floor(turns)) * mesh.points[d]
+            if not abs(x) < 1e9:
+                mesh.lost[block] = True
+                return
+            corner = int(x)
+            mesh.part[i, d] = x - corner - 0.5
+            mesh.corner[i, d] = corner if corner < mesh.points[d] else 0
+        mesh.part[i, 3] = charge[i]
+
+
+@task(counted=False)
+def _sort(parcel, block):
+    """Sort sites by the plane of their corner; within a plane they keep their order."""
+    _alpha, _charge, _spline, mesh = opened(parcel)
+    first = mesh.first
+    first[:] = 0
+    for i in range(len(mesh.order)):
+        first[mesh.corner[i, 0] + 1] += 1
+    for plane in range(1, len(first)):
+        first[plane] += first[plane - 1]
+    for i in range(len(mesh.order)):
+        plane = mesh.corner[i, 0]
+        mesh.order[first[plane]] = i
+        first[plane] += 1
+    for plane in range(len(first) - 1, 0, -1):
+        first[plane] = first[plane - 1]
+    first[0] = 0
+
+
+def few(spline, array, index):
+    """Four or eight numbers of an array from an index on, as a vector: as many as the spline's weights."""
+    raise TypeError("compiled code only")
+
+
+@implements(few, inline=True, counted=False)
+def _few(spline, array, index):
+    if is_a(spline, UpToFour):
+        return lambda spline, array, index: load_four(array, index)
+    return lambda spline, array, index: load_eight(array, index)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def weights_at(spline, part):
+    """Weights of the grid points from the corner on, as a vector."""
+    order = len(spline.nodes)
+    width = len(spline.value) // order
+    found = few(spline, spline.value, width * (order - 1))
+    for j in range(order - 2, -1, -1):
+        found = found * part + few(spline, spline.value, width * j)
+    return found
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def slopes_at(spline, part):
+    """Their derivatives, per cell."""
+    order = len(spline.nodes)
+    width = len(spline.value) // order
+    found = few(spline, spline.slope, width * (order - 2))
+    for j in range(order - 3, -1, -1):
+        found = found * part + few(spline, spline.slope, width * j)
+    return found
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _spread(parcel, block):
+    """Charges on the planes of a block, and their waves within the planes."""
+    _alpha, _charge, spline, mesh = opened(parcel)
+    low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
+    na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
+    order = len(spline.nodes)
+    grid, weight = mesh.grid, mesh.weight[block]
+    grid[low:high] = 0
+    for before in range(min(high - low + order - 1, na)):
+        corner = low - order + 1 + before
+        corner += na if corner < 0 else 0
+        for n in range(mesh.first[corner], mesh.first[corner + 1]):
+            i = mesh.order[n]
+            store(weight, 0, weights_at(spline, mesh.part[i, 0]))
+            store(weight, 8, weights_at(spline, mesh.part[i, 1]))
+            z = weights_at(spline, mesh.part[i, 2]) * mesh.part[i, 3]
+            b, c = mesh.corner[i, 1], mesh.corner[i, 2]
+            for j in range(order):
+                plane = corner + j
+                plane -= na if plane >= na else 0
+                if low <= plane < high:
+                    for k in range(order):
+                        row = grid[plane, b + k]
+                        store(row, c, few(spline, row, c) + z * (weight[j] * weight[8 + k]))
+    for plane in range(low, high):
+        for k in range(order - 1):
+            for c in range(nc + order - 1):
+                grid[plane, k, c] += grid[plane, nb + k, c]
+        for b in range(nb):
+            for c in range(order - 1):
+                grid[plane, b, c] += grid[plane, b, nc + c]
+    r2c(grid[low:high, :nb, :nc], mesh.wave[low:high], mesh.axes[2], True, 1.0, 1)
+    c2c(mesh.wave[low:high], mesh.wave[low:high], mesh.axes[1], True, 1.0, 1)
+
+
+@task(counted=False)
+def _convolve(parcel, block):
+    """From waves of charge to waves of potential, for a block of rows."""
+    _alpha, _charge, _spline, mesh = opened(parcel)
+    low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
+    wave = mesh.wave
+    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
+    for x in range(wave.shape[0]):
+        for y in range(low, high):
+            for z in range(wave.shape[2]):
+                wave[x, y, z] *= mesh.influence[x, y, z]
+    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
+
+
+@task(counted=False)
+def _convolve_and_count(parcel, block):
+    """The same, with energy and virial."""
+    alpha, _charge, _spline, mesh = opened(parcel)
+    low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
+    wave, of, b = mesh.wave, mesh.alias, mesh.reciprocal
+    tally = mesh.tallies[block]
+    mesh.tallies[block] = 0.0
+    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
+    for x in range(wave.shape[0]):
+        for y in range(low, high):
+            for z in range(wave.shape[2]):
+                value, strength = wave[x, y, z], mesh.influence[x, y, z]
+                wave[x, y, z] = value * strength
+                if x + y + z > 0:
+                    n = (of[0, 0, x], of[1, 0, y], of[2, 0, z])
+                    k = (
+                        n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
+                        n[0] * b[0, 1] + n[1] * b[1, 1] + n[2] * b[2, 1],
+                        n[0] * b[0, 2] + n[1] * b[1, 2] + n[2] * b[2, 2],
+                    )
+                    k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
+                    # waves with n_c and with -n_c are stored once, where they are two
+                    share = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
+                    real, imaginary = float(value.real), float(value.imag)
+                    energy = share * strength * (real * real + imaginary * imaginary)
+                    tally[0] += energy
+                    add_wave_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
+
+
+@task(counted=False)
+def _back(parcel, block):
+    """From waves within the planes of a block to the potential on them."""
+    _alpha, _charge, spline, mesh = opened(parcel)
+    low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
+    nb, nc = mesh.points[1], mesh.points[2]
+    order = len(spline.nodes)
+    grid = mesh.grid
+    c2c(mesh.wave[low:high], mesh.wave[low:high], mesh.axes[1], False, 1.0, 1)
+    c2r(mesh.wave[low:high], grid[low:high, :nb, :nc], mesh.axes[2], False, 1.0, 1)
+    for plane in range(low, high):
+        for b in range(nb):
+            for c in range(order - 1):
+                grid[plane, b, nc + c] = grid[plane, b, c]
+        for k in range(order - 1):
+            for c in range(nc + order - 1):
+                grid[plane, nb + k, c] = grid[plane, k, c]
+
+
+@task(fastmath=PAIR_FLAGS, counted=False)
+def _pull(parcel, block):
+    """Forces on a share of the sites: the gradient of the potential at each, times its charge."""
+    _alpha, charge, spline, mesh = opened(parcel)
+    na = mesh.points[0]
+    order = len(spline.nodes)
+    grid, weight = mesh.grid, mesh.weight[block]
+    for n in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
+        i = mesh.order[n]
+        store(weight, 0, weights_at(spline, mesh.part[i, 0]))
+        store(weight, 8, weights_at(spline, mesh.part[i, 1]))
+        store(weight, 16, slopes_at(spline, mesh.part[i, 0]))
+        store(weight, 24, slopes_at(spline, mesh.part[i, 1]))
+        z = weights_at(spline, mesh.part[i, 2])
+        dz = slopes_at(spline, mesh.part[i, 2])
+        a, b, c = mesh.corner[i, 0], mesh.corner[i, 1], mesh.corner[i, 2]
+        nothing = z * 0.0
+        along_a = nothing
+        along_b = nothing
+        along_c = nothing
+        for j in range(order):
+            plane = a + j
+            plane -= na if plane >= na else 0
+            flat = nothing
+            tilted = nothing
+            for k in range(order):
+                row = few(spline, grid[plane, b + k], c)
+                flat = flat + row * weight[8 + k]
+                tilted = tilted + row * weight[24 + k]
+            along_a = along_a + flat * weight[16 + j]
+            along_b = along_b + tilted * weight[j]
+            along_c = along_c + flat * weight[j]
+        ga = -charge[i] * mesh.points[0] * total(along_a * z) * (0.5 / pi)
+        gb = -charge[i] * mesh.points[1] * total(along_b * z) * (0.5 / pi)
+        gc = -charge[i] * mesh.points[2] * total(along_c * dz) * (0.5 / pi)
+        for k in range(3):
+            mesh.force[i, k] = ga * mesh.reciprocal[0, k] + gb * mesh.reciprocal[1, k] + gc * mesh.reciprocal[2, k]

@@ -1,0 +1,223 @@
+"""What errors are measured on: the start of a scene, with every method that can move it.
+
+Both `rigidmd precision` and `integrator = "auto"` use these.
+"""
+
+from collections.abc import Callable
+from math import inf, sqrt
+
+import numpy as np
+
+from rigidmd.assemble.body import BodySystem, Pose, build_body
+from rigidmd.assemble.momenta import mobile
+from rigidmd.assemble.system import System
+from rigidmd.core.schemes import FORMULATIONS, SCHEMES, Scheme
+from rigidmd.core.state import State
+from rigidmd.errors import SceneError
+from rigidmd.measure.choice import choose
+from rigidmd.measure.motion import Motion, Snapshot, motion
+from rigidmd.measure.observables import observe
+from rigidmd.measure.trials import Method, Subject
+from rigidmd.scene import BodyScene
+from rigidmd.scene.molecules import Stage
+from rigidmd.units import BOLTZMANN, FEMTOSECOND
+
+#: General solvers of the textbook's equations, beside which the engine's own ways with a body can be seen.
+COMPARATORS = {
+    solver if form == "matrix" else f"{solver}_{form}": (solver, form)
+    for solver in ("rk4", "dop853")
+    for form in FORMULATIONS
+}
+SPAN_PS = 0.1
+#: A step of velocity Verlet, and the span of a pilot run, for one radian of the mean vibration or libration.
+PILOT_STEP, PILOT_SPAN = 0.15, 10.0
+#: Looks and steps of a body's first run, which only tells how fast it moves.
+LOOKS, STEPS = 200, 20_000
+
+
+def _on_rotor(name: str, rotor: str | None) -> Scheme:
+    """The scheme on the rotor that the scene asks for, where it can have that."""
+    scheme = SCHEMES[name]
+    return scheme if scheme.exact_rotor else scheme.with_rotor(rotor)
+
+
+def natural_time(system: System, state: State) -> float | None:
+    """Time (ps) in which the faster of vibration and libration moves on by a radian; None of what is at rest.
+
+    Its inverse squared is <F²/m> / <m v²>, for a harmonic motion in equilibrium its mean square frequency; the same of
+    torques.
+    """
+    engine = system.engine()
+    load, _ = engine.evaluate(state)
+    mass, inverse = (system.model.mass[system.model.species], system.model.inverse_mass[system.model.species])
+    rates = [_ratio((load.force**2).sum(axis=1) @ inverse, mass @ (state.velocity**2).sum(axis=1))]
+    if len(load.torque_body):
+        inverse = system.model.inverse_inertia[system.model.species]
+        rates.append(_ratio((load.torque_body**2 * inverse).sum(), (state.angular_momentum_body**2 * inverse).sum()))
+    return 1 / sqrt(max(rates)) if max(rates) > 0 else None
+
+
+def _ratio(a: float, b: float) -> float:
+    return float(a / b) if b > 0 else 0.0
+
+
+def molecular_subject(system: System, start: State, rotor: str | None, span: float) -> Subject:
+    """Molecules from a state on, for `span` ps."""
+    state = start.copy()
+    state.step[:] = 0
+    state.begin_stretch(0.0)
+    kinetic = observe(system, system.engine(), state).kinetic
+    freedom = max(system.freedom.total, 1)
+    thermal = 2 * kinetic / freedom
+    mass = system.model.mass[system.model.species]
+    boxed = system.space.volume < inf
+    held = not mobile(system.model).all()
+
+    def kept(now: State) -> dict[str, float]:
+        """Total momentum and, without a box, total angular momentum, relative to the sums of their sizes."""
+        if held:
+            return {}
+        impulse = mass[:, None] * now.velocity
+        errors = {"momentum": _change(mass[:, None] * state.velocity, impulse)}
+        if not boxed:
+            errors["L"] = _change(_angular_momenta(state, mass), _angular_momenta(now, mass))
+        return errors
+
+    return Subject(
+        name=system.scene.name,
+        state=state,
+        methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
+        energy=lambda engine, now: observe(system, engine, now).energy,
+        energy_unit="kT per degree of freedom",
+        energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
+        energy_size=freedom * thermal or 1.0,
+        kinetic=kinetic or 1.0,
+        span=span,
+        time_unit="fs",
+        time_size=FEMTOSECOND,
+        length_unit="Å",
+        reference="srkn_6",
+        kept=kept,
+        observe=(lambda engine, now, step: observe(system, engine, now, step)) if boxed else None,
+        molecules=len(system.model.species),
+    )
+
+
+def _change(before: np.ndarray, after: np.ndarray) -> float:
+    """Change of the sum over molecules of vectors (n, 3), relative to the sum of their lengths."""
+    size = float(np.linalg.norm(before, axis=1).sum())
+    return float(np.linalg.norm((after - before).sum(axis=0))) / (size or 1.0)
+
+
+def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
+    """Of each molecule (n, 3), about the origin, lab frame."""
+    whole = np.cross(state.position, mass[:, None] * state.velocity)
+    if len(state.rotation):
+        whole += np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body)
+    return whole
+
+
+def body_subject(
+    scene: BodyScene, span: float | None = None, applied: dict[str, Callable[[Pose], tuple]] | None = None
+) -> tuple[Subject, float]:
+    """A body for `span` s, its run or until something told changes; and the fastest rate (rad/s) at which it turns."""
+    run = scene.run
+    keys = ("rotor", "formulation", "relative_tolerance", "absolute_tolerance", "energy_error", "trajectory_error")
+    plain = dict.fromkeys(keys)
+    fits = {}
+    for name in (*SCHEMES, *COMPARATORS):
+        solver, form = COMPARATORS.get(name, (name, None))
+        try:
+            changed = run.model_copy(update=plain | {"integrator": solver, "formulation": form})
+            fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
+        except SceneError:
+            continue
+    if not fits:
+        build_body(scene, applied)  # says what is wrong with it
+    system = fits["velocity_verlet"]
+    if not system.turns:
+        fits = {name: own for name, own in fits.items() if COMPARATORS.get(name, (name, "matrix"))[1] == "matrix"}
+    whole = min([span or run.duration_s, *system.breaks()])
+    seen = _first_look(system, whole)
+    kinetic = float(np.abs(seen["kinetic"]).max()) or 1.0
+
+    def energy(engine, state) -> float:
+        now = motion(system, [Snapshot(float(state.time[0]), state)])
+        return float(now["energy"][0] - now["work"][0])
+
+    start = Snapshot(0.0, system.state)
+
+    def kept(state) -> dict[str, float]:
+        seen = motion(system, [start, Snapshot(float(state.time[0]), state)])
+        return {name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"}
+
+    methods = {
+        name: Method(
+            own.engine, own.method._replace(duration=whole) if name in COMPARATORS else _on_rotor(name, run.rotor)
+        )
+        for name, own in fits.items()
+    }
+    schemes = [name for name in fits if name in SCHEMES]
+    reference = max(schemes, key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations))
+    subject = Subject(
+        name=scene.name,
+        state=system.state,
+        methods=methods,
+        energy=energy,
+        energy_unit="times the largest kinetic energy",
+        energy_note="",
+        energy_size=kinetic,
+        kinetic=kinetic,
+        span=whole,
+        time_unit="s",
+        time_size=1.0,
+        length_unit="m",
+        reference=reference,
+        kept=kept,
+    )
+    speed = 0.0
+    if system.turns:  # of the body, and of the nutation that its wheels would give it
+        inertia, carried = system.moments(np.zeros(1))
+        spin = max(float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
+        speed = max(spin, float(np.abs(carried).max() / inertia.max()))
+    return subject, speed
+
+
+def _first_look(system: BodySystem, whole: float) -> Motion:
+    """How the body moves in this time, roughly."""
+    engine = system.engine()
+    state = engine.begin(system.state, system.method)
+    snapshots, every = [Snapshot(0.0, state.copy())], STEPS // LOOKS
+    for k in range(LOOKS):
+        engine.advance(state, system.method, whole / STEPS, (k + 1) * every)
+        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
+    return motion(system, snapshots)
+
+
+def choose_for_molecules(system: System, state: State, stage: Stage) -> tuple[str, float, str]:
+    """Integrator, time step (fs) and reason for a stage that starts at a state and leaves them open.
+
+    Raises SimulationError.
+    """
+    natural = natural_time(system, state)
+    step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
+    subject = molecular_subject(system, state, None, PILOT_SPAN * natural if natural else SPAN_PS)
+    longest = {name: 4 * step * SCHEMES[name].force_evaluations for name in SCHEMES}
+    return _chosen(subject, longest, stage.energy_error_kT, stage.trajectory_error)
+
+
+def decided_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None) -> tuple[BodyScene, str]:
+    """A scene that leaves integrator and step open, with both; and in words why. Raises SimulationError."""
+    run = scene.run
+    subject, _ = body_subject(scene, applied=applied)
+    longest = {name: run.timestep_s for name in subject.methods if name in SCHEMES}
+    integrator, timestep, reason = _chosen(subject, longest, run.energy_error, run.trajectory_error)
+    none = {"energy_error": None, "trajectory_error": None}
+    changed = run.model_copy(update={"integrator": integrator, "timestep_s": timestep} | none)
+    return scene.model_copy(update={"run": changed}), f"{integrator} at {timestep:g} s chosen: {reason}"
+
+
+def _chosen(subject: Subject, longest: dict[str, float], energy: float | None, trajectory: float | None):
+    kind, target = ("energy_rms", energy) if energy is not None else ("trajectory_error", trajectory)
+    found = choose(subject, target, kind, longest)
+    return found.integrator, found.timestep, found.reason

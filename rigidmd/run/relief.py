@@ -1,0 +1,63 @@
+"""Overlap relief: molecules that a lattice put too close are moved apart before the first step."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.momenta import mobile
+from rigidmd.core.state import State
+from rigidmd.engines.cpu import Engine
+from rigidmd.measure.kicks import kicks
+from rigidmd.mechanics.rotation import from_vector
+
+MOST_STEPS = 2000
+LONGEST_MOVE = 0.1  # of the smallest distance that matters (the scale given), a step
+
+
+class Relief(NamedTuple):
+    """What the relief did and what is left to do."""
+
+    steps: int
+    excess: float  # largest kick of a first step over its thermal momentum; fine at 1 or below
+
+
+def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, thermal: float, dt: float) -> Relief:
+    """Steepest descent with a bounded move, in place, until the first step is no longer violent.
+
+    radius (species,): how far from its centre a molecule reaches (Å), which turns angles into moves; scale: the
+    smallest Lennard-Jones diameter (Å). A move that lowers the energy lengthens the next by a fifth, another is taken
+    back and halved.
+    """
+    load, tallies = engine.evaluate(state)
+    left = float(kicks(engine.model, load, thermal, dt).max())
+    if left <= 1:
+        return Relief(0, left)
+    energy = sum(tally.energy for tally in tallies.values())
+    length = LONGEST_MOVE * scale
+    arm = np.where(radius > 0, radius, 1.0)[engine.model.species][: len(state.rotation), None]
+    free = mobile(engine.model)
+    turning = (engine.model.inertia > 0)[engine.model.species][: len(state.rotation)]
+    for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
+        # Each molecule along its own force, none further than `length`: overlaps do not slow down everybody else.
+        push = load.force * free[:, None] / np.abs(load.force[free]).max()
+        turn = load.torque_body * turning / arm / np.abs(load.force[free]).max()
+        reach = np.linalg.norm(push, axis=1)
+        reach[: len(turn)] = np.maximum(reach[: len(turn)], np.linalg.norm(turn, axis=1))
+        share = length / np.sqrt(reach.max() * np.maximum(reach, 1e-3 * reach.max()))
+        before = state.copy()
+        state.position[:] += push * share[:, None]
+        if len(turn):
+            state.rotation[:] = state.rotation @ from_vector(turn * share[: len(turn), None] / arm)
+        new_load, tallies = engine.evaluate(state)
+        new_energy = sum(tally.energy for tally in tallies.values())
+        if new_energy < energy:
+            load, energy, length = new_load, new_energy, min(1.2 * length, LONGEST_MOVE * scale)
+            left = float(kicks(engine.model, load, thermal, dt).max())
+            if left <= 1:
+                break
+        else:
+            state.position[:], state.rotation[:] = before.position, before.rotation
+            length *= 0.5
+            if length < 1e-6 * scale:
+                break
+    return Relief(step, left)

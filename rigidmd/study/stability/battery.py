@@ -1,0 +1,34 @@
+"""The battery: all cases, in the order in which they are run."""
+
+import time as clock
+from collections.abc import Callable
+
+from rigidmd.errors import SceneError
+from rigidmd.measure.stability import Finding
+from rigidmd.study.stability import bodies, boxes, collisions, resistance, tops, unfit, water  # noqa: F401  (enter cases)
+from rigidmd.study.stability.cases import CASES, Case
+from rigidmd.validation import meant
+
+
+def chosen(names: list[str] | None) -> list[Case]:
+    """The cases of these names, or all. Raises SceneError with a suggestion."""
+    faults = [
+        f"there is no case {name!r}{meant(name, CASES)} (known: {', '.join(CASES)})"
+        for name in names or []
+        if name not in CASES
+    ]
+    if faults:
+        raise SceneError("--case", faults)
+    found = [CASES[name] for name in names] if names else CASES.values()
+    return sorted(found, key=lambda one: one.group)
+
+
+def battery(names: list[str] | None = None, quick: bool = False, say: Callable[[str], None] = lambda name: None):
+    """Findings of the cases of these names (all of them when not given), one after the other; say(name) before each."""
+    for one in chosen(names):
+        say(one.name)
+        finding = Finding(one.name, one.group, one.sentence, *one.titles)
+        began = clock.perf_counter()
+        one.attempt(finding, quick)
+        finding.seconds = clock.perf_counter() - began
+        yield finding

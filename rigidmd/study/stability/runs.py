@@ -1,0 +1,219 @@
+"""Scenes made in code, run as a user runs them, and what came of them."""
+
+import time as clock
+from collections.abc import Callable
+from functools import cache
+from math import inf, nan
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from rigidmd.core.state import State
+from rigidmd.errors import RigidMDError
+from rigidmd.measure.stability import Outcome
+from rigidmd.mechanics.rotation import from_quaternion
+from rigidmd.run import Simulation
+from rigidmd.run.loop import Results
+from rigidmd.scene import Scene
+
+#: Integrator families: the common one on both rotors, a symplectic Nystrom scheme, a composition on the split rotor.
+FAMILIES = {
+    "velocity_verlet": {"integrator": "velocity_verlet", "rotor": "split"},
+    "velocity_verlet, exact rotor": {"integrator": "velocity_verlet", "rotor": "exact"},
+    "srkn_4": {"integrator": "srkn_4"},
+    "pefrl": {"integrator": "pefrl"},
+    "kahan_li_6": {"integrator": "kahan_li_6"},
+}
+SPLIT, EXACT = "velocity_verlet", "velocity_verlet, exact rotor"
+QUICK = (SPLIT, EXACT, "srkn_4")
+TEXTBOOK = {
+    f"{solver}, {form}": {"integrator": solver, "formulation": form}
+    for solver in ("rk4", "dop853")
+    for form in ("matrix", "quaternion", "euler_angles")
+}
+
+
+def families(quick: bool) -> tuple[str, ...]:
+    """Those that every case is tried with."""
+    return QUICK if quick else tuple(FAMILIES)
+
+
+def attempt(run: Callable[[], Outcome]) -> Outcome:
+    """The outcome of a run; an error of ours becomes its message, any other a crash."""
+    began = clock.perf_counter()
+    try:
+        with np.errstate(all="ignore"):
+            outcome = run()
+    except RigidMDError as error:
+        outcome = Outcome(message=str(error))
+    except Exception as error:  # what must not happen is what is looked for
+        outcome = Outcome(crash=f"{type(error).__name__}: {error}")
+    return outcome._replace(seconds=clock.perf_counter() - began)
+
+
+def body_scene(data: dict, step: float, duration: float, family: str, samples: int = 50) -> dict:
+    """The tables of a body's scene with a run of this family; no files."""
+    known = FAMILIES | TEXTBOOK
+    run = {"duration_s": float(duration), "timestep_s": float(step)} | known[family]
+    output = {"trajectory": False, "figures": False, "interval_s": max(float(step), float(duration) / samples)}
+    return data | {"run": run, "output": output | {"interval_s": min(output["interval_s"], float(duration))}}
+
+
+def run_body(
+    data: dict, step: float, duration: float, family: str, error: Callable[[Results], float], samples: int = 50
+) -> Outcome:
+    """A body moved for a duration (s), with error(results) against what is known."""
+
+    def run() -> Outcome:
+        results = Simulation(Scene.from_dict(body_scene(data, step, duration, family, samples))).run()
+        wrong = list(results.summary["largest_relative_error"].values())
+        orthogonality = results.summary["largest_orthogonality_error"]
+        told = max([*wrong, orthogonality or 0.0], default=0.0)
+        return Outcome(float(error(results)), float(told))
+
+    return attempt(run)
+
+
+def last_rotation(results: Results) -> np.ndarray:
+    """Q (3, 3) at the end, of the body's own axes."""
+    return np.array([[results[f"q{i}{j}"][-1] for j in (1, 2, 3)] for i in (1, 2, 3)])
+
+
+def away_from(rotation: np.ndarray) -> Callable[[Results], float]:
+    """The largest entry of |Q - Q_known| at the end."""
+    return lambda results: np.abs(last_rotation(results) - rotation).max()
+
+
+def invariants(results: Results) -> float:
+    """Largest relative error of L along the lab's axes, of |L| and of Q's orthogonality; not of the energy."""
+    wrong = results.summary["largest_relative_error"]
+    return max([results.summary["largest_orthogonality_error"], *(e for name, e in wrong.items() if name != "energy")])
+
+
+def everything_kept(results: Results) -> float:
+    """Largest relative error of all that is conserved, and of Q's orthogonality."""
+    return max(invariants(results), results.summary["largest_relative_error"].get("energy", 0.0))
+
+
+def solved(inertia, omega, span: float) -> np.ndarray:
+    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion: it shares nothing with the flows.
+
+    Good to about 1e-13 a radian.
+    """
+    i1, i2, i3 = (float(i) for i in inertia)
+    k1, k2, k3 = (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3
+
+    def rates(t, y):
+        a, b, c, w, x, y, z = y.tolist()
+        return (
+            k1 * b * c, k2 * c * a, k3 * a * b,
+            -0.5 * (x * a + y * b + z * c), 0.5 * (w * a + y * c - z * b),
+            0.5 * (w * b + z * a - x * c), 0.5 * (w * c + x * b - y * a),
+        )  # fmt: skip
+
+    found = solve_ivp(rates, (0.0, span), [*omega, 1.0, 0.0, 0.0, 0.0], "DOP853", rtol=1e-13, atol=1e-14)
+    return from_quaternion(found.y[3:, -1])
+
+
+# Molecules
+
+
+def molecules_scene(
+    molecules: list[dict],
+    box: dict,
+    step: float,
+    steps: int,
+    family: str = SPLIT,
+    temperature: float | None = 298.0,
+    thermostat: dict | None = None,
+    forces: dict | None = None,
+    looks: int = 25,
+) -> dict:
+    """The tables of a scene of molecules: one stage of so many steps (fs), seen `looks` times, no files."""
+    stage = {"duration_ps": step * steps / 1000, "timestep_fs": float(step)} | FAMILIES[family]
+    if thermostat is not None:
+        stage |= {"ensemble": "nvt"} | thermostat
+    return {
+        "box": box,
+        "molecules": molecules,
+        "forces": forces or {},
+        "start": {} if temperature is None else {"temperature_K": float(temperature)},
+        "stages": [stage],
+        "output": {"trajectory": False, "log_interval_ps": min(1e9, step * max(1, steps // looks) / 1000)},
+    }
+
+
+def simulate(data: dict, state: State | None = None) -> Results:
+    """Run a scene of molecules, from a state of its own where one is given."""
+    simulation = Simulation(Scene.from_dict(data))
+    if state is not None:
+        simulation.start_from(state)
+    return simulation.run()
+
+
+def energy_error(results: Results, scale: float = 0.0) -> float:
+    """Largest change of what is conserved, relative to the kinetic energy of the start (or a scale, kJ/mol)."""
+    wrong = np.abs(results["drift"])
+    size = scale or results["kinetic"][0]
+    return float(wrong.max() / size) if np.isfinite(wrong).all() and size > 0 else inf
+
+
+def run_molecules(
+    data: dict,
+    state: State | None = None,
+    error: Callable[[Results], float] | None = None,
+    scale: float = 0.0,
+) -> Outcome:
+    """A run of molecules; its error is that of the energy unless `error` says what else."""
+
+    def run() -> Outcome:
+        results = simulate(data, state)
+        told = energy_error(results, scale)
+        return Outcome(told if error is None else float(error(results)), told)
+
+    return attempt(run)
+
+
+def only_built(data: dict) -> Outcome:
+    """A scene that should be refused before it runs; it counts as run, with no answer, if it is not."""
+
+    def run() -> Outcome:
+        Simulation(Scene.from_dict(data)).run()
+        return Outcome(nan, 0.0)
+
+    return attempt(run)
+
+
+WATER_BOX, WATER_FORCES = {"density_g_cm3": 0.997}, {"cutoff_A": 6.0}
+WATERS = 64
+
+
+@cache
+def liquid(model: str, temperature: float, step: float, steps: int) -> State:
+    """Water that has been at a temperature (K) for so many steps (fs), from the lattice."""
+    heat = {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
+    data = molecules_scene(water(model), WATER_BOX, step, steps, SPLIT, temperature, heat, WATER_FORCES)
+    with np.errstate(all="ignore"):
+        return simulate(data).state
+
+
+def water(model: str) -> list[dict]:
+    """A box of it; TIP4P of 1983 is no model of the package, its sites are given."""
+    return [
+        {"name": "tip4p", "sites": TIP4P, "count": WATERS} if model == "tip4p" else {"model": model, "count": WATERS}
+    ]
+
+
+TIP4P = [
+    {
+        "name": "OW",
+        "element": "O",
+        "mass_u": 15.9994,
+        "position_A": [0.0, 0.0, 0.0],
+        "sigma_A": 3.154,
+        "epsilon_K": 78.0,
+    },
+    {"name": "HW1", "element": "H", "mass_u": 1.008, "position_A": [0.756950, 0.585882, 0.0], "charge_e": 0.52},
+    {"name": "HW2", "element": "H", "mass_u": 1.008, "position_A": [-0.756950, 0.585882, 0.0], "charge_e": 0.52},
+    {"name": "MW", "mass_u": 0.0, "position_A": [0.0, 0.15, 0.0], "charge_e": -1.04},
+]
