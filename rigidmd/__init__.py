@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BodyScene", "Every", "MolecularScene", "Moment", "Results", "Scene", "Simulation"]
 
-_HOMES = {name: "scene" if name.endswith("Scene") else "simulation" for name in __all__}
+_HOMES = {name: "scene" if name.endswith("Scene") else "run" for name in __all__}
 
 
 def __getattr__(name: str) -> object:
