@@ -176,7 +176,7 @@ def build(scene: MolecularScene) -> System:
         if faults := overlaps(system):
             raise StructureError(str(scene.path(scene.structure.file)), faults)
     else:
-        system.notes += [f"box: {note}" for note in arrangement.notes]
+        system.notes.extend(f"box: {note}" for note in arrangement.notes)
     return system
 
 
