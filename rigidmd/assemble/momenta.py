@@ -1,12 +1,10 @@
 """Momenta at a temperature, and the degrees of freedom that share it."""
 
-from dataclasses import dataclass
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.state import REST, State
+from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
 from rigidmd.units import BOLTZMANN
 
@@ -57,21 +55,6 @@ def remove_momentum(model: Model, velocity: np.ndarray) -> float:
         return 0.0
     velocity -= momentum / mass.sum()
     return float(momentum @ momentum / (2 * mass.sum()))
-
-
-@dataclass
-class Removed:
-    """What removals of the total momentum have taken out so far."""
-
-    times: int = 0
-    largest: float = 0.0  # |P|, u Å/ps
-
-    def remove(self, model: Model, state: State) -> None:
-        """Once more, in place, and book its energy."""
-        energy = remove_momentum(model, state.velocity)
-        self.times += 1
-        self.largest = max(self.largest, sqrt(2 * energy * float(model.mass[model.species].sum())))
-        state.books[REST] -= energy
 
 
 def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:

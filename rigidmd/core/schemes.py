@@ -10,16 +10,17 @@ does. Every other row counts on a drift that is the free motion itself: with the
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-#: The flows that a step is made of: by the forces, free flight and free rotation, by a bath.
-KICK, DRIFT, BATH = 0, 1, 2
+#: The flows that a step is made of: by the forces, free flight and free rotation, by a bath; and total momentum goes.
+KICK, DRIFT, BATH, REST = 0, 1, 2, 3
 
 
 class Flow(NamedTuple):
     """One flow of a step."""
 
-    kind: int  # KICK, DRIFT or BATH
+    kind: int  # KICK, DRIFT, BATH or REST
     fraction: float  # of the time step
     gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.gradient)
+    every: int = 1  # it is taken in every so many steps of a stretch
 
 
 class Scheme(NamedTuple):
@@ -39,6 +40,10 @@ class Scheme(NamedTuple):
     def with_bath(self, bath: tuple) -> "Scheme":
         """This scheme with a bath that acts for a whole time step at the end of each."""
         return self._replace(flows=(*self.flows, Flow(BATH, 1.0)), bath=bath)
+
+    def with_rest(self, every: int) -> "Scheme":
+        """This scheme with the total momentum of all molecules taken out at the end of every so many steps."""
+        return self._replace(flows=(*self.flows, Flow(REST, 0.0, every=every)))
 
     @property
     def kicks(self) -> tuple[float, ...]:
@@ -61,7 +66,7 @@ class Scheme(NamedTuple):
 
         A gradient takes one more.
         """
-        moving = [flow for flow in self.flows if flow.kind != BATH]
+        moving = [flow for flow in self.flows if flow.kind in (KICK, DRIFT)]
         after_drift = sum(b.kind == KICK and a.kind == DRIFT for a, b in pairwise((moving[-1], *moving)))
         return after_drift + sum(flow.gradient != 0 for flow in self.flows)
 

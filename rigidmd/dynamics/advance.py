@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
-from rigidmd.core.schemes import DRIFT, KICK, Scheme
+from rigidmd.core import state as books
+from rigidmd.core.schemes import BATH, DRIFT, KICK, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN
 from rigidmd.dynamics.baths import apply
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
@@ -41,9 +42,10 @@ def code_of(model: NamedTuple) -> Code | None:
 class Row(NamedTuple):
     """The flows of a scheme as arrays, in their order."""
 
-    kind: np.ndarray  # (flows,) KICK, DRIFT or BATH
+    kind: np.ndarray  # (flows,) KICK, DRIFT, BATH or REST
     fraction: np.ndarray  # (flows,) of the time step
     moment: np.ndarray  # (flows,) of the time step: when each ends, as drifts count
+    every: np.ndarray  # (flows,) taken in every so many steps of a stretch
     gradient: np.ndarray | None  # (flows,) of dt²; None where no kick has one, and none is compiled
 
 
@@ -54,7 +56,8 @@ def row_of(scheme: Scheme) -> Row:
     moment = np.cumsum(np.where(kind == DRIFT, fraction, 0.0))
     moment[np.flatnonzero(kind == DRIFT)[-1] :] = 1.0
     gradient = np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None
-    return Row(kind, fraction, moment, gradient)
+    every = np.array([flow.every for flow in scheme.flows])
+    return Row(kind, fraction, moment, every, gradient)
 
 
 @kernel(outer=True)
@@ -91,8 +94,12 @@ def advance(model, code, state, load, terms, bath, row, probe, dt, until, cursor
                 drift(model, code, state, h)
                 state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + row.moment[k]) * dt
                 cursor[1] = 0
-            else:
+            elif (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] != 0:
+                pass
+            elif row.kind[k] == BATH:
                 apply(bath, model, state, h, DRAWS * k)
+            else:
+                rest(model, state)
             cursor[0] += 1
         cursor[0] = 0
         state.step[NOW] += 1
@@ -112,6 +119,33 @@ def drift(model, code, state, h):
 def pay(model, terms, state, h):
     """Add to the books what driving terms do at the present velocity over h; half before a kick, half after."""
     raise TypeError("compiled code only")
+
+
+def rest(model, state):
+    """Take the total momentum out, in place: the same velocity from all molecules; its energy goes into the books."""
+    raise TypeError("compiled code only")
+
+
+@implements(rest)
+def _rest_molecules(model, state):
+    if not is_a(model, Model):
+        return lambda model, state: None
+
+    def rest_molecules(model, state):
+        mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
+        for m in range(len(state.velocity)):
+            own = model.mass[model.species[m]]
+            mass += own
+            px += own * state.velocity[m, 0]
+            py += own * state.velocity[m, 1]
+            pz += own * state.velocity[m, 2]
+        for m in range(len(state.velocity)):
+            state.velocity[m, 0] -= px / mass
+            state.velocity[m, 1] -= py / mass
+            state.velocity[m, 2] -= pz / mass
+        state.books[books.REST] -= (px * px + py * py + pz * pz) / (2 * mass)
+
+    return rest_molecules
 
 
 @implements(kick)

@@ -8,7 +8,7 @@ from math import isnan, sqrt
 import numba
 import numpy as np
 
-from rigidmd.assemble.momenta import Removed, mobile
+from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System
 from rigidmd.core.state import REST, State
 from rigidmd.measure.drift import inefficiency, slope
@@ -33,13 +33,11 @@ def summarise(
     choices: dict[int, str],
     stable: dict[int, float],
     warnings: list[str],
-    removed: Removed,
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
 
     choices : of stages that left their integrator open, what was chosen and why
     stable : the longest stable step (ps) of stages, as estimated at their start
-    removed : how often, and how much, total momentum was taken out
     """
     scene = system.scene
     momentum = samples.rows[-1].momentum
@@ -73,20 +71,18 @@ def summarise(
         "largest_orthogonality_error": max(sample.orthogonality for sample in samples.rows),
         "momentum_u_A_ps": momentum,
         "momentum_relative": _relative_momentum(system, state, momentum),
-        "momentum_removed": _removed(scene, removed, state),
+        "momentum_removed": _removed(scene, state),
         "stages": stages,
         "notes": [*system.notes, *_drifting(system, samples.rows[-1]), *warnings],
     }
 
 
-def _removed(scene: MolecularScene, removed: Removed, state: State) -> dict | None:
+def _removed(scene: MolecularScene, state: State) -> dict | None:
     """What removals of the total momentum took out in the whole run; None where there are none."""
     if scene.removes_momentum_every is None:
         return None
     return {
         "interval_ps": scene.removes_momentum_every,
-        "times": removed.times,
-        "largest_u_A_ps": removed.largest,
         "energy_kJ_mol": -float(state.books[REST]) / KJ_PER_MOL,
     }
 

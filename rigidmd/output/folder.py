@@ -6,7 +6,9 @@ from pathlib import Path
 
 from rigidmd.errors import OutputError
 
-SCENE_FILE = "scene.toml"
+#: Files of a run, by what is in them; trajectory and topology are named by the scene.
+SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
+FINAL, LAST_GOOD, ENERGY, SUMMARY = "final.npz", "last_good_state.npz", "energy.png", "summary.json"
 #: Marks a folder as that of a run and lists the files the run may write, one a line: what --force may remove.
 MARKER = ".rigidmd-run"
 

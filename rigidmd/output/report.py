@@ -45,8 +45,7 @@ def summary_text(summary: dict) -> str:
     )
     if removed := summary["momentum_removed"]:
         lines.append(
-            f"  {'':<16}taken out every {removed['interval_ps']:g} ps, {removed['times']} times, at most "
-            f"{removed['largest_u_A_ps']:.1e} u Å/ps; {removed['energy_kJ_mol']:.1e} kJ/mol in all"
+            f"  {'':<16}taken out every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"
         )
     if summary["positions"]:
         lines.append(f"  {'positions':<16}{summary['positions']}: {POSITIONS[summary['positions']]}")

@@ -8,7 +8,7 @@ import tomli_w
 
 from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
-from rigidmd.output.folder import SCENE_FILE
+from rigidmd.output.folder import SCENE
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 
@@ -41,5 +41,5 @@ def write_body_scene(folder: Path, scene: BodyScene) -> None:
 
 
 def _write(folder: Path, data: dict) -> None:
-    with whole_file(folder / SCENE_FILE) as temporary:
+    with whole_file(folder / SCENE) as temporary:
         temporary.write_text(tomli_w.dumps(data), encoding="utf-8")

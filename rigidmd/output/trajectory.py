@@ -5,6 +5,7 @@ import os
 import warnings
 from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
@@ -22,7 +23,6 @@ from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
-from rigidmd.forces.pairs.space import cell_of
 
 #: Least and largest coordinate (Å) that a format holds: whole thousandths of a nm in 32 bits, columns of a text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
@@ -58,24 +58,32 @@ def set_frame(
     frame.positions = system.site_positions(state, wrapped)
     if velocities:
         frame.velocities = system.site_velocities(state)
-    frame.dimensions = dimensions(system)
+    frame.dimensions = dimensions(state.cell)
     frame.time = time
     frame.data["step"] = step
 
 
-def dimensions(system: System | BodySystem) -> list[float] | None:
-    """Box as MDAnalysis wants it; None without one."""
-    if system.space.volume == inf:
+def dimensions(cell: np.ndarray) -> list[float] | None:
+    """A cell (3, 3) as MDAnalysis wants it; None where there is none."""
+    if cell[0, 0] == inf:
         return None
-    cell = cell_of(system.space)
     return [*np.linalg.norm(cell, axis=1), *angles_deg(cell)]
 
 
-def in_memory(system: System | BodySystem, times: list[float], positions: list[np.ndarray]) -> mda.Universe:
-    """A Universe that holds frames (positions (s, 3) each) in memory, each with its own time (ps)."""
+class Frame(NamedTuple):
+    """A frame of a run: its time (ps), and where none is on the disk, positions (s, 3) and cell (3, 3)."""
+
+    time: float
+    positions: np.ndarray | None = None
+    cell: np.ndarray | None = None
+
+
+def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
+    """A Universe that holds frames in memory, each with its own time and box."""
     u = universe(system, system.state)
-    box = np.tile(dimensions(system), (len(times), 1)) if system.space.volume < inf else None
-    u.trajectory = _TimedFrames(np.array(positions), times=_checked(times), order="fac", dimensions=box)
+    times, positions = _checked([frame.time for frame in frames]), np.array([frame.positions for frame in frames])
+    boxes = None if u.dimensions is None else np.array([dimensions(frame.cell) for frame in frames])
+    u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes)
     return u
 
 
@@ -192,11 +200,11 @@ class TrajectoryFile:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if self._format == ".xyz":
-                self._writer.remark = self._extended_xyz(time)
+                self._writer.remark = _extended_xyz(state.cell, time)
             elif self._format == ".pdb":
                 self._writer.REMARK(f"TIME {time:.6f} PS")
             self._writer.write(self._universe.atoms)
-            if self._format == ".pdb" and (box := dimensions(self._system)):
+            if self._format == ".pdb" and (box := dimensions(state.cell)):
                 self._writer.CRYST1(box)  # MDAnalysis reads what stands between a model and the next as the model's own
         self._flush()
 
@@ -208,14 +216,15 @@ class TrajectoryFile:
         if os.name == "posix":  # XTC and TRR go through C streams that their writers cannot flush: flush them all
             ctypes.CDLL(None).fflush(None)
 
-    def _extended_xyz(self, time: float) -> str:
-        """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
-        box = 'pbc="F F F"'
-        if self._system.space.volume < inf:
-            edges = " ".join(f"{x:.9g}" for x in cell_of(self._system.space).flat)
-            box = f'Lattice="{edges}" pbc="T T T"'
-        return f"{box} Properties=species:S:1:pos:R:3 Time={time:.9g}"
-
     def close(self) -> None:
         """Finish the file."""
         self._writer.close()
+
+
+def _extended_xyz(cell: np.ndarray, time: float) -> str:
+    """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
+    box = 'pbc="F F F"'
+    if cell[0, 0] < inf:
+        edges = " ".join(f"{x:.9g}" for x in cell.flat)
+        box = f'Lattice="{edges}" pbc="T T T"'
+    return f"{box} Properties=species:S:1:pos:R:3 Time={time:.9g}"

@@ -1,7 +1,10 @@
 """The loop between observations, for molecules and for a single body: everything from a scene to its results."""
 
 from rigidmd.run.body import BodySimulation
-from rigidmd.run.loop import Every, Moment, Results, Simulation
+from rigidmd.run.loop import Simulation
 from rigidmd.run.molecules import MolecularSimulation
+from rigidmd.run.moment import Moment
+from rigidmd.run.observers import Every, Observer
+from rigidmd.run.results import Results
 
-__all__ = ["BodySimulation", "Every", "MolecularSimulation", "Moment", "Results", "Simulation"]
+__all__ = ["BodySimulation", "Every", "MolecularSimulation", "Moment", "Observer", "Results", "Simulation"]

@@ -1,38 +1,38 @@
-"""Molecules: relief of overlaps, stages with thermostats, samples, log, trajectory."""
+"""Molecules: relief of overlaps, stages with thermostats, what is sampled of them."""
 
-import contextlib
-from collections.abc import Callable
 from dataclasses import replace
 from math import nan
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 
-from rigidmd.assemble.momenta import Removed
 from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme
-from rigidmd.core.state import NOW, Load, State, state_of
-from rigidmd.core.state_file import write_state
+from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.meanings import meanings
-from rigidmd.measure.observables import Observation, Reading, observe
+from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.subjects import choose_for_molecules
 from rigidmd.measure.summary import summarise
-from rigidmd.output.folder import SCENE_FILE
-from rigidmd.run.loop import Every, Moment, Phase, Results, Simulation
+from rigidmd.output.report import summary_text
+from rigidmd.output.scene_file import input_names, write_scene
+from rigidmd.run.loop import Costs, Simulation, Stretch
+from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, Sampler, StepWatch, Watch
+from rigidmd.run.moment import Moment
+from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.relief import Relief, relieve
+from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import WITH_VELOCITIES
-from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
-
-LAST_GOOD_STATE = "last_good_state.npz"
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
 
 
 class MolecularSimulation(Simulation):
@@ -49,33 +49,6 @@ class MolecularSimulation(Simulation):
         self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
         self._reset()
 
-    def observe(self, moment: Moment) -> Reading:
-        """Energies, temperatures, pressure, in the units of the log."""
-        return moment._seen.reading
-
-    def _look(self, moment: Moment) -> Observation:
-        stage = self.scene.stages[moment.stage]
-        step = stage.timestep_fs * FEMTOSECOND if stage.integrator == "velocity_verlet" else nan
-        return observe(self.system, self.engine, self.state, step)
-
-    def _no_samples(self) -> Samples:
-        return Samples()
-
-    def _reset(self) -> None:
-        self.system = self._built  # a run may have decided what its scene leaves open
-        self.scene = self.system.scene
-        self.engine = self.system.engine()
-        self.state = self.system.state.copy()
-        numba.set_num_threads(self.threads)
-
-    def _file_names(self) -> list[str]:
-        """Every file that `run` may write."""
-        from rigidmd.output.scene_file import input_names
-
-        output = self.scene.output
-        names = [SCENE_FILE, output.topology, "log.csv", "final.npz", "energy.png", "summary.json", LAST_GOOD_STATE]
-        return [*names, *input_names(self.scene).values(), *([output.trajectory] if output.trajectory else [])]
-
     def start_from(self, state: State) -> None:
         """Let runs begin at positions and momenta of one's own, as they are: no overlaps are relieved."""
         begun = state_of(*state[:5])
@@ -87,6 +60,13 @@ class MolecularSimulation(Simulation):
         self._reset()
         self._prepare()
         return self._relief
+
+    def _reset(self) -> None:
+        self.system = self._built  # a run may have decided what its scene leaves open
+        self.scene = self.system.scene
+        self.engine = self.system.engine()
+        self.state = self.system.state.copy()
+        numba.set_num_threads(self.threads)
 
     def _prepare(self) -> None:
         """Compile, and move apart what a lattice put too close."""
@@ -123,42 +103,41 @@ class MolecularSimulation(Simulation):
         self._relief = relief
         self._choices: dict[int, str] = {}
         self._stable: dict[int, float] = {}
-        self._stage = 0
-        self._last_good: tuple[int, float, State] | None = None
-        self._thermal = 0.0
-        self._removed = Removed()
+        self._origins: dict[int, float] = {}
+        self._conserved: float | None = None
 
     def _row(self, k: int) -> Scheme:
-        """The scheme of a stage, with its thermostat."""
-        stage = self.scene.stages[k]
-        idle = stage.ensemble == "nve"
-        if all(stage.ensemble == "nve" for stage in self.scene.stages):
-            return stage.scheme
-        # a stage without a thermostat among others with one has one that rests: all then run the same machine code
-        return stage.scheme.with_bath(
-            VelocityRescaling(
-                0.0 if idle else BOLTZMANN * stage.temperature_K,
-                np.inf if idle else stage.thermostat_time_ps,
-                self.system.freedom.total,
-                key_of(self.scene.seed, BATH, k),
+        """The scheme of a stage, with its thermostat and the removal of total momentum."""
+        stage, row = self.scene.stages[k], self.scene.stages[k].scheme
+        if any(stage.ensemble == "nvt" for stage in self.scene.stages):
+            # a stage without a thermostat among others with one has one that rests: all then run the same machine code
+            idle = stage.ensemble == "nve"
+            row = row.with_bath(
+                VelocityRescaling(
+                    0.0 if idle else BOLTZMANN * stage.temperature_K,
+                    np.inf if idle else stage.thermostat_time_ps,
+                    self.system.freedom.total,
+                    key_of(self.scene.seed, BATH, k),
+                )
             )
-        )
+        if (interval := self.scene.removes_momentum_every) is not None:
+            row = row.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
+        return row
 
     def _durations(self) -> list[float]:
         return [stage.duration_ps for stage in self.scene.stages]
 
-    def _begin(self, k: int) -> Phase:
+    def _enter(self, k: int) -> Stretch:
         if self.scene.stages[k].is_open:
             self._choose(k)
-        self._stage = k
-        if self.scene.removes_momentum_every is not None:
-            self._removed.remove(self.system.model, self.state)
         self._estimate(k)
         # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
         self.engine = self.system.engine()
         self.state.begin_stretch()
+        if self._conserved is not None:
+            self._origins[k] = self._conserved
         stage = self.scene.stages[k]
-        return Phase(stage.timestep_fs * FEMTOSECOND, stage.steps)
+        return Stretch(self._row(k), stage.timestep_fs * FEMTOSECOND, stage.steps)
 
     def _estimate(self, k: int) -> None:
         """Longest stable step (ps) of stage k from where it starts, and a warning where its own is longer."""
@@ -172,7 +151,7 @@ class MolecularSimulation(Simulation):
             return
         self._stable[k] = stable_angle(stage.scheme) / found.rate
         if stage.timestep_fs * FEMTOSECOND > self._stable[k]:
-            self._note(
+            self.note(
                 f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
                 f"at its start, of {watch.named(self.system, found.molecule)}, has a period of "
                 f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
@@ -190,168 +169,78 @@ class MolecularSimulation(Simulation):
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
         self.system = replace(self.system, scene=self.scene)
         if self.folder is not None:
-            from rigidmd.output.scene_file import write_scene
+            self.write_scene(self.folder)
 
-            write_scene(self.folder, self.scene, self.system)
+    def _look(self, moment: Moment) -> Observation:
+        stage = self.scene.stages[moment.stage]
+        step = stage.timestep_fs * FEMTOSECOND if stage.integrator == "velocity_verlet" else nan
+        return observe(self.system, self.engine, self.state, step)
 
-    def _advance(self, k: int, steps: int, done: int) -> None:
-        dt = self.scene.stages[k].timestep_fs * FEMTOSECOND
-        row, interval = self._row(k), self.scene.removes_momentum_every
-        every = steps + done if interval is None else max(1, round(interval / dt))
-        end = done + steps
-        while done < end:
-            to = min(end, done + every - done % every)
-            self.engine.advance(self.state, row, dt, int(self.state.step[NOW]) + to - done)
-            done = to
-            if interval is not None and done % every == 0:
-                self._removed.remove(self.system.model, self.state)
-
-    def _own_observers(self, stack: contextlib.ExitStack, results: Results) -> list[Every]:
-        log, writers = self._writers(stack, results)
-        return [Every(self.scene.output.log_interval_ps, self._sampler(results.samples, log)), *writers]
-
-    def _sampler(self, samples: Samples, log: Callable[[Sample], None]) -> Callable[[Moment], None]:
-        """An observer that turns moments into samples, logs and checks them, and keeps the last good state."""
-        begins: dict[int, int] = {}  # of each stage, the row of the sample at which it began
-
-        def sample(moment: Moment) -> None:
-            seen: Reading = moment.observation
-            conserved = seen.energy - float(self.state.books.sum()) / KJ_PER_MOL
-            begin = begins.setdefault(moment.stage, max(0, len(samples.rows) - 1))
-            origin = samples.rows[begin].conserved if samples.rows else conserved
-            boxed = self.system.density > 0
-            samples.rows.append(
-                Sample(
-                    step=moment.step,
-                    time=moment.time,
-                    potential=seen.potential,
-                    kinetic=seen.kinetic,
-                    energy=seen.energy,
-                    temperature=seen.temperature,
-                    volume=self.system.space.volume * 1e-3 if boxed else nan,
-                    density=self.system.density if boxed else nan,
-                    stage_name=self.scene.stages[moment.stage].label,
-                    temperature_translation=seen.temperature_translation,
-                    temperature_rotation=seen.temperature_rotation,
-                    temperature_translation_unbiased=seen.temperature_translation_unbiased,
-                    temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
-                    pressure_bar=seen.pressure_bar,
-                    drift=conserved - origin,
-                    momentum=float(np.linalg.norm(seen.momentum)),
-                    orthogonality=seen.orthogonality,
-                    conserved=conserved,
-                    stage=moment.stage,
-                )
-            )
-            log(samples.rows[-1])
-            self._check_sample(samples.rows, begin, moment._seen)
-            self._last_good = (moment.step, moment.time, self.state.copy())
-
-        return sample
-
-    def _check_sample(self, rows: list[Sample], begin: int, seen: Observation) -> None:
-        now = rows[-1]
-        since = begin
-        if self.scene.stages[now.stage].ensemble == "nvt":
-            memory = self.scene.stages[now.stage].thermostat_time_ps
-            since = len(rows) - 1
-            while since > begin and rows[since].time > now.time - memory:
-                since -= 1
-        self._thermal = self._thermal or watch.thermal_energy(self.system, seen.kinetic)
-        self._check_step(now.stage, seen.load)
-        if finding := watch.sample_finding(self.system, self.scene.watch, rows[since], now):
-            raise finding
-        self._thermal = watch.thermal_energy(self.system, seen.kinetic)
-
-    def _check_step(self, k: int, load: Load) -> None:
-        stage = self.scene.stages[k]
-        finding = watch.step_finding(
-            self.system,
-            self.scene.watch,
-            self.state,
-            load,
-            stage.scheme,
-            stage.timestep_fs * FEMTOSECOND,
-            self._thermal,
+    def sample_of(self, moment: Moment) -> Sample:
+        """A line of the log. Its drift is counted from the last sample before its stage."""
+        seen = moment.observation
+        conserved = seen.energy - float(self.state.books.sum()) / KJ_PER_MOL
+        self._conserved = conserved
+        volume = self.state.volume
+        boxed = volume < np.inf
+        mass = float(self.system.model.mass[self.system.model.species].sum())
+        return Sample(
+            step=moment.step,
+            time=moment.time,
+            potential=seen.potential,
+            kinetic=seen.kinetic,
+            energy=seen.energy,
+            temperature=seen.temperature,
+            volume=volume * 1e-3 if boxed else nan,
+            density=mass / volume / GRAM_PER_CM3 if boxed else nan,
+            stage_name=self.scene.stages[moment.stage].label,
+            temperature_translation=seen.temperature_translation,
+            temperature_rotation=seen.temperature_rotation,
+            temperature_translation_unbiased=seen.temperature_translation_unbiased,
+            temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
+            pressure_bar=seen.pressure_bar,
+            drift=conserved - self._origins.setdefault(moment.stage, conserved),
+            momentum=float(np.linalg.norm(seen.momentum)),
+            orthogonality=seen.orthogonality,
+            conserved=conserved,
+            stage=moment.stage,
         )
-        if finding:
-            raise finding
 
-    def _patience(self, k: int) -> int:
-        return watch.patience(self.system)
-
-    def _check(self, k: int, dt: float) -> None:
-        self._check_step(k, self.engine.load)
-
-    def _writers(self, stack: contextlib.ExitStack, results: Results) -> tuple[Callable[[Sample], None], list[Every]]:
-        """What logs a sample, and the observers that write frames, or keep them where there is no folder."""
+    def _own_observers(self) -> list[Observer]:
         output = self.scene.output
-        wrapped = output.positions == "wrapped"
-        if self.folder is None:
-
-            def keep(moment: Moment) -> None:
-                results._times.append(moment.time)
-                results._frames.append(self.system.site_positions(moment.state, wrapped).astype(np.float32))
-
-            return lambda sample: None, [Every(output.trajectory_interval_ps, keep)] if output.trajectory else []
-        from rigidmd.output.log import Log
-        from rigidmd.output.scene_file import write_scene
-        from rigidmd.output.trajectory import TrajectoryFile, write_topology
-
-        write_scene(self.folder, self.scene, self.system)
-        write_topology(self.folder / output.topology, self.system, self.state, wrapped)
-        log = Log(self.folder / "log.csv")
-        stack.callback(log.close)
-        results.files += [self.folder / name for name in (SCENE_FILE, output.topology, "log.csv")]
-        writers = []
+        interval = output.log_interval_ps
+        self._sampler, self._watch = Sampler(interval), Watch(self, interval)
+        observers: list[Observer] = [self._sampler, self._watch, StepWatch(self, self._watch)]
+        files: list[Observer] = []
         if output.trajectory:
-            path = self.folder / output.trajectory
-            velocities = path.suffix in WITH_VELOCITIES if output.velocities is None else output.velocities
-            file = TrajectoryFile(path, self.system, output.trajectory_interval_ps, velocities, wrapped)
-            stack.callback(file.close)
-            results.files.append(path)
+            velocities = output.trajectory.endswith(WITH_VELOCITIES) if output.velocities is None else output.velocities
+            wrapped = output.positions == "wrapped"
+            files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
+        if self.folder is not None:
+            names = input_names(self.scene).values()
+            files = [SceneFile(names), *files, LogFile(interval), FinalState()]
+            files += [EnergyFigure(self._sampler)] if output.figure else []
+        return [*files, *observers]
 
-            def write(moment: Moment) -> None:
-                file.write(moment.state, moment.time, moment.step)
-                results._times.append(moment.time)
+    def _samples(self) -> Samples:
+        return self._sampler.samples
 
-            writers.append(Every(output.trajectory_interval_ps, write))
-        return log.write, writers
-
-    def _conclude(self, results: Results, prepared: float, wall: float, computing: list[float]) -> None:
-        results.summary = summarise(
-            self.system, results.samples, self.state, self._relief.steps if self._relief else 0, self.threads,
-            prepared, wall, computing,
-            self._interrupted, self._choices, self._stable, self._warnings, self._removed,
+    def _summary(self, samples: Samples, costs: Costs) -> dict[str, Any]:
+        relief_steps = self._relief.steps if self._relief else 0
+        return summarise(
+            self.system, samples, self.state, relief_steps, self.threads, costs.preparing, costs.wall,
+            costs.computing, self._interrupted, self._choices, self._stable, self.notes,
         )  # fmt: skip
-        if self.folder is None:
-            return
-        from rigidmd.output.report import draw_energy, write_summary
 
-        self._write_state("final.npz", self.state)
-        results.files.append(self.folder / "final.npz")
-        if self.scene.output.figure and len(results.samples.rows) > 1:
-            draw_energy(self.folder / "energy.png", self.system, results.samples, results.summary)
-            results.files.append(self.folder / "energy.png")
-        results.files.append(self.folder / "summary.json")
-        results.summary["files"] = [str(path) for path in results.files]
-        write_summary(self.folder / "summary.json", results.summary)
+    def _explain(self, error: SimulationError) -> str:
+        good = self._watch.last_good
+        states = [("", self.state), *([(f"at step {good.step}, ", good.state)] if good else [])]
+        stable = self._stable.get(len(self._origins) - 1)
+        return watch.explained(self.system, error, states, self.stretch.dt, stable)
 
-    def _explain(self, error: SimulationError, dt: float) -> str:
-        states = [("", self.state)]
-        if self._last_good is not None:
-            states.append((f"at step {self._last_good[0]}, ", self._last_good[2]))
-        return watch.explained(self.system, error, states, dt, self._stable.get(self._stage))
-
-    def _write_state(self, name: str, state: State) -> None:
-        write_state(self.folder / name, self.system.saved(state))
-
-    def _save(self) -> str:
-        if self.folder is None or self._last_good is None:
-            return ""
-        step, time, state = self._last_good
-        self._write_state(LAST_GOOD_STATE, state)
-        return f". Last good state, of step {step} ({time:g} ps): {self.folder / LAST_GOOD_STATE}"
+    def write_scene(self, folder: Path) -> None:
+        """Write the scene as it is run, with copies of the files that it reads."""
+        write_scene(folder, self.scene, self.system)
 
     def introduction(self) -> str:
         """What is about to run."""
@@ -365,8 +254,6 @@ class MolecularSimulation(Simulation):
 
     def conclusion(self, results: Results) -> str:
         """The summary as a person reads it."""
-        from rigidmd.output.report import summary_text
-
         return summary_text(results.summary)
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:

@@ -13,7 +13,7 @@ from rigidmd.errors import RigidMDError
 from rigidmd.measure.stability import Outcome
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Simulation
-from rigidmd.run.loop import Results
+from rigidmd.run.results import Results
 from rigidmd.scene import Scene
 
 #: Integrator families: the common one on both rotors, a symplectic Nystrom scheme, a composition on the split rotor.

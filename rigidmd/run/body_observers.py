@@ -1,0 +1,104 @@
+"""What observes a single body: snapshots, the watch, motion.csv, figures."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidmd.forces.body.frame import Inertial
+from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
+from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
+from rigidmd.mechanics.rotor import SplitRotor
+from rigidmd.output.body_figures import FIGURES, draw_motion
+from rigidmd.output.folder import MOTION, MOTION_NPZ
+from rigidmd.output.motion_file import write_csv, write_npz
+from rigidmd.run.moment import Moment
+from rigidmd.run.observers import Observer
+
+if TYPE_CHECKING:
+    from rigidmd.assemble.body import BodySystem
+    from rigidmd.run.body import BodySimulation
+    from rigidmd.run.results import Results
+
+
+class Sampler(Observer):
+    """Keeps snapshots; their columns are made at the end."""
+
+    ends = True
+
+    def __init__(self, interval: float):
+        self.interval = interval
+        self.snapshots: list[Snapshot] = []
+
+    def see(self, moment: Moment) -> None:
+        """One more."""
+        self.snapshots.append(Snapshot(moment.time, moment.state.copy()))
+
+
+class BodyWatch(Observer):
+    """Holds the state against the limits of the scene, however seldom samples are taken."""
+
+    ends = True
+
+    def __init__(self, run: "BodySimulation"):
+        self.check = BodyCheck(run.system, run.scene.watch)
+        every = max(1, round(run.scene.interval / run.scene.run.timestep_s))
+        # half a second of computing or less, and LOOKS samples
+        self.steps = min(BODY_PATIENCE // getattr(run.system.method, "force_evaluations", 1), LOOKS * every)
+        self._run = run
+
+    def see(self, moment: Moment) -> None:
+        """Raise a `Finding` if the state cannot be what the scene means."""
+        if finding := self.check.finding(self._run.state, self._run.stretch.dt):
+            raise finding
+
+
+class MotionFiles(Observer):
+    """motion.csv, and the same as arrays."""
+
+    def __init__(self, sampler: Sampler, npz: bool):
+        self._sampler, self._npz = sampler, npz
+
+    def files(self) -> list[str]:
+        """Both."""
+        return [MOTION, MOTION_NPZ]
+
+    def end(self, run: "BodySimulation", results: "Results") -> None:
+        """Write them."""
+        write_csv(run.folder / MOTION, results.samples.columns)
+        results.files.append(run.folder / MOTION)
+        if self._npz:
+            write_npz(run.folder / MOTION_NPZ, results.samples.columns)
+            results.files.append(run.folder / MOTION_NPZ)
+
+    def failed(self, run: "BodySimulation") -> str:
+        """Save the motion so far."""
+        write_csv(run.folder / MOTION, motion(run.system, self._sampler.snapshots).columns)
+        return f". The motion so far: {run.folder / MOTION}"
+
+
+class Figures(Observer):
+    """The path of the axis, angles, omega, errors."""
+
+    def files(self) -> list[str]:
+        """As PNG and SVG."""
+        return [f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "svg")]
+
+    def end(self, run: "BodySimulation", results: "Results") -> None:
+        """Draw them, if there is anything to see."""
+        if len(results.samples) > 2:
+            gravity = run.scene.gravity and run.scene.gravity.acceleration_m_s2
+            drawn = _drawn(run.system, results.samples) | {"gravity": gravity}
+            results.files += draw_motion(run.folder, run.scene.name, **drawn)
+
+
+def _drawn(system: "BodySystem", samples: Motion) -> dict:
+    """What the figures show: omega along the principal axes, where it lies on ellipsoids that stay."""
+    omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes if system.turns else []
+    own = {f"omega_body_{k + 1}": omega[:, k] for k in range(3)} if system.turns else {}
+    constant = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
+    return {
+        "columns": samples.columns | own,
+        "axis_body": drawn_axis(system),
+        "inertia": system.inertia if constant else None,
+        "invariants": samples.invariants,
+    }

@@ -1,0 +1,53 @@
+"""A moment of a run, as observers are shown it."""
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidmd.core.state import State
+
+if TYPE_CHECKING:
+    from rigidmd.measure.samples import Sample
+    from rigidmd.run.loop import Simulation
+
+
+class Moment:
+    """What an observer is given: where the run is, its state (read-only), and what can be measured there.
+
+    step : steps since the start; time : ps, or s for a single body; stage : index of the stage that led here
+    state : of molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), of a body in SI units
+    """
+
+    def __init__(self, run: "Simulation", step: int, time: float, stage: int):
+        self._run = run
+        self.step = step
+        self.time = time
+        self.stage = stage
+        self.state = State(*(_read_only(array) for array in run.state))
+
+    @cached_property
+    def _seen(self) -> Any:
+        """What there is to see, in internal units; evaluated at the first use and shared by all observers."""
+        return self._run._look(self)
+
+    @cached_property
+    def sample(self) -> "Sample":
+        """The line of the log of this moment; of molecules."""
+        return self._run.sample_of(self)
+
+    @property
+    def observation(self) -> Any:
+        """What can be measured: a `Reading` of molecules, in the units of the log; a `Pose` of a body, in SI units."""
+        return getattr(self._seen, "reading", self._seen)
+
+    @property
+    def site_positions(self) -> np.ndarray:
+        """Positions (s, 3) of all sites, lab frame, Å, as they travelled."""
+        return self._run.system.site_positions(self.state)
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view

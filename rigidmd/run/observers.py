@@ -1,0 +1,128 @@
+"""Observers: all that looks at a run between its steps. They read its state and never write it.
+
+Each is asked the same few things, whatever it does: `files` it may write, `begin`, `see` a moment, `end`. It sees every
+`interval` of time, counted in steps of each stretch, or every so many `steps`, for what is to be looked at however
+rarely results are wanted; and, if it is one that `ends`, the last moment of every stretch. None depends on being before
+or behind another: what several of them need, a moment or the run has.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidmd.output.folder import SCENE
+from rigidmd.run.moment import Moment
+
+if TYPE_CHECKING:
+    from rigidmd.run.loop import Simulation
+    from rigidmd.run.results import Results
+
+
+class Observer:
+    """An observer that does nothing; others do some of it."""
+
+    interval: float | None = None  # ps, or s for a single body
+    steps: int | None = None
+    ends = False
+
+    def files(self) -> list[str]:
+        """Names of all files that it may write into the folder of the run."""
+        return []
+
+    def begin(self, run: "Simulation") -> None:
+        """Before the first step; the folder is there."""
+
+    def see(self, moment: Moment) -> None:
+        """Look. Raises SimulationError to stop the run."""
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        """After the last step, or where the run was interrupted: write what is left to write."""
+
+    def close(self) -> None:
+        """Whatever happened: let go of files."""
+
+    def failed(self, run: "Simulation") -> str:
+        """The run stops with an error: save what is good; a sentence that says where, or nothing."""
+        return ""
+
+
+class Every(Observer):
+    """An observer of one's own: call `function(moment)` every `interval` ps (s for a single body)."""
+
+    def __init__(self, interval: float, function: Callable[[Moment], object]):
+        self.interval = interval
+        self.function = function
+
+    def see(self, moment: Moment) -> None:
+        """Call the function."""
+        self.function(moment)
+
+
+class SceneFile(Observer):
+    """scene.toml: the scene as it was run, with copies of the files that it reads."""
+
+    def __init__(self, names: Sequence[str] = ()):
+        self._copies = list(names)
+
+    def files(self) -> list[str]:
+        """The scene and its inputs."""
+        return [SCENE, *self._copies]
+
+    def begin(self, run: "Simulation") -> None:
+        """Write it; a run writes it once more where a stage has decided what the scene left open."""
+        run.write_scene(run.folder)
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        """Name it."""
+        results.files.append(run.folder / SCENE)
+
+
+class Frames(Observer):
+    """Topology and trajectory; without a folder, frames in memory."""
+
+    def __init__(
+        self, interval: float, topology: str, trajectory: str, velocities: bool = False, wrapped: bool = False
+    ):
+        self.interval = interval
+        self._names = [topology, trajectory]
+        self._velocities, self._wrapped = velocities, wrapped
+        self._frames: list = []
+        self._file = None
+
+    def files(self) -> list[str]:
+        """Both."""
+        return self._names
+
+    def begin(self, run: "Simulation") -> None:
+        """Write the topology and open the trajectory."""
+        from rigidmd.output.trajectory import TrajectoryFile, write_topology
+
+        self._run, self._frames = run, []
+        if run.folder is not None:
+            topology, trajectory = (run.folder / name for name in self._names)
+            write_topology(topology, run.system, run.state, self._wrapped)
+            self._file = TrajectoryFile(trajectory, run.system, self.interval, self._velocities, self._wrapped)
+
+    def see(self, moment: Moment) -> None:
+        """A frame."""
+        from rigidmd.output.trajectory import Frame
+
+        if self._file is not None:
+            self._file.write(moment.state, moment.time, moment.step)
+            self._frames.append(Frame(moment.time))
+        else:
+            positions = self._run.system.site_positions(moment.state, self._wrapped).astype(np.float32)
+            self._frames.append(Frame(moment.time, positions, moment.state.cell.copy()))
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        """Hand over what was seen."""
+        results._frames = self._frames
+        if self._file is not None:
+            results.files += [run.folder / name for name in self._names]
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None

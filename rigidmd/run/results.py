@@ -1,0 +1,110 @@
+"""What a run leaves."""
+
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidmd.core.state import State
+
+if TYPE_CHECKING:
+    import MDAnalysis
+    import pandas
+
+    from rigidmd.assemble.body import BodySystem
+    from rigidmd.assemble.system import System
+    from rigidmd.measure.motion import Motion
+    from rigidmd.measure.samples import Samples
+    from rigidmd.output.trajectory import Frame
+
+
+@dataclass(repr=False)
+class Results:
+    """What a run leaves: samples as arrays, a summary, the final state, the files.
+
+    results["energy"] is a column of the samples as an array, in the unit that log.csv has (kJ/mol of the whole system,
+    K, bar, Å, ps), of a body in SI units; `units` names all columns with their units.
+
+    summary : figures with units in their keys, as in summary.json
+    state : the last one, of molecules in Å, Å/ps and u Å²/ps, of a body in SI units
+    files : what was written
+    interrupted : whether a signal ended the run before its time; signal : which one, 2 of Ctrl-C, 15 of SIGTERM
+    """
+
+    system: "System | BodySystem"
+    state: State
+    samples: "Samples | Motion"
+    summary: dict[str, Any] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    interrupted: bool = False
+    signal: int | None = None
+    _frames: "list[Frame]" = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"<Results of {self.system.scene.name}: {self._told}; results[column], .units, .summary, .universe()>"
+
+    def _repr_html_(self) -> str:
+        families: dict[tuple[str, str], list[str]] = {}
+        for name, column in self.samples.described.items():
+            families.setdefault((column.unit, column.about), []).append(name)
+        rows = "".join(
+            f"<tr><td>{' '.join(f'<code>{name}</code>' for name in names)}</td><td>{unit}</td>"
+            f'<td>{self._range(names)}</td><td style="text-align: left">{escape(about)}</td></tr>'
+            for (unit, about), names in families.items()
+        )
+        return (
+            f"<b>{escape(self.system.scene.name)}</b>: {escape(self._told)}<table><tr><th>column</th><th>unit</th>"
+            f"<th>first ... last</th><th></th></tr>{rows}</table>"
+        )
+
+    @property
+    def _told(self) -> str:
+        files = f"{len(self.files)} files in {self.files[0].parent}" if self.files else "no files"
+        return f"{'interrupted, ' if self.interrupted else ''}{len(self.samples)} samples, {files}"
+
+    def _range(self, columns: list[str]) -> str:
+        """First and last value of a column that stands alone."""
+        values = self[columns[0]]
+        if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
+            return ""
+        return " ... ".join(escape(x) if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """A column of the samples as an array (n,), in the unit that `units` says: results["energy"].
+
+        Of a body that turns results["Q"] are its rotation matrices (n, 3, 3). Raises KeyError with all names.
+        """
+        return self.samples[column]
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of every column, by its name; "1" of plain numbers, empty of words."""
+        return {name: column.unit for name, column in self.samples.described.items()}
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The samples under the headers of log.csv (motion.csv of a body). Raises ImportError without pandas."""
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
+        written = {name: column.header for name, column in self.samples.described.items() if column.header}
+        return pandas.DataFrame({header: self[name] for name, header in written.items()})
+
+    def universe(self) -> "MDAnalysis.Universe":
+        """The trajectory as an MDAnalysis Universe: from the files if there are any, else from memory.
+
+        Lengths in Å, times in ps: every frame has the time of the run, whatever the file can hold. Of a body a second
+        is shown as a picosecond. Warns where frames are not evenly spaced. Raises ValueError where there is none.
+        """
+        from rigidmd.output import trajectory
+
+        output = self.system.scene.output
+        if not output.trajectory:
+            raise ValueError("this run wrote no trajectory (output.trajectory = false)")
+        if self.files:
+            by_name = {path.name: path for path in self.files}
+            times = [frame.time for frame in self._frames]
+            return trajectory.from_files(by_name[output.topology], by_name[output.trajectory], times)
+        return trajectory.in_memory(self.system, self._frames)
