@@ -4,7 +4,7 @@ import rigidmd
 
 scene = rigidmd.Scene.read("systems/water.toml")
 results = rigidmd.Simulation(scene).run()
-print(results["temperature"].mean(), results.universe())
+print(results["temperature"].mean(), results.units["temperature"], results.universe())
 """
 
 from importlib import import_module

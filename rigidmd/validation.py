@@ -120,7 +120,17 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """'; did you mean ...?' for what may have been meant by a name that is not known; empty where nothing is like it.
+    """'; did you mean ...?' for a name that is not known; empty where nothing is like it."""
+    return perhaps(nearest(name, known))
+
+
+def perhaps(names: list[str]) -> str:
+    """'; did you mean ...?' for these names; empty for none."""
+    return f"; did you mean {' or '.join(names)}?" if names else ""
+
+
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """What may have been meant by a name that is not known.
 
     Known names that are the same but for case and punctuation; else those that it begins, as where a unit is
     forgotten, or ends; else the one spelled most like it.
@@ -133,7 +143,7 @@ def meant(name: str, known: Iterable[str]) -> str:
     if not near or len(near) > MOST_MEANT:
         alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
         near = [key for key, letters in plain.items() if letters in alike]
-    return f"; did you mean {' or '.join(near)}?" if near else ""
+    return near
 
 
 def _plain(name: str) -> str:

@@ -432,7 +432,10 @@ def test_a_run_keeps_the_table_and_runs_again_from_its_copy(own):
     ("change", "expected"),
     [
         (('parameters = "aromatic.toml"', 'parameters = "../aromatic.toml"'), "lies outside the scene's folder"),
-        (('parameters = "aromatic.toml"', 'parameters = "none.toml"'), "cannot be read"),
+        (
+            ('parameters = "aromatic.toml"', 'parameters = "none.toml"'),
+            "line 6: molecules.0.parameters: there is no such file",
+        ),
         (('parameters = "aromatic.toml"', 'parameters = "aromatic.csv"'), "must be a .toml file"),
         (('parameters = "aromatic.toml"', ""), "a geometry file needs sites, or a file of parameters"),
         (('file = "benzene.xyz"', 'model = "spce"'), "parameters would do nothing"),

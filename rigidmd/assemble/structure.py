@@ -196,11 +196,11 @@ def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     if atoms.masses is None:
         return []
     masses = np.unique([mass for m in species for mass in m.masses[massive(m)]])
-    strange = {
-        f"{name} ({mass:g} u)": None
-        for name, mass in zip(atoms.names, atoms.masses.tolist(), strict=True)
+    strange = [
+        f"{name} ({mass:g} u)"
+        for name, mass in sorted(set(zip(atoms.names, atoms.masses.tolist(), strict=True)))
         if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
-    }
+    ]
     if not strange:
         return []
     there = ", ".join(f"{mass:g}" for mass in masses)

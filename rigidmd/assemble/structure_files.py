@@ -327,7 +327,8 @@ def _lammps_atoms(
             raise StructureError(str(path), faults)
     names = labels if atom_types is None else atom_types
     masses = atoms.get_masses() if listed else None
-    element = {} if masses is None else {t: element_of_mass(mass) for t, mass in zip(types, masses, strict=True)}
+    of_type = {} if masses is None else dict(zip(types, masses.tolist(), strict=True))
+    element = {t: element_of_mass(mass) for t, mass in of_type.items()}
     result = _from_ase(
         path,
         atoms,

@@ -27,7 +27,7 @@ BODY = {
     "position": Family(("x", "y", "z"), "m", "centre of mass"),
     "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
     "rotation": Family(
-        tuple(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "1", "rotation matrix Q: lab = Q body; rows first"
+        tuple(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "1", "rotation matrix Q by rows: lab = Q body"
     ),
     "quaternion": Family(("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"),
     "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
@@ -46,9 +46,9 @@ BODY = {
     "L_error": Family(
         tuple(f"L_{k}_error" for k in ("lab", "size", "x", "y", "z", 1, 2, 3)),
         "1",
-        "change of what is conserved of L, as a fraction of the largest |L|",
+        "change of what is conserved of L, as a fraction of the largest abs(L)",
     ),
-    "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of |QᵀQ - 1|"),
+    "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
 }
 
 #: What `results[...]` knows of a body besides: several columns as one array.

@@ -56,7 +56,7 @@ def summarise(
         "seed": scene.seed,
         "interrupted": interrupted,
         "molecules": len(system.model.species),
-        "species": dict(Counter(system.species[k].name for k in system.model.species)),
+        "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),
         "sites": len(system.sites.molecule),
         "degrees_of_freedom": system.freedom.total,
         "degrees_of_freedom_translation": system.freedom.translation,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field, PrivateAttr, ValidationError
 
 from rigidmd.errors import SceneError
-from rigidmd.validation import Section, faults_of, meant, place, toml_fault
+from rigidmd.validation import Section, faults_of, meant, nearest, perhaps, place, toml_fault
 
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene
@@ -130,9 +130,10 @@ class Scene(Section):
             if path.is_file():
                 continue
             where = place([int(part) if part.isdigit() else part for part in key.split(".")], text, overridden)
-            near = meant(path.name, [p.name for p in path.parent.iterdir()]) if path.parent.is_dir() else ""
             what = "is a folder" if path.is_dir() else "there is no such file"
-            faults.append(f"{where}: {what}: {path}{near}")
+            there = sorted(path.parent.iterdir()) if path.parent.is_dir() else []
+            stems = nearest(path.stem, {other.stem for other in there})
+            faults.append(f"{where}: {what}: {path}{perhaps([other.name for other in there if other.stem in stems])}")
         return faults
 
 
