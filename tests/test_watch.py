@@ -13,7 +13,6 @@ from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.core.schemes import KICK, SCHEMES
 from rigidmd.core.state import NOW
-from rigidmd.dynamics.baths import kinetic_energy
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
@@ -401,33 +400,3 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
         )
         said.append(done.stdout.strip() or done.stderr)
     assert said == ["2.0", "3.0"]
-
-
-def test_threads_are_there_for_code_that_comes_from_the_cache(tmp_path):
-    """Numba forgets that code starts threads where it calls what itself came from the cache; it ended in a crash."""
-    (tmp_path / "shared.py").write_text(
-        "import numba, numpy as np\n"
-        "from rigidmd.compile import call, kernel, opened, packed, work\n"
-        "@kernel(parallel=True, outer=True)\n"
-        "def fill(x):\n    for n in numba.prange(len(x)):\n        x[n] = n\n"
-        "@work()\n"
-        "def filled(parcel, block):\n    fill(opened(parcel))\n"
-        "@numba.njit\n"
-        "def run(address, x):\n    call(address, packed(x), 0)\n"
-        "x = np.zeros(5)\n"
-    )
-    environment = os.environ | {
-        "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
-    }  # fmt: skip
-    for script in ("fill(x)", *["run(filled.address(x), x)"] * 2):
-        done = subprocess.run(
-            [sys.executable, "-c", f"from shared import *; {script}; print(x.sum())"],
-            env=environment, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert done.stdout.strip() == "10.0", done.stderr
-
-
-def test_python_is_told_which_kernels_are_not_for_it():
-    """Numba itself would crash: such a kernel has no wrapper for Python."""
-    with pytest.raises(TypeError, match=r"kinetic_energy is for compiled code; .*outer=True"):
-        kinetic_energy(None, None)

@@ -14,7 +14,7 @@ NOT_FINITE = 4  # a position is not a number, or so large that it says nothing a
 
 #: Columns of `State.books`, energies put in so far: heat of baths, work of what drives or brakes, and what goes (below
 #: zero) with total momentum that is taken out.
-HEAT, WORK, REST = 0, 1, 2
+HEAT, WORK, TAKEN = 0, 1, 2
 #: Columns of `State.time` and `State.step`: now, and where the present stretch of equal steps began.
 NOW, ORIGIN = 0, 1
 

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
-from rigidmd.core import state as books
 from rigidmd.core.schemes import BATH, DRIFT, KICK, Scheme
-from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN
+from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN
 from rigidmd.dynamics.baths import apply
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import SERIAL
@@ -143,7 +142,7 @@ def _rest_molecules(model, state):
             state.velocity[m, 0] -= px / mass
             state.velocity[m, 1] -= py / mass
             state.velocity[m, 2] -= pz / mass
-        state.books[books.REST] -= (px * px + py * py + pz * pz) / (2 * mass)
+        state.books[TAKEN] -= (px * px + py * py + pz * pz) / (2 * mass)
 
     return rest_molecules
 

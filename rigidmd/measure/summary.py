@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System
-from rigidmd.core.state import REST, State
+from rigidmd.core.state import TAKEN, State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.scene import MolecularScene
@@ -83,7 +83,7 @@ def _removed(scene: MolecularScene, state: State) -> dict | None:
         return None
     return {
         "interval_ps": scene.removes_momentum_every,
-        "energy_kJ_mol": -float(state.books[REST]) / KJ_PER_MOL,
+        "energy_kJ_mol": -float(state.books[TAKEN]) / KJ_PER_MOL,
     }
 
 
