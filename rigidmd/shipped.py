@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
+from rigidmd.core.files import whole_file
 from rigidmd.errors import Faults, OutputError
-from rigidmd.output.folder import whole_file
 
 PACKAGE = Path(__file__).parent
 

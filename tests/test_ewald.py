@@ -685,7 +685,7 @@ def test_what_energy_says_of_its_figures():
         assert "without the tail correction" in said["virial"]
         translation = observe(system, simulation.engine, simulation.state).kinetic_translation / KJ_PER_MOL
         bar = (2 * translation + found["virial"]) * KJ_PER_MOL / (3 * 13 * 14 * 15) / BAR
-        tail = system.tail_pressure / BAR
+        tail = system.tail.pressure(13 * 14 * 15) / BAR
         assert tail < -1
         assert found["pressure_bar"] - bar == pytest.approx(tail, rel=1e-6)
         assert f", and {tail:.10g} bar of the tail" in said["pressure"]

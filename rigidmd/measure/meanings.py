@@ -54,13 +54,11 @@ def _of_ewald(system: System) -> dict[str, str]:
 
 def _of_pressure(system: System) -> dict[str, str]:
     """Which of the two has what no motion changes."""
-    constant = f"{system.tail_pressure / BAR:.10g} bar"
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
-    if "lennard_jones_tail" in system.constants:
-        return {
-            "virial": f"{virial}, without the tail correction",
-            "pressure": f"{pressure}, and {constant} of the tail",
-        }
+    if system.tail is not None:
+        virial += ", without the tail correction"
+        pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"
     if "coulomb_frozen" in system.constants:
+        constant = f"{system.constant_pressure / BAR:.10g} bar"
         pressure += f", and {constant}, which takes out what frozen molecules do to one another"
     return {"virial": virial, "pressure": pressure}
