@@ -25,9 +25,10 @@ class InPieces:
 
     def draw_path(self, renderer, gc, path, affine, rgbFace=None):
         """Draw a path of straight sides."""
-        last = len(path.vertices) - 1
-        for first, end in pairwise([*range(0, last, AT_ONCE - 1), last]):
-            piece = type(path)(path.vertices[first : end + 1])
+        sides = len(path.vertices) - 1
+        pieces = -(-sides // (AT_ONCE - 1))  # of one length: a short one, level, would be shifted onto whole pixels
+        for first, last in pairwise(sides * k // pieces for k in range(pieces + 1)):
+            piece = type(path)(path.vertices[first : last + 1])
             piece.simplify_threshold = path.simplify_threshold
             renderer.draw_path(gc, piece, affine, rgbFace)
 

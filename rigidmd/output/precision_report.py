@@ -169,8 +169,8 @@ def _timing_words(found: Precision) -> list[str]:
     which = f"{worst.integrator} at {worst.timestep:.3g} {found.subject.time_unit}"
     return [
         f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than {DOUBTFUL:.0%}, "
-        f"those of {which} by {worst.spread:.0%} (± % in the table): was another program running? More --repeats, or a "
-        "quieter machine, make them better"
+        f"those of {which} by {worst.spread:.0%} (± % in the table): was another program running? A quieter machine or "
+        "more --repeats help"
     ]
 
 
