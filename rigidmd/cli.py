@@ -98,13 +98,22 @@ def _parser() -> argparse.ArgumentParser:
         "precision",
         _precision,
         "measure error against run time of integrators and time steps",
-        "rigidmd precision systems/heavy_top_3.toml --integrators velocity_verlet,srkn_6",
+        "rigidmd precision systems/heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
+        "  rigidmd precision systems/heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles",
     )
     _scene_arguments(precision)
-    precision.add_argument("--integrators", metavar="A,B,...", help="integrators (default: those that suit the scene)")
+    precision.add_argument(
+        "--integrators", metavar="A,B,...",
+        help="integrators (default: the scene's own and those that suit it; of a body also the textbook's solvers, "
+        "each with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion, rk4_euler_angles, dop853, "
+        "dop853_quaternion, dop853_euler_angles). Where the scene has a run.formulation, rk4, dop853 and radau mean "
+        "that one, and rk4_matrix the matrix",
+    )  # fmt: skip
     precision.add_argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body")
     precision.add_argument("--span", type=float, metavar="T", help="how long each runs (default: 0.1 ps; a body's run)")
-    precision.add_argument("--repeats", type=int, default=3, metavar="N", help="repeats of the timing (default: 3)")
+    precision.add_argument(
+        "--repeats", type=int, default=3, metavar="N", help="repeats of the timing (default: 3); 1 shows no spread"
+    )
     precision.add_argument(
         "--averages", type=float, metavar="PS",
         help="of molecules: also average temperatures, energy and pressure over so many ps with every step",

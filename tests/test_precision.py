@@ -1,6 +1,7 @@
 """`rigidmd precision`: what it measures, what it says, what it writes."""
 
 import csv
+import dataclasses
 import itertools
 import tomllib
 
@@ -9,16 +10,29 @@ import pytest
 from conftest import ROOT, small_scene
 
 from rigidmd.cli import main
-from rigidmd.errors import SceneError
-from rigidmd.output.precision_report import advice, table_text, write_precision
+from rigidmd.core.schemes import FORMULATIONS, SCHEMES
+from rigidmd.errors import SceneError, SimulationError
+from rigidmd.measure import precision as measuring
+from rigidmd.measure.subjects import body_subject
+from rigidmd.measure.trials import Method, Precision, Trial, measure, timing
+from rigidmd.output.precision_report import advice, row, table_text, write_precision
 from rigidmd.scene import Scene
+from rigidmd.study import precision as choosing
 from rigidmd.study.precision import precision
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_timings():
+    """Seconds of computing are not what most of these tests are about."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measuring, "TIMED", 0.002)
+        yield
+
+
 @pytest.fixture(scope="module")
-def top():
+def top(short_timings):
     return precision(Scene.read(TOP), ["velocity_verlet", "srkn_4", "srkn_6"], span=0.4, repeats=3)
 
 
@@ -44,6 +58,100 @@ def test_every_trial_is_timed_as_often_as_asked(top):
         assert len(trial.seconds) == 3
         assert trial.time == sorted(trial.seconds)[1]
         assert trial.timestep * trial.steps == pytest.approx(0.4)
+
+
+class Clockwork:
+    """An engine, and the clock: steps take 1 ms, a call 5 ms, and the first three steps of a new engine 30 ms more."""
+
+    now = 0.0
+
+    def __init__(self, made, lasts=10**9):
+        self.cold, self.at, self.lasts = 3, 0, lasts
+        made.append(self)
+
+    def advance(self, state, scheme, dt, steps, thermostat, done=0):
+        """As `Engine.advance`."""
+        self.at = done + steps
+        if self.at > self.lasts:
+            raise SimulationError("no further")
+        Clockwork.now += 5e-3 + 1e-3 * steps + 30e-3 * min(steps, self.cold)
+        self.cold -= min(steps, self.cold)
+
+    def forget(self):
+        """As `Engine.forget`."""
+
+
+@pytest.fixture
+def clockwork(monkeypatch):
+    """(subject, engines made) of a subject moved by clockwork, for a given lifetime in steps."""
+    monkeypatch.setattr(measuring, "TIMED", 0.2)
+    monkeypatch.setattr(measuring.clock, "perf_counter", lambda: Clockwork.now)
+
+    def subject(goes_on, lasts=10**9):
+        made = []
+        method = Method(lambda: Clockwork(made, lasts), SCHEMES["velocity_verlet"])
+        own, _ = body_subject(Scene.read(TOP), 0.1)
+        return dataclasses.replace(own, methods={"velocity_verlet": method}, goes_on=goes_on), made
+
+    return subject
+
+
+@pytest.mark.parametrize("steps", [1, 25, 1000])
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_timing_is_of_warm_steps_and_of_nothing_else(clockwork, steps, goes_on):
+    """25 steps of 216 waters took 40 ms where a new engine began with them, and 20 ms after that."""
+    subject, made = clockwork(goes_on)
+    began = Clockwork.now
+    seconds = timing(subject, Trial("velocity_verlet", 1e-3, steps, steps))
+    assert seconds == pytest.approx(1e-3 * steps)
+    assert Clockwork.now - began > 0.2
+    assert len(made) == 1
+    spans = -(-0.2 // (5e-3 + 1e-3 * steps))
+    assert made[0].at == (steps * spans if goes_on else 0)
+
+
+def test_a_step_that_is_good_for_the_span_only_is_timed_on_the_span(clockwork):
+    subject, made = clockwork(goes_on=True, lasts=60)
+    assert timing(subject, Trial("velocity_verlet", 1e-3, 25, 25)) == pytest.approx(0.025)
+    assert made[0].at <= 60
+    subject, _ = clockwork(goes_on=True, lasts=20)
+    with pytest.raises(SimulationError):
+        timing(subject, Trial("velocity_verlet", 1e-3, 25, 25))
+
+
+def test_timings_alternate_between_trials(monkeypatch):
+    order = []
+    monkeypatch.setattr(measuring, "timing", lambda subject, trial: order.append(trial.steps) or 1e-3 * len(order))
+    subject, _ = body_subject(Scene.read(TOP), 0.01)
+    trials = [Trial("velocity_verlet", 0.01 / n, n, n) for n in (2, 3, 4)]
+    shares = []
+    measure(subject, trials, 2, say=shares.append)
+    assert order == [2, 3, 4, 2, 3, 4]
+    assert [trial.seconds for trial in trials] == [[1e-3, 4e-3], [2e-3, 5e-3], [3e-3, 6e-3]]
+    assert shares == pytest.approx(np.arange(1, 7) / 6)
+
+
+def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_path):
+    subject, _ = body_subject(Scene.read(TOP), 0.1)
+
+    def told(*seconds):
+        trials = [Trial("velocity_verlet", 1e-3, 100, 100, list(s), *[1e-6] * 6) for s in seconds]
+        found = Precision(subject, trials, 1000, 1e-14)
+        return found, "\n".join(advice(found))
+
+    found, words = told((1.0, 1.1, 1.19), (1.0, 1.0, 1.0))
+    assert [row(found, trial)[4] for trial in found.trials] == pytest.approx([100 * 0.19 / 1.1, 0])
+    assert "warning" not in words
+    found, words = told((1.0, 1.1, 1.15), (1.0, 1.1, 1.4), (1.0, 2.0, 1.5))
+    assert "warning: repeated timings of 2 of 3 trials differ by more than 20%" in words
+    assert "those of velocity_verlet at 0.001 s by 67%" in words
+    found, words = told((1.0,), (1.5,))
+    assert "timed once" in words
+    assert "warning" not in words
+    assert "±" not in table_text(found).splitlines()[1].replace("drift        ±", "drift")
+    write_precision(tmp_path, found, "a command")
+    with (tmp_path / "precision.csv").open() as file:
+        assert [line["spread (%)"] for line in csv.DictReader(file)] == ["", ""]
 
 
 def test_the_front_and_the_advice_follow_from_the_numbers(top):
@@ -99,7 +207,9 @@ def test_only_what_keeps_its_order_is_tried():
     names = {trial.integrator for trial in found.trials}
     assert "suzuki_4" in names
     assert "srkn_6" not in names
-    with pytest.raises(SceneError, match="srkn_6 would not have its order on this scene"):
+    said = "\n".join(advice(found))
+    assert "srkn_6: the free motion of a body with wheels has no exact flow: it would be of order 2\n" in said
+    with pytest.raises(SceneError, match=r"srkn_6 does not suit this scene: .* wheels .*: it would be of order 2$"):
         precision(wheel, ["srkn_6"])
     with pytest.raises(SceneError, match="there is no rk5"):
         precision(wheel, ["rk5"])
@@ -184,6 +294,69 @@ def test_comparators_stand_beside_the_schemes_and_fail_in_words():
     assert [trial.tolerance for trial in adaptive] == sorted((t.tolerance for t in adaptive), reverse=True)
     assert all(b.forces > a.forces and b.timestep < a.timestep for a, b in itertools.pairwise(adaptive))
     assert adaptive[-1].rotation_error < 1e-8
+
+
+def changed(**run):
+    """The heavy top with other keys of its run."""
+    return Scene.read(TOP, {f"run.{key}": value for key, value in run.items()})
+
+
+def test_the_formulation_of_the_scene_is_the_one_measured():
+    errors = {}
+    for name in ("rk4_matrix", "rk4_quaternion", "rk4_euler_angles"):
+        (trial,) = precision(Scene.read(TOP), [name], [1e-3], span=0.2, repeats=1).trials
+        assert trial.integrator == name.removesuffix("_matrix")
+        errors[name.removeprefix("rk4_")] = trial.rotation_error
+    assert len(set(errors.values())) == 3
+    for form in FORMULATIONS:
+        (trial,) = precision(changed(integrator="rk4", formulation=form), ["rk4"], [1e-3], span=0.2, repeats=1).trials
+        assert trial.rotation_error == errors[form]
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """(names tried, what was left out) by default on a scene; nothing is run."""
+    monkeypatch.setattr(choosing, "measure", lambda subject, trials, *_: Precision(subject, trials, 1, 0.0))
+
+    def plan(scene):
+        found = precision(scene)
+        return {trial.integrator for trial in found.trials}, found.left_out
+
+    return plan
+
+
+def test_textbook_solvers_in_all_formulations_are_measured_by_default(planned):
+    textbook = {f"{solver}{form}" for solver in ("rk4", "dop853") for form in ("", "_quaternion", "_euler_angles")}
+    names, left_out = planned(Scene.read(TOP))
+    assert textbook | {"velocity_verlet", "srkn_6"} <= names
+    assert left_out == {}
+    assert "vefrl" not in names
+    assert "vefrl" in planned(changed(integrator="vefrl"))[0]
+    assert "rk4_quaternion" in planned(changed(integrator="rk4", formulation="quaternion"))[0]
+    assert "radau_euler_angles" in planned(changed(integrator="radau", formulation="euler_angles"))[0]
+
+
+def test_what_cannot_be_measured_is_left_out_in_words(planned):
+    upright = tomllib.loads(TOP.read_text()) | {"start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}}
+    names, left_out = planned(Scene.from_dict(upright))
+    assert set(left_out) == {"rk4_euler_angles", "dop853_euler_angles"}
+    assert "theta = 0" in left_out["rk4_euler_angles"]
+    assert "rk4_quaternion" in names
+    names, left_out = planned(Scene.read(ROOT / "systems" / "dropped_stone.toml"))
+    assert "rk4" in names
+    assert "a point does not turn" in left_out["rk4_quaternion"]
+    _, left_out = planned(Scene.read(ROOT / "systems" / "gyroscope_friction.toml"))
+    assert left_out["rk4"] == "dry friction jumps where a body stops, which it cannot step over"
+    with pytest.raises(SceneError, match="rk4_quaternion does not suit this scene: it is for single bodies"):
+        precision(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["rk4_quaternion"])
+
+
+def test_help_names_the_formulations(capsys):
+    with pytest.raises(SystemExit):
+        main(["precision", "--help"])
+    said = capsys.readouterr().out
+    assert "--integrators rk4,rk4_quaternion,rk4_euler_angles" in said
+    assert "dop853_euler_angles" in said
 
 
 def test_what_else_is_kept_is_shown(top):

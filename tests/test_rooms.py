@@ -31,7 +31,10 @@ LIBRARIES = {
     "MDAnalysis": {"output/trajectory.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
-    "matplotlib": {"output/report.py", "output/body_figures.py", "output/precision_report.py", "output/stability_report.py", "output/molecule_figure.py"},
+    "matplotlib": {
+        "output/figure.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
+        "output/stability_report.py", "output/molecule_figure.py",
+    },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/body.py", "scene/actions.py"},
     "numba": {
         "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lanes.py", "compile/machine.py",

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-# What a kernel reports; the largest one wins, Python acts on it (dynamics.engine).
+# What a kernel reports; the largest one wins, Python acts on it (engines.cpu).
 OK = 0
 ASK = 1  # a Python function has to be asked for its force: ask it and call again
 LIST_FULL = 2  # a neighbour list needs more room: enlarge it and call again

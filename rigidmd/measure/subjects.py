@@ -3,6 +3,7 @@
 Both `rigidmd precision` and `integrator = "auto"` use these.
 """
 
+import re
 from collections.abc import Callable
 from math import inf, sqrt
 
@@ -11,8 +12,9 @@ import numpy as np
 from rigidmd.assemble.body import BodySystem, Pose, build_body
 from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System
-from rigidmd.core.schemes import FORMULATIONS, SCHEMES, Scheme
+from rigidmd.core.schemes import FORMULATIONS, SCHEMES, SOLVERS, Scheme
 from rigidmd.core.state import State
+from rigidmd.engines.textbook import SMALLEST_SINE
 from rigidmd.errors import SceneError
 from rigidmd.measure.choice import choose
 from rigidmd.measure.motion import Motion, Snapshot, motion
@@ -24,9 +26,7 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: General solvers of the textbook's equations, beside which the engine's own ways with a body can be seen.
 COMPARATORS = {
-    solver if form == "matrix" else f"{solver}_{form}": (solver, form)
-    for solver in ("rk4", "dop853")
-    for form in FORMULATIONS
+    solver if form == "matrix" else f"{solver}_{form}": (solver, form) for solver in SOLVERS for form in FORMULATIONS
 }
 SPAN_PS = 0.1
 #: A step of velocity Verlet, and the span of a pilot run, for one radian of the mean vibration or libration.
@@ -98,6 +98,8 @@ def molecular_subject(system: System, start: State, rotor: str | None, span: flo
         length_unit="Å",
         reference="srkn_6",
         kept=kept,
+        goes_on=True,
+        refused={name: "it is for single bodies" for name in COMPARATORS},
         observe=(lambda engine, now, step: observe(system, engine, now, step)) if boxed else None,
         molecules=len(system.model.species),
     )
@@ -124,19 +126,18 @@ def body_subject(
     run = scene.run
     keys = ("rotor", "formulation", "relative_tolerance", "absolute_tolerance", "energy_error", "trajectory_error")
     plain = dict.fromkeys(keys)
-    fits = {}
+    fits, refused = {}, {}
     for name in (*SCHEMES, *COMPARATORS):
-        solver, form = COMPARATORS.get(name, (name, None))
+        solver, form = COMPARATORS.get(name, (name, "matrix"))
+        told = None if form == "matrix" else form
         try:
-            changed = run.model_copy(update=plain | {"integrator": solver, "formulation": form})
+            changed = run.model_copy(update=plain | {"integrator": solver, "formulation": told})
             fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
-        except SceneError:
-            continue
+        except SceneError as error:
+            refused[name] = "; ".join(_why(fault, solver) for fault in error.faults)
     if not fits:
         build_body(scene, applied)  # says what is wrong with it
     system = fits["velocity_verlet"]
-    if not system.turns:
-        fits = {name: own for name, own in fits.items() if COMPARATORS.get(name, (name, "matrix"))[1] == "matrix"}
     whole = min([span or run.duration_s, *system.breaks()])
     seen = _first_look(system, whole)
     kinetic = float(np.abs(seen["kinetic"]).max()) or 1.0
@@ -158,6 +159,7 @@ def body_subject(
         for name, own in fits.items()
     }
     schemes = [name for name in fits if name in SCHEMES]
+    at_a_pole = system.turns and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(schemes, key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations))
     subject = Subject(
         name=scene.name,
@@ -174,6 +176,9 @@ def body_subject(
         length_unit="m",
         reference=reference,
         kept=kept,
+        goes_on=False,
+        refused=refused,
+        singular=tuple(name for name, (_, form) in COMPARATORS.items() if form == "euler_angles" and at_a_pole),
     )
     speed = 0.0
     if system.turns:  # of the body, and of the nutation that its wheels would give it
@@ -181,6 +186,11 @@ def body_subject(
         spin = max(float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
         speed = max(spin, float(np.abs(carried).max() / inertia.max()))
     return subject, speed
+
+
+def _why(fault: str, name: str) -> str:
+    """A fault of an integrator as a reason, without what to use instead."""
+    return re.split("[:;] use ", fault.removeprefix("run: "))[0].replace(name, "it")
 
 
 def _first_look(system: BodySystem, whole: float) -> Motion:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import whole_file
+from rigidmd.output.figure import save_figure
 from rigidmd.output.report import COOL, FAINT, INK, WARM
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
@@ -51,10 +52,10 @@ def _write(folder: Path, stem: str, name: str, figure) -> list[Path]:
 
     figure.suptitle(f"{name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
     png, svg = folder / f"{stem}.png", folder / f"{stem}.svg"
-    with rc_context({"agg.path.chunksize": 5000, "svg.hashsalt": stem}):
+    with rc_context({"svg.hashsalt": stem}):
         for path, options in ((png, {"dpi": 150}), (svg, {"dpi": 100, "metadata": {"Date": None}})):
             with whole_file(path) as temporary:
-                figure.savefig(temporary, **options)
+                save_figure(figure, temporary, **options)
     return [png, svg]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
 from rigidmd.molecules import Molecule
+from rigidmd.output.figure import save_figure
 from rigidmd.output.molecule_report import COVALENT, bonds, short_source
 from rigidmd.output.report import COOL, FAINT, INK
 
@@ -82,7 +83,8 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     told.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(told), fontsize=FONT, linespacing=1.35, **plain)
     with rc_context({"svg.hashsalt": m.name}), whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        metadata = {"Date": None} if path.suffix == ".svg" else None
+        save_figure(figure, temporary, dpi=150, metadata=metadata)
 
 
 def _view(m: Molecule) -> np.ndarray:

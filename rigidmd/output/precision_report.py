@@ -10,13 +10,15 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.trials import Precision, Trial
+from rigidmd.output.figure import curve_style, save_figure
 from rigidmd.output.report import FAINT, INK, signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
-COLORS = ("#2b6f9e", "#8fb4cf", "#c8553d", "#e2a08f", "#4f8a5b", "#9bbf9f", "#7a5ca3", "#b8862d", INK, FAINT)
 #: So that a line of the table fits a terminal.
 SHORT_TITLES = {"error of ": "", "energy drift in the span": "drift", " per ": "/", "seconds": "s", "spread (%)": "± %",
                 "energy rms": "energy", "orthogonality": "QᵀQ"}  # fmt: skip
+#: A spread of repeated timings that is warned of.
+DOUBTFUL = 0.2
 ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
 
@@ -41,7 +43,7 @@ def row(found: Precision, trial: Trial) -> list:
     span, kept = found.subject.span, _kept(found)
     if trial.diverged:
         return [trial.integrator, trial.timestep, trial.forces / span, "fails", *[None] * (7 + len(kept))]
-    spread = 100 * (max(trial.seconds) - min(trial.seconds)) / trial.time
+    spread = None if trial.spread is None else 100 * trial.spread
     values = [
         trial.integrator, trial.timestep, trial.forces / span, trial.time / span, spread, trial.rotation_error,
         trial.position_error, trial.energy_rms, trial.energy_drift, trial.energy_drift_error,
@@ -142,12 +144,34 @@ def advice(found: Precision) -> list[str]:
             step = found.stable_step(name)
             lines.append(f"{name} diverges" + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried"))
         lines += [f"{name}: {fault}" for fault in dict.fromkeys(faults) if fault != "diverges"][:1]
+    for why in dict.fromkeys(found.left_out.values()):
+        lines.append(f"left out: {', '.join(name for name in found.left_out if found.left_out[name] == why)}: {why}")
+    lines += _timing_words(found)
     if found.sampled:
         lines += _temperature_words(found)
     lines += _cheapest(found, "energy_rms", "an energy error", s.energy_unit)
     what = "Q" if any(not np.isnan(t.rotation_error) for t in found.trials) else "X"
     lines += _cheapest(found, "trajectory_error", f"an error of {what}", "" if what == "Q" else s.length_unit)
     return lines
+
+
+def _timing_words(found: Precision) -> list[str]:
+    """How far the seconds can be relied on."""
+    timed = [trial for trial in found.trials if not trial.diverged]
+    if not timed:
+        return []
+    if timed[0].spread is None:
+        return ["timed once: how far the seconds would be the same again is not known; see --repeats"]
+    doubtful = [trial for trial in timed if trial.spread > DOUBTFUL]
+    if not doubtful:
+        return []
+    worst = max(doubtful, key=lambda trial: trial.spread)
+    which = f"{worst.integrator} at {worst.timestep:.3g} {found.subject.time_unit}"
+    return [
+        f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than {DOUBTFUL:.0%}, "
+        f"those of {which} by {worst.spread:.0%} (± % in the table): was another program running? A quieter machine or "
+        "more --repeats help"
+    ]
 
 
 def _temperature_words(found: Precision) -> list[str]:
@@ -219,8 +243,8 @@ def draw(path: Path, found: Precision) -> None:
     for axis, (error, title) in zip((left, right), titles.items(), strict=True):
         for k, name in enumerate(names):
             own = [t for t in found.trials if t.integrator == name and not t.diverged and getattr(t, error) > 0]
-            axis.loglog([t.time / s.span for t in own], [getattr(t, error) for t in own], "o-", ms=3.5, lw=1.2,
-                        color=COLORS[k % len(COLORS)], label=name)  # fmt: skip
+            axis.loglog([t.time / s.span for t in own], [getattr(t, error) for t in own], ms=3.5, lw=1.2, label=name,
+                        **curve_style(k))  # fmt: skip
         front = found.front(error)
         ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": "no other is faster and better"}
         axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
@@ -231,10 +255,10 @@ def draw(path: Path, found: Precision) -> None:
     left.axhline(found.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate("error of the reference", (1, found.reference_error), xycoords=("axes fraction", "data"), fontsize=8,
                   color=FAINT, ha="right", va="bottom")  # fmt: skip
-    right.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    right.legend(frameon=False, fontsize=8, handlelength=2.8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.suptitle(f"{s.name}: error against run time", color=INK, x=0.01, ha="left", fontsize=11)
     with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+        save_figure(figure, temporary, dpi=150)
 
 
 def page(found: Precision, picture: bytes, command: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
+from rigidmd.output.figure import save_figure
 
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
@@ -172,4 +173,4 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
             axis.legend(frameon=False, ncols=2, loc="upper right", fontsize=9)
     figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
     with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+        save_figure(figure, temporary, dpi=150)

@@ -12,6 +12,7 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
+from rigidmd.output.figure import save_figure
 from rigidmd.output.report import COOL, FAINT, INK, WARM
 
 FILES = ("stability.csv", "stability.html", "stability.md")
@@ -167,7 +168,7 @@ def picture(finding: Finding) -> bytes:
         if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, fontsize=6.5, loc="best")
     stream = io.BytesIO()
-    figure.savefig(stream, dpi=110)
+    save_figure(figure, stream, dpi=110)
     return stream.getvalue()
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.schemes import RADAU, SCHEMES, SOLVERS
 from rigidmd.errors import SceneError
 from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
@@ -11,10 +11,10 @@ from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.validation import meant
 
-#: Tried when no others are asked for: the common one, and the best of each kind.
+#: Tried when no others are asked for: the common one, the best of each kind, and of a body what textbooks do.
 USUAL = (
     "velocity_verlet", "two_stage", "suzuki_4", "pefrl", "chin_4a", "srkn_4", "kahan_li_6", "srkn_6", "kahan_li_8",
-    "rk4", "dop853",
+    *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
 )  # fmt: skip
 #: Time steps per force evaluation, in those of the scene.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
@@ -22,6 +22,7 @@ LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 RADIANS = 0.1
 #: The same of what does not turn, in steps of its scene, which are taken to be fine.
 AT_REST = 8.0
+AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
 
 
 def precision(
@@ -35,13 +36,16 @@ def precision(
 ) -> Precision:
     """Error against run time of integrators at time steps, on the start of a scene.
 
-    integrators : names; those that make sense for the scene when not given. timesteps : fs for molecules, s for a body,
+    integrators : names; when not given, the scene's own and those that make sense for it, with what was left out in
+    `left_out`. rk4, dop853 and radau are in the scene's formulation, matrix when it has none; with _matrix, _quaternion
+    or _euler_angles after the name in that one. timesteps : fs for molecules, s for a body,
     the same for all; when not given, steps that cost the same number of forces, around the scene's own. span : ps or s.
     averages : ps of which molecules' temperatures, energy and pressure are averaged besides. Molecules start where the
     last stage starts, the earlier stages run before; no thermostat acts.
     """
     known = (*SCHEMES, *COMPARATORS)
-    if unknown := [name for name in integrators or [] if name not in known]:
+    integrators = list(dict.fromkeys(_named(name, scene) for name in integrators or []))
+    if unknown := [name for name in integrators if name not in known]:
         faults = [f"there is no {name}{meant(name, known)} (known: {', '.join(known)})" for name in unknown]
         raise SceneError("--integrators", faults)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
@@ -50,14 +54,37 @@ def precision(
     subject, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
     if averages and subject.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])
-    if refused := [name for name in integrators or [] if name not in subject.methods]:
-        why = "is for single bodies" if isinstance(scene, MolecularScene) else "would not have its order on this scene"
-        raise SceneError(scene.source, [f"{name} {why}" for name in refused])
-    chosen = integrators or [name for name in USUAL if name in subject.methods]
+    if refused := [name for name in integrators if name not in subject.methods]:
+        reasons = [f"{name} does not suit this scene: {subject.refused[name]}" for name in refused]
+        raise SceneError(scene.source, reasons)
+    left_out = {}
+    if not integrators:
+        usual = USUAL if isinstance(scene, BodyScene) else [name for name in USUAL if name in SCHEMES]
+        left_out = {name: why for name, why in subject.refused.items() if name in usual}
+        left_out |= {name: AT_A_POLE for name in subject.singular if name in usual}
+        wanted = dict.fromkeys((*usual, _own(scene)))
+        integrators = [name for name in wanted if name in subject.methods and name not in left_out]
     steps = {
-        name: timesteps or [base * rung * subject.methods[name].force_evaluations for rung in LADDER] for name in chosen
+        name: timesteps or [base * rung * subject.methods[name].force_evaluations for rung in LADDER]
+        for name in integrators
     }
-    return measure(subject, plan(subject, steps), repeats, averages, say)
+    found = measure(subject, plan(subject, steps), repeats, averages, say)
+    found.left_out = left_out
+    return found
+
+
+def _named(name: str, scene: Scene) -> str:
+    """The method that a name stands for on a scene."""
+    solver, _, form = name.partition("_")
+    if solver in SOLVERS and isinstance(scene, BodyScene):
+        form = form or scene.run.formulation
+        return solver if form in (None, "matrix") else f"{solver}_{form}"
+    return name
+
+
+def _own(scene: Scene) -> str:
+    """The method that a scene itself asks for."""
+    return _named(scene.run.integrator if isinstance(scene, BodyScene) else scene.stages[-1].integrator, scene)
 
 
 def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, float]:

@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 
 KCAL = 4.184  # kJ
+#: Variables that say how many threads there are and how they wait. An engine is told its cores by its own option.
+THREADING = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "NUMBA_NUM_THREADS")
 WARM_UP = 2  # steps before the clock starts, where the engine does not time its own loop
 OPENMM_TOLERANCE = 2.5e-4  # of PME; the default is 5e-4. Forces are then about as good as those of the others
 DSF_ALPHA = 0.2  # 1/Å, damping of LAMMPS's coul/dsf
@@ -31,6 +33,11 @@ class Absent(Exception):
 
 class Failed(Exception):
     """An engine that did not end its run; its last words."""
+
+
+def environment() -> dict[str, str]:
+    """What a user has in his shell: none of what this shell, or rigidmd when it was imported, says about threads."""
+    return {key: value for key, value in os.environ.items() if key not in THREADING}
 
 
 def program(name: str, beside: str = sys.executable) -> str:

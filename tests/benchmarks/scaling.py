@@ -4,12 +4,12 @@
 
 The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box of 216 waters that has
 come to rest is copied along each edge, so every size is the same liquid. Each size runs in a process of its own, so that
-its peak of memory is its own; lists are built before the clock starts, and rebuilt while it runs.
+its peak of memory is its own; lists are built before the clock starts, and rebuilt while it runs. No variable about threads is set:
+it is measured as users have it.
 """
 
 import argparse
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -20,6 +20,7 @@ from pathlib import Path
 import numba
 import numpy as np
 from matplotlib.figure import Figure
+from peer_engines import environment
 from peers import WORKLOADS, numbers, write_start
 
 from rigidmd import Scene, Simulation
@@ -115,7 +116,6 @@ def main() -> None:
     if asked.job:
         print(json.dumps(measure(json.loads(asked.job))))
         return
-    environment = os.environ | {"NUMBA_NUM_THREADS": str(max(asked.cores)), "OMP_WAIT_POLICY": "ACTIVE"}
     with tempfile.TemporaryDirectory() as folder:
         relax(Path(folder))
         per_step = "".join(f" µs a molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores)
@@ -125,7 +125,7 @@ def main() -> None:
         for copies in asked.copies:
             job = {"copies": copies, "cores": asked.cores, "precision": asked.precision, "folder": folder}
             command = [sys.executable, __file__, "--job", json.dumps(job)]
-            done = subprocess.run(command, env=environment, capture_output=True, text=True)
+            done = subprocess.run(command, env=environment(), capture_output=True, text=True)
             if done.returncode:
                 sys.exit(done.stderr)
             found = json.loads(done.stdout)
