@@ -48,7 +48,7 @@ def test_a_crude_error_is_kept_crudely():
     simulation = Simulation(liquid(integrator="auto", energy_error_kT=3e-3))
     first = simulation.run()
     coarse = first.summary["stages"][1]
-    assert energy_error(first) < 1e-2
+    assert energy_error(first) < 4 * 3e-3
     assert energy_error(first) > 1e-5
     second = simulation.run().summary["stages"][1]  # a simulation chooses anew, and the same
     assert (second["integrator"], second["timestep_fs"]) == (coarse["integrator"], coarse["timestep_fs"])

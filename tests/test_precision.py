@@ -12,7 +12,7 @@ from conftest import ROOT, small_scene
 from rigidmd.cli import main
 from rigidmd.core.schemes import FORMULATIONS, SCHEMES
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure import precision as measuring
+from rigidmd.measure import trials as measuring
 from rigidmd.measure.subjects import body_subject
 from rigidmd.measure.trials import Method, Precision, Trial, measure, timing
 from rigidmd.output.precision_report import advice, row, table_text, write_precision
@@ -69,9 +69,13 @@ class Clockwork:
         self.cold, self.at, self.lasts = 3, 0, lasts
         made.append(self)
 
-    def advance(self, state, scheme, dt, steps, thermostat, done=0):
+    def begin(self, state, scheme):
+        """As `Engine.begin`."""
+        return state.copy()
+
+    def advance(self, state, scheme, dt, until):
         """As `Engine.advance`."""
-        self.at = done + steps
+        steps, self.at = max(0, until - self.at), until
         if self.at > self.lasts:
             raise SimulationError("no further")
         Clockwork.now += 5e-3 + 1e-3 * steps + 30e-3 * min(steps, self.cold)

@@ -107,7 +107,10 @@ def test_every_column_of_every_body_is_in_the_table():
     for path in BODIES:
         scene = Scene.read(path)
         results = Simulation(
-            Scene.read(path, {"run.duration_s": 10 * scene.run.timestep_s, "output.interval_s": None})
+            Scene.read(
+                path,
+                {f"{key}_s": n * scene.run.timestep_s for key, n in (("run.duration", 10), ("output.interval", 1))},
+            )
         ).run()
         assert set(results.units) == set(results.samples.columns) | ({"Q"} if "q11" in results.units else set())
         found |= set(results.units)

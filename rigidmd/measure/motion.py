@@ -62,7 +62,7 @@ class Motion:
 def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     """All columns of the samples of a run."""
     times = np.array([s.time for s in snapshots])
-    states = State(*(np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields))))
+    states = State(*(np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)), np.zeros(0))
     position, velocity, rotation, omega = system.motion(times, states)
     columns = {"t": times} | _columns("position", position) | _columns("velocity", velocity)
     if system.turns:

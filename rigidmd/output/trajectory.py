@@ -5,7 +5,6 @@ import os
 import warnings
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
@@ -23,6 +22,7 @@ from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
+from rigidmd.output.frame import Frame
 
 #: Least and largest coordinate (Å) that a format holds: whole thousandths of a nm in 32 bits, columns of a text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
@@ -68,14 +68,6 @@ def dimensions(cell: np.ndarray) -> list[float] | None:
     if cell[0, 0] == inf:
         return None
     return [*np.linalg.norm(cell, axis=1), *angles_deg(cell)]
-
-
-class Frame(NamedTuple):
-    """A frame of a run: its time (ps), and where none is on the disk, positions (s, 3) and cell (3, 3)."""
-
-    time: float
-    positions: np.ndarray | None = None
-    cell: np.ndarray | None = None
 
 
 def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:

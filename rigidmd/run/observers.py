@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.output.folder import SCENE
+from rigidmd.output.frame import Frame
 from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class Frames(Observer):
         self.interval = interval
         self._names = [topology, trajectory]
         self._velocities, self._wrapped = velocities, wrapped
-        self._frames: list = []
+        self._frames: list[Frame] = []
         self._file = None
 
     def files(self) -> list[str]:
@@ -96,18 +97,16 @@ class Frames(Observer):
 
     def begin(self, run: "Simulation") -> None:
         """Write the topology and open the trajectory."""
-        from rigidmd.output.trajectory import TrajectoryFile, write_topology
-
         self._run, self._frames = run, []
         if run.folder is not None:
+            from rigidmd.output.trajectory import TrajectoryFile, write_topology  # MDAnalysis is slow to import
+
             topology, trajectory = (run.folder / name for name in self._names)
             write_topology(topology, run.system, run.state, self._wrapped)
             self._file = TrajectoryFile(trajectory, run.system, self.interval, self._velocities, self._wrapped)
 
     def see(self, moment: Moment) -> None:
         """A frame."""
-        from rigidmd.output.trajectory import Frame
-
         if self._file is not None:
             self._file.write(moment.state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rigidmd.assemble.system import System
     from rigidmd.measure.motion import Motion
     from rigidmd.measure.samples import Samples
-    from rigidmd.output.trajectory import Frame
+    from rigidmd.output.frame import Frame
 
 
 @dataclass(repr=False)
