@@ -102,7 +102,7 @@ class Engine:
             model, state, self.load, self._terms, thermostat, rows, probe, dt, origin, done + steps, progress
         ):
             self._answer(status, state)
-        self._stale = False
+        self._stale = self._stale and steps == 0
 
     def model_for(self, scheme: Scheme) -> Model | Body:
         """The model with the rotor that a scheme needs; only an asymmetric body turns differently by an exact one."""
