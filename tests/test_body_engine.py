@@ -54,6 +54,17 @@ def end(results):
     return x, v, q, w
 
 
+def test_a_call_of_no_steps_is_no_step():
+    system = build_body(Scene.from_dict(PINNED))
+    ends = []
+    for calls in ((10,), (0, 10)):
+        engine, state = system.engine(), system.state.copy()
+        for steps in calls:
+            move(engine, state, system.method, 0.01, steps)
+        ends.append(state.angular_momentum_body.tobytes())
+    assert ends[0] == ends[1]
+
+
 # Steps in 2 s at which the error of each scheme has become a power of the step and is not yet rounding.
 STEPS = {"velocity_verlet": 200, "suzuki_4": 50, "kahan_li_6": 16, "kahan_li_8": 19, "srkn_4": 54, "srkn_6": 15,
          "blanes_moan_6": 16}  # fmt: skip

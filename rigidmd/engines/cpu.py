@@ -103,7 +103,7 @@ class Engine:
         cursor = np.array([0, not self._stale], np.int64)
         while status := advance(model, code, state, self.load, self._workspaces, bath, row, probe, dt, until, cursor):
             self._answer(status, state)
-        self._stale = False
+        self._stale = cursor[1] == 0  # also where there was no step, and nobody has evaluated forces
 
     def model_for(self, scheme: Scheme) -> Model | Body:
         """The model with the rotor that a scheme needs; only an asymmetric body turns differently by an exact one."""
