@@ -5,6 +5,10 @@ the exception.
 """
 
 
+class RigidMDWarning(UserWarning):
+    """What whoever runs something should know before it is done; the summary of a run has it too."""
+
+
 class RigidMDError(Exception):
     """Base of all errors of this package."""
 

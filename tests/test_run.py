@@ -19,7 +19,7 @@ from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import NOW, TAKEN, State
-from rigidmd.errors import SceneError, SimulationError
+from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.measure.observables import observe
 from rigidmd.output import progress
 from rigidmd.output.log import COLUMNS
@@ -283,6 +283,14 @@ def test_a_drift_of_all_molecules_is_noted():
     mass = float(results.system.model.mass[results.system.model.species].sum())
     said = next(note for note in results.summary["notes"] if "drift together" in note)
     assert f"which adds {mass * 0.5**2 / (57 * BOLTZMANN):.2g} K to T_trans; run.remove_momentum_interval_ps" in said
+
+
+def test_warnings_reach_whoever_calls_from_python():
+    plain = {"run.timestep_s": 0.3, "run.duration_s": 0.9, "run.integrator": "velocity_verlet", "watch.energy": False}
+    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", plain)
+    with pytest.warns(RigidMDWarning, match=r"timestep_s = 0.3 is longer than what is stable") as caught:
+        Simulation(scene).run()
+    assert caught[0].filename == __file__
 
 
 def test_when_total_momentum_is_taken_out():

@@ -2,8 +2,10 @@
 
 import contextlib
 import signal
+import sys
 import threading
 import time as clock
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -15,7 +17,7 @@ from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines import Engine
 from rigidmd.engines.cpu import NotFiniteError
-from rigidmd.errors import SimulationError
+from rigidmd.errors import RigidMDWarning, SimulationError
 from rigidmd.output.folder import SUMMARY, check_folder, make_folder
 from rigidmd.output.progress import progress_of
 from rigidmd.output.report import write_summary
@@ -29,6 +31,14 @@ if TYPE_CHECKING:
     from rigidmd.assemble.system import System
     from rigidmd.run.body import BodySimulation
     from rigidmd.run.molecules import MolecularSimulation
+
+
+def _as_warning(sentence: str) -> None:
+    """A warning that names the line outside of this package from which it comes."""
+    package, level, frame = str(Path(__file__).parent.parent), 1, sys._getframe()
+    while frame is not None and frame.f_code.co_filename.startswith(package):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(sentence, RigidMDWarning, stacklevel=level)
 
 
 class Stretch(NamedTuple):
@@ -58,7 +68,8 @@ class Simulation:
     force : replace an earlier run in that folder
     observers : `Every` objects of your own, called between steps
     say : called with a sentence when something begins that takes a moment (compiling, relieving)
-    warn : called with a sentence that whoever runs this should know before it is done; the summary has it too
+    warn : called with a sentence that whoever runs this should know before it is done; the summary has it too. A
+        `RigidMDWarning` by Python's `warnings` when not given
     applied : of a single body, forces by Python functions: see `BodySimulation`
     """
 
@@ -112,7 +123,7 @@ class Simulation:
         force: bool = False,
         observers: Every | Sequence[Every] = (),
         say: Callable[[str], object] = lambda sentence: None,
-        warn: Callable[[str], object] = lambda sentence: None,
+        warn: Callable[[str], object] = _as_warning,
     ):
         self.scene = scene
         self.folder = None if folder is None else Path(folder)
