@@ -9,6 +9,7 @@ import pytest
 from conftest import BODIES, ROOT
 
 import rigidmd
+from rigidmd.assemble.body import build_body
 from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Every, Simulation
@@ -152,8 +153,9 @@ def test_resolved_scenes_are_scenes(path, tmp_path):
     from rigidmd.output.scene_file import write_body_scene
 
     scene = Scene.read(path)
-    write_body_scene(tmp_path, scene)
-    assert Scene.read(tmp_path / "scene.toml").model_dump() == scene.model_dump()
+    write_body_scene(tmp_path, scene, build_body(scene))
+    decided = {"output": scene.output.model_copy(update={"interval_s": scene.interval})}
+    assert Scene.read(tmp_path / "scene.toml").model_dump() == scene.model_copy(update=decided).model_dump()
 
 
 def test_wheels_are_shown(tmp_path):
@@ -181,3 +183,17 @@ def test_what_a_trajectory_cannot_hold_is_told(tmp_path):
     with pytest.raises(SimulationError, match=r"beyond the 2e\+07 Å that .xtc can hold.* The motion so far"):
         Simulation(fast, tmp_path / "fast").run()
     assert (tmp_path / "fast" / "motion.csv").is_file()
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
+def test_the_scene_that_a_run_writes_runs_again_to_the_same_bits(integrator, tmp_path):
+    changes = {"run.duration_s": 0.05, "run.integrator": integrator}
+    first = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", changes), tmp_path / "out").run()
+    again = Scene.read(tmp_path / "out" / "scene.toml")
+    assert again.output.interval_s is not None
+    assert (again.run.formulation is None) == (integrator == "velocity_verlet")
+    assert (again.run.relative_tolerance is None) == (integrator != "dop853")
+    repeated = Simulation(again).run()
+    for one, other in zip(first.state, repeated.state, strict=True):
+        assert one.tobytes() == other.tobytes()
+    assert first["theta"].tobytes() == repeated["theta"].tobytes()

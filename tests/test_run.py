@@ -309,6 +309,33 @@ def test_when_total_momentum_is_taken_out():
     assert "run.remove_momentum_interval_ps is false" in describe(argon(run={"remove_momentum_interval_ps": False}))
 
 
+DECIDED = {
+    "reaction_field": {"cutoff_A", "switch_start_A"},
+    "ewald": {"cutoff_A", "switch_start_A", "ewald_alpha_per_A", "ewald_k_radius_per_A", "ewald_truncation"},
+    "pme": {"cutoff_A", "switch_start_A", "ewald_alpha_per_A", "pme_grid", "pme_order", "ewald_truncation"},
+}
+
+
+@pytest.mark.parametrize("electrostatics", DECIDED)
+def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, tmp_path):
+    """And runs again to the same bits, though nothing is left for it to decide."""
+    forces = {"electrostatics": electrostatics} | (
+        {} if electrostatics == "reaction_field" else {"ewald_accuracy": 1e-3}
+    )
+    stages = [{"duration_ps": 0.01, "ensemble": "nvt", "temperature_K": 300.0}]
+    scene = small_scene({"spce": 30}, 18.5, forces=forces, start={}, stages=stages)
+    first = Simulation(scene, tmp_path / "out").run()
+    again = Scene.read(tmp_path / "out" / "scene.toml")
+    assert DECIDED[electrostatics] <= again.forces.model_fields_set
+    assert ("ewald_accuracy" in again.forces.model_fields_set) == (electrostatics == "reaction_field")
+    assert again.start.temperature_K == 300.0
+    assert again.forces.skin_A == 1.6
+    assert build(again).decided == first.system.decided
+    repeated = Simulation(again).run()
+    for one, other in zip(first.state, repeated.state, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
 def test_input_files_of_one_name_are_kept_apart(tmp_path):
     model = (ROOT / "rigidmd" / "models" / "argon.toml").read_text()
     for name, mass in (("aa", "39.948"), ("bb", "83.798")):

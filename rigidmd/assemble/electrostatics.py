@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from math import inf, pi, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from rigidmd.forces.waves.errors import (
     radius_of,
     real_error,
     wave_error,
-    waves_for,
+    wave_radius_for,
 )
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
@@ -71,6 +71,7 @@ class Electrostatics(NamedTuple):
     pressure: float = 0.0  # u/(Å ps²), that no motion changes
     force_error: float | None = None  # estimated rms error of the force on a site, u Å/ps²; with Ewald sums
     notes: tuple[str, ...] = ()
+    decided: dict[str, Any] | None = None  # keys of forces that the scene left open, with what they became
 
 
 def electrostatics(
@@ -132,6 +133,7 @@ class Settings(NamedTuple):
     waves: ewald.Waves | None  # of Ewald; of PME those that tell what frozen molecules do to one another
     grid: tuple[int, int, int] | None  # of PME
     order: int | None
+    radius: float | None  # of waves, 1/Å, where they are those within one
     real_error: float  # e²/Å², see ewald_errors
     wave_error: float
 
@@ -164,11 +166,13 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
                 )
             grid, order = found
         left = mesh_error(charges, alpha, cell, grid, order)
-        over = waves_for(charges, alpha, reciprocal, 1e-3 * left) if charged.frozen.any() else None
-        return Settings(alpha, over, grid, order, beyond, left)
+        over = None
+        if charged.frozen.any():
+            over = ewald.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
+        return Settings(alpha, over, grid, order, None, beyond, left)
+    radius = forces.ewald_k_radius_per_A
     if forces.gives_waves:
         most = forces.ewald_k_max if isinstance(forces.ewald_k_max, tuple | None) else (forces.ewald_k_max,) * 3
-        radius = forces.ewald_k_radius_per_A
         longest = np.linalg.norm(cell, axis=1).max()
         if radius is not None and most is None and radius * longest > 2 * pi * MOST_WAVES:
             fault = f"forces.ewald_k_radius_per_A = {radius:g} is more than {MOST_WAVES} waves along an edge of the box"
@@ -181,8 +185,10 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
         if over.total == 0:
             raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no wave at all"])
     else:
-        over = waves_for(charges, alpha, reciprocal, share)
-    return Settings(alpha, over, None, None, beyond, wave_error(charges, alpha, radius_of(over.total, volume), volume))
+        radius = wave_radius_for(charges, alpha, reciprocal, share)
+        over = ewald.waves_within(reciprocal, radius)
+    left = wave_error(charges, alpha, radius_of(over.total, volume), volume)
+    return Settings(alpha, over, None, None, radius, beyond, left)
 
 
 def _given_grid(scene: MolecularScene, basis: np.ndarray, cell: np.ndarray) -> tuple[int, int, int] | None:
@@ -255,7 +261,12 @@ def _ewald(
         constants["coulomb_frozen"], pressure = _of_frozen(
             charged, charge * still, space, settings, permittivity, state
         )
-    return Electrostatics(terms, constants, pressure, error * COULOMB, tuple(notes))
+    decided = {"ewald_alpha_per_A": alpha, "ewald_truncation": "shift" if forces.shifts_ewald else "plain"}
+    if settings.radius is not None:
+        decided["ewald_k_radius_per_A"] = settings.radius
+    if settings.grid is not None and np.array_equal(basis, ewald.AS_GIVEN):  # else it is one of another cell
+        decided |= {"pme_grid": tuple(map(int, settings.grid)), "pme_order": settings.order}
+    return Electrostatics(terms, constants, pressure, error * COULOMB, tuple(notes), decided)
 
 
 def _of_frozen(

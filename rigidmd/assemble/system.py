@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,6 +67,7 @@ class System:
     constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
     constant_pressure: float  # u/(Å ps²), that no motion changes
     tail: Tail | None  # what is missing beyond the cut-off, where it is asked for
+    decided: dict[str, Any]  # keys of forces that the scene left open, with what they became
     sites: Sites
     residue_number: np.ndarray  # (n,) by which a scene may pick molecules: see Molecules.frozen
     from_lattice: bool
@@ -141,7 +142,9 @@ def build(scene: MolecularScene) -> System:
     state = state_of(
         position=arrangement.position, rotation=arrangement.rotation if turning else None, cell=arrangement.cell
     )
-    terms, constants, pressure, beyond, charges = _terms(scene, species, model, space, cutoff, state, arrangement.basis)
+    terms, constants, pressure, beyond, decided, charges = _terms(
+        scene, species, model, space, cutoff, state, arrangement.basis
+    )
     system = System(
         scene=scene,
         species=species,
@@ -153,6 +156,7 @@ def build(scene: MolecularScene) -> System:
         constants=constants,
         constant_pressure=pressure,
         tail=beyond,
+        decided=decided,
         sites=_sites(species, index),
         residue_number=number,
         from_lattice=scene.structure is None,
@@ -429,12 +433,15 @@ def _terms(
     cutoff: float,
     state: State,
     basis: np.ndarray,
-) -> tuple[dict[str, NamedTuple], dict[str, float], float, Tail | None, Electrostatics | None]:
-    """Terms by name, constant energies by name, constant pressure, what is beyond the cut-off, what charges are."""
+) -> tuple[dict[str, NamedTuple], dict[str, float], float, Tail | None, dict[str, Any], Electrostatics | None]:
+    """Terms and constant energies by name, constant pressure, what is beyond the cut-off, what was decided, charges."""
     forces = scene.forces
     index = model.species
     usual = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
     start = forces.switch_start_A or usual
+    decided = {} if cutoff == inf else {"cutoff_A": cutoff}
+    if cutoff < inf and "switch" in forces.truncation:
+        decided["switch_start_A"] = start
     terms, constants, pressure, beyond = {}, {}, 0.0, None
     named = _named_pairs(scene, species)
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
@@ -471,7 +478,8 @@ def _terms(
         terms |= found.terms
         constants |= found.constants
         pressure += found.pressure
-    return terms, constants, pressure, beyond, found
+        decided |= found.decided or {}
+    return terms, constants, pressure, beyond, decided, found
 
 
 def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:

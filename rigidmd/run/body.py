@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +62,9 @@ class BodySimulation(Simulation):
         self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0)
         self._reset()
         self._stretches = self._walk()
-        rate = body_rate(self.system)
-        self._stable = stable_angle(self.system.method) / rate if self.scene.watch.stable_step and rate else None
+        rate, angle = body_rate(self.system), stable_angle(self.system.method)
+        followed = self.scene.watch.stable_step and rate > 0 and angle < inf  # some solvers choose their own steps
+        self._stable = angle / rate if followed else None
         if self._stable is not None and self.scene.run.timestep_s > self._stable:
             self.note(
                 f"timestep_s = {self.scene.run.timestep_s:g} is longer than what is stable: at its start the body "
@@ -127,7 +128,7 @@ class BodySimulation(Simulation):
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it is run."""
-        write_body_scene(folder, self.scene)
+        write_body_scene(folder, self.scene, self.system)
 
     def introduction(self) -> str:
         """One line, before the run."""

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from rigidmd.forces.waves.ewald import Waves, waves_within
 from rigidmd.forces.waves.splines import aliases
 
 FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
@@ -72,8 +71,8 @@ def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> 
     return sqrt(charges.square / charges.count * np.trapezoid(density, k) / volume)
 
 
-def waves_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> Waves:
-    """All waves up to a length beyond which this error is left."""
+def wave_radius_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
+    """The length of waves (1/Å) beyond which this error is left."""
     volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
     least = np.linalg.norm(reciprocal, axis=1).min()
     longest = 12 * alpha + least
@@ -82,7 +81,7 @@ def waves_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: flo
         return np.log(max(wave_error(charges, alpha, radius, volume), 1e-300) / error)
 
     radius = least if left(0.0) <= 0 else brentq(left, 0.0, longest)
-    return waves_within(reciprocal, max(radius, least) * (1 + 1e-9))
+    return max(radius, least) * (1 + 1e-9)
 
 
 def radius_of(count: int, volume: float) -> float:
