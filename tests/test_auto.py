@@ -5,7 +5,7 @@ import pytest
 from conftest import ROOT, small_scene
 
 from rigidmd.cli import main
-from rigidmd.errors import SceneError
+from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
@@ -94,3 +94,9 @@ def test_check_says_that_it_is_open(capsys):
     more = ["--set", "stages.1.integrator=auto", "--set", "stages.1.energy_error_kT=1e-4"]
     assert main(["check", water, *more, "--set", "stages.1.timestep_fs=2.0"]) == 0
     assert "integrator and step chosen at its start for an error of 0.0001 kT" in capsys.readouterr().out
+
+
+def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
+    stages = [{"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-30}]
+    with pytest.raises(SimulationError, match=r"stopped at step 0 \(0 ps\): no integrator keeps its error below 1e-30"):
+        Simulation(small_scene({"argon": 40}, 18.5, stages=stages)).run()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 
-from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.core.schemes import SCHEMES, Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines import Engine
 from rigidmd.engines.cpu import NotFiniteError
@@ -265,6 +265,7 @@ class Simulation:
         """Advance through all stretches; seconds of computing in each."""
         computing: list[float] = []
         durations = self._durations()
+        self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # until there is one, nothing has moved
         time = 0.0  # in whole steps, without the rounding of their sum
         with progress_of(sum(durations), self.time_unit, progress) as advanced:
             for k in range(len(durations)):
