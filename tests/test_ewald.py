@@ -26,7 +26,7 @@ from rigidmd.mechanics.rotation import from_vector
 from rigidmd.output.report import summary_text
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
-from rigidmd.scene.molecules import Box
+from rigidmd.scene.place import Box
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
 BOXES = [{"lengths_A": [13.0, 12.5, 15.0]}, {"lengths_A": [13.0, 14.0, 15.0], "angles_deg": [75.0, 100.0, 65.0]}]

@@ -22,7 +22,7 @@ from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.molecules import Molecule, Site, load_model, molecule, with_masses
 from rigidmd.output.trajectory import TrajectoryFile, write_topology
 from rigidmd.scene import Scene
-from rigidmd.scene.molecules import Box
+from rigidmd.scene.place import Box
 from rigidmd.units import GRAM_PER_CM3
 
 TOLERANCE = 0.15

@@ -15,7 +15,7 @@ from rigidmd.forces.pairs.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, Scene
-from rigidmd.scene.molecules import Stage
+from rigidmd.scene.stage import Stage
 from rigidmd.units import FEMTOSECOND
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.errors import StructureError
-from rigidmd.scene.molecules import LAMMPS_DATA
+from rigidmd.scene.place import LAMMPS_DATA
 
 # ASE's velocity unit (Å sqrt(u/eV)) in Å/ps.
 ASE_VELOCITY = 98.22694788464063

@@ -37,7 +37,7 @@ from rigidmd.molecules import (
     with_parameters,
 )
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.molecules import Molecules
+from rigidmd.scene.species import Molecules
 from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 DEFAULT_CUTOFF = 9.0  # Å

@@ -21,7 +21,7 @@ from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.observables import observe
 from rigidmd.measure.trials import Method, Subject
 from rigidmd.scene import BodyScene
-from rigidmd.scene.molecules import Stage
+from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: General solvers of the textbook's equations, beside which the engine's own ways with a body can be seen.

@@ -1,0 +1,116 @@
+"""Of the scene of molecules: what acts between their sites."""
+
+from math import inf
+from typing import Annotated, Literal
+
+from pydantic import Field, Strict, model_validator
+
+from rigidmd.molecules import Mixing
+from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
+
+Permittivity = Annotated[float, Strict(), Field(ge=1)]
+WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
+GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
+
+#: Keys of `Forces` that only some kinds of electrostatics know.
+ELECTROSTATIC_KEYS = {
+    "reaction_field_permittivity": ("reaction_field",),
+    "damping_per_A": ("damped_shifted_force",),
+    "ewald_accuracy": ("ewald", "pme"),
+    "ewald_alpha_per_A": ("ewald", "pme"),
+    "ewald_surface_permittivity": ("ewald", "pme"),
+    "ewald_truncation": ("ewald", "pme"),
+    "ewald_k_max": ("ewald",),
+    "ewald_k2_max": ("ewald",),
+    "ewald_k_radius_per_A": ("ewald",),
+    "pme_order": ("pme",),
+    "pme_grid": ("pme",),
+}
+
+
+class UnlikePair(Section):
+    """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
+
+    sites: tuple[str, str]
+    """The two kinds: a site's name, else an element; `SPECIES.NAME` for those of one species"""
+    sigma_A: Positive
+    """Lennard-Jones diameter"""
+    epsilon_kJ_mol: NonNegative
+    """Lennard-Jones well depth"""
+
+
+class Forces(Section):
+    """What acts between sites of different molecules."""
+
+    cutoff_A: Positive | None = None
+    """Cut-off between sites; 9 Å in a periodic box, none without one"""
+    truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
+    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. The
+    energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. What ewald and
+    pme leave to pairs ends as ewald_truncation says"""
+    switch_start_A: Positive | None = None
+    """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
+    and smooth_switch, at 0.6 of the cut-off"""
+    mixing: Mixing = "lorentz-berthelot"
+    """Lennard-Jones parameters between unlike sites"""
+    pairs: tuple[UnlikePair, ...] = ()
+    """Parameters of particular pairs, in place of the mixing rule"""
+    tail_correction: Flag = False
+    """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` is with it, `virial` without"""
+    electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
+    """How charges act: ewald and pme with all periodic images, the others within the cut-off; none ignores them"""
+    reaction_field_permittivity: Permittivity = inf
+    """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
+    damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
+    """Of damped_shifted_force; 0 for none"""
+    ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] = 1e-5
+    """Of ewald and pme: rms error of the force on a site, over that between two charges e at 1 Å; sets what follows"""
+    ewald_alpha_per_A: Positive | None = None
+    """Splitting parameter: charges are screened by erfc(alpha r)"""
+    ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
+    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each, of the cell as box or file describe it"""
+    ewald_k2_max: Count | None = None
+    """Of ewald: largest n_x² + n_y² + n_z² besides"""
+    ewald_k_radius_per_A: Positive | None = None
+    """Of ewald: largest length of k"""
+    ewald_truncation: Literal["plain", "shift"] | None = None
+    """Of ewald and pme: whether the energy of what they leave to pairs, erfc(alpha r)/r, is shifted to 0 at the
+    cut-off; forces are the same. When not given: plain where `truncation` is plain, else shift. coulomb_self then also
+    holds -erfc(alpha R)/(2 R) times the square of each molecule's charge, R the cut-off: nothing for neutral ones"""
+    ewald_surface_permittivity: Permittivity = inf
+    """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
+    pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
+    """Of pme: order of the B-splines, 4 is cubic"""
+    pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
+    """Of pme: grid points along each edge of the cell as box or file describe it; three equal ones if it leans by more
+    than half an edge, as another cell stands for it then"""
+    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.6
+    """Extra radius of the neighbour list; speed only, never the result"""
+
+    @model_validator(mode="after")
+    def _nothing_idle(self):
+        if self.switch_start_A is not None and "switch" not in self.truncation:
+            raise ValueError(f"switch_start_A would do nothing with truncation = {self.truncation!r}")
+        fields, method = type(self).model_fields, self.electrostatics
+        for key, methods in ELECTROSTATIC_KEYS.items():
+            if getattr(self, key) != fields[key].default and method not in methods:
+                raise ValueError(f"{key} would do nothing with electrostatics = {method!r}")
+        if self.ewald_k2_max is not None and self.ewald_k_max is None:
+            raise ValueError("ewald_k2_max needs ewald_k_max beside it")
+        if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
+            raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
+        settled = self.gives_waves or (self.pme_grid is not None and self.pme_order is not None)
+        if settled and self.ewald_alpha_per_A is not None and "ewald_accuracy" in self.model_fields_set:
+            raise ValueError("ewald_accuracy would do nothing: alpha and what goes with it are all given")
+        return self
+
+    @property
+    def shifts_ewald(self) -> bool:
+        """Whether the real-space energy of an Ewald sum is shifted to 0 at the cut-off."""
+        usual = "plain" if self.truncation == "plain" else "shift"
+        return (self.ewald_truncation or usual) == "shift"
+
+    @property
+    def gives_waves(self) -> bool:
+        """Whether the scene says which waves an Ewald sum takes."""
+        return self.ewald_k_max is not None or self.ewald_k_radius_per_A is not None

@@ -1,0 +1,86 @@
+"""Of the scene of molecules: where they are at the start."""
+
+from math import cos, pi, radians, sqrt
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, Strict, model_validator
+
+from rigidmd.molecules import SiteName
+from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
+
+#: Endings of LAMMPS' data files.
+LAMMPS_DATA = (".data", ".lmp", ".lammps")
+
+Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
+
+
+class Structure(Section):
+    """Where the molecules are at the start, from a file."""
+
+    file: str
+    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, or `final.npz` of an
+    earlier run; beside or below the scene"""
+    frame: Annotated[int, Strict()] | None = None
+    """Which of several structures in the file: 1 is the first, -1 the last; needed where there are several"""
+    repeat: tuple[Count, Count, Count] = (1, 1, 1)
+    """How many times the file's cell stands side by side along a, b, c: from a crystal's cell to a crystal"""
+    velocities: Flag = False
+    """Use the velocities in the file instead of drawing them"""
+    tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
+    """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
+    atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
+    """Of LAMMPS' data files: what each atom type is, { 1 = "O", 2 = "H" }, by a site's name or an element, X without
+    mass. When not given, labels in the file tell, and else masses"""
+
+    @model_validator(mode="after")
+    def _has_types(self):
+        if self.atom_types is not None and not self.file.lower().endswith(LAMMPS_DATA):
+            raise ValueError(f"atom_types are of LAMMPS' data files ({' '.join(LAMMPS_DATA)}), not of {self.file}")
+        return self
+
+
+class Box(Section):
+    """The periodic box, if any."""
+
+    lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
+    """Edges; one number for a cube"""
+    angles_deg: tuple[Angle, Angle, Angle] | None = None
+    """Angles between b and c, c and a, a and b; right angles when not given"""
+    density_g_cm3: Positive | None = None
+    """Mass density, from which the edge of a cube follows"""
+    periodic: Flag = True
+    """False: no box; molecules in vacuum"""
+
+    @model_validator(mode="after")
+    def _one_size(self):
+        if self.lengths_A is not None and self.density_g_cm3 is not None:
+            raise ValueError("give lengths_A or density_g_cm3, not both")
+        if self.angles_deg is not None and self.lengths_A is None:
+            raise ValueError("angles_deg needs lengths_A")
+        if self.angles_deg is not None and not _span_a_volume(*map(radians, self.angles_deg)):
+            raise ValueError("angles_deg: three edges cannot stand at these angles")
+        return self
+
+    @property
+    def cell(self) -> np.ndarray | None:
+        """Rows (3, 3) a along x, b in the xy plane and c, Å; None where the scene does not say."""
+        if self.lengths_A is None:
+            return None
+        a, b, c = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
+        alpha, beta, gamma = (0.0 if angle == 90 else cos(radians(angle)) for angle in self.angles_deg or (90,) * 3)
+        across = sqrt(1 - gamma**2)
+        y = (alpha - beta * gamma) / across
+        return np.array([[a, 0, 0], [b * gamma, b * across, 0], [c * beta, c * y, c * sqrt(1 - beta**2 - y**2)]])
+
+
+def _span_a_volume(alpha: float, beta: float, gamma: float) -> bool:
+    """Whether edges at these angles to one another (radians) can stand, and not in one plane."""
+    return 2 * max(alpha, beta, gamma) < alpha + beta + gamma < 2 * pi
+
+
+class Start(Section):
+    """The first moment."""
+
+    temperature_K: NonNegative | None = None
+    """Temperature of the momenta that are drawn; that of the first stage when not given"""

@@ -1,0 +1,97 @@
+"""Of the scene of molecules: which they are."""
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, Strict, field_validator, model_validator
+
+from rigidmd.molecules import Site, SiteName, model_fault
+from rigidmd.validation import Count, Flag, Positive, Section
+
+#: Keys of [[molecules]] that name a file.
+SPECIES_FILES = ("file", "parameters")
+
+ResidueNumber = Annotated[int, Strict(), Field(ge=0)]
+
+
+class Molecules(Section):
+    """A species and how many of it."""
+
+    model: str | None = None
+    """A model that comes with rigidmd; `rigidmd models` lists them"""
+    file: str | None = None
+    """A molecule in a .toml file like those models, or a geometry in any file ASE reads, with `sites` for its atoms"""
+    name: str | None = None
+    """What to call the species; the model's or file's name when not given"""
+    sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
+    """The sites of a molecule of one's own; with a geometry `file`, their parameters by atom name or element"""
+    parameters: str | None = None
+    """A .toml file with entries like those of `sites`, which several molecules may share: what they do not say
+    themselves, by atom name or element"""
+    masses_u: dict[str, Positive] | None = Field(default=None, min_length=1)
+    """Other masses of sites, by name or element: other isotopes, { H = 2.014 } for heavy water"""
+    residue_names: tuple[SiteName, ...] | None = None
+    """Residue names by which structure files may call this species"""
+    count: Count | None = None
+    """How many; needed unless there is a structure file"""
+    frozen: Flag | tuple[ResidueNumber, ...] | str = False
+    """They stay put and act on the others; not on one another, so the potential energy lacks that constant. True for
+    all, or numbers of some, [1, 2, 5] or "1-10, 15": all residues of such a number in the structure file; where its
+    residues are not the molecules, or there is no file, 1, 2, ... among those of this species"""
+
+    @field_validator("frozen")
+    @classmethod
+    def _are_numbers(cls, frozen: bool | tuple[int, ...] | str):
+        if frozen == ():
+            raise ValueError("is empty: list the numbers of molecules, or leave it out")
+        if isinstance(frozen, str):
+            if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", frozen):
+                raise ValueError(f"is {frozen!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
+            if turned := [f"{first}-{last}" for first, last in _spans(frozen) if first > last]:
+                raise ValueError(f"is {frozen!r}: {', '.join(turned)} ends before it begins")
+        return frozen
+
+    @property
+    def frozen_spans(self) -> list[tuple[int, int]]:
+        """First and last of the numbers of frozen molecules; none where all or none are."""
+        if isinstance(self.frozen, bool):
+            return []
+        return _spans(self.frozen) if isinstance(self.frozen, str) else [(number, number) for number in self.frozen]
+
+    @field_validator("model")
+    @classmethod
+    def _is_known(cls, model: str | None):
+        if model is not None and (fault := model_fault(model)):
+            raise ValueError(fault)
+        return model
+
+    @model_validator(mode="after")
+    def _one_source(self):
+        if self.model is not None and (self.file is not None or self.sites is not None):
+            raise ValueError("give a model, or a file and sites of your own, not both")
+        whole = self.model is not None or (self.file is not None and self.file.endswith(".toml"))
+        if self.parameters is not None and whole:
+            raise ValueError("parameters would do nothing: a model or a .toml file has its own")
+        if self.parameters is not None and not self.parameters.endswith(".toml"):
+            raise ValueError(f"parameters = {self.parameters!r} must be a .toml file with [[sites]]")
+        if self.model is None and self.file is None and self.sites is None:
+            raise ValueError("needs one of model, file, sites")
+        if self.file is not None and self.file.endswith(".toml") and self.sites is not None:
+            raise ValueError("a .toml file has its own sites: leave out one of them")
+        if self.file is not None and not whole and self.sites is None and self.parameters is None:
+            raise ValueError("a geometry file needs sites, or a file of parameters, for its atoms")
+        if self.sites is not None and self.file is None and self.name is None:
+            raise ValueError("a molecule of one's own needs a name")
+        return self
+
+    @property
+    def label(self) -> str:
+        """Its name, or that of its model or file."""
+        return self.name or self.model or Path(self.file or "").stem
+
+
+def _spans(text: str) -> list[tuple[int, int]]:
+    """First and last number of each part of "1-10, 15"."""
+    ends = [[int(number) for number in part.split("-")] for part in text.split(",")]
+    return [(numbers[0], numbers[-1]) for numbers in ends]
