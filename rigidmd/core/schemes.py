@@ -1,4 +1,4 @@
-"""Integrators as data: rows of flows, kicks (forces and torques), drifts (free flight and free rotation), baths.
+"""Integrators as data: rows of flows, kicks (forces and torques), drifts (free flight and free rotation), baths, boxes.
 
 A row says by which fractions of the time step the flows follow one another. Kick and drift are symplectic and
 time-reversible, so any palindrome of them is too; its coefficients decide its order.
@@ -10,15 +10,16 @@ does. Every other row counts on a drift that is the free motion itself: with the
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-#: The flows that a step is made of: by the forces, free flight and free rotation, by a bath; and total momentum goes.
-KICK, DRIFT, BATH, REST = 0, 1, 2, 3
+#: The flows that a step is made of: by the forces, free flight and free rotation, by a bath; removal of the total
+#: momentum; by a pressure, and of a volume by its own inertia.
+KICK, DRIFT, BATH, REST, BOX, STRETCH = 0, 1, 2, 3, 4, 5
 
 
 class Flow(NamedTuple):
     """One flow of a step."""
 
-    kind: int  # KICK, DRIFT, BATH or REST
-    fraction: float  # of the time step
+    kind: int  # KICK, DRIFT, BATH, REST, BOX or STRETCH
+    fraction: float  # of the time step; of what is taken in every so many steps, of as many
     gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.gradient)
     every: int = 1  # it is taken in every so many steps of a stretch
 
@@ -32,14 +33,44 @@ class Scheme(NamedTuple):
     exact_rotor: bool  # whether its order needs one
     source: str
     bath: tuple | None = None  # whose flow BATH is (dynamics.baths)
+    box: tuple | None = None  # whose flows BOX and STRETCH are (dynamics.boxes)
 
     def with_rotor(self, rotor: str | None) -> "Scheme":
         """This scheme on the rotor named ("split" or "exact"); its own where none is."""
         return self if rotor is None else self._replace(exact_rotor=rotor == "exact")
 
-    def with_bath(self, bath: tuple) -> "Scheme":
-        """This scheme with a bath that acts for a whole time step at the end of each."""
+    @property
+    def has_bath(self) -> bool:
+        """Whether a bath has its place in the row itself."""
+        return any(flow.kind == BATH for flow in self.flows)
+
+    def with_bath(self, bath: tuple, halved: bool = False) -> "Scheme":
+        """This scheme with a bath: where its row says; or else half before and half after a step, or all after it."""
+        if self.has_bath:
+            return self._replace(bath=bath)
+        if halved:
+            return self._replace(flows=(Flow(BATH, 0.5), *self.flows, Flow(BATH, 0.5)), bath=bath)
         return self._replace(flows=(*self.flows, Flow(BATH, 1.0)), bath=bath)
+
+    def with_box(self, box: tuple, every: int) -> "Scheme":
+        """This scheme with a box that moves at the end of every so many steps."""
+        return self._replace(flows=(*self.flows, Flow(BOX, float(every), every=every)), box=box)
+
+    def with_piston(self, box: tuple) -> "Scheme":
+        """This scheme with a volume that has inertia: each kick and drift with one of the volume about or around it."""
+        flows: list[Flow] = []
+        kicks = [k for k, flow in enumerate(self.flows) if flow.kind == KICK]
+        for k, flow in enumerate(self.flows):
+            half = flow._replace(fraction=flow.fraction / 2)
+            if flow.kind == DRIFT:
+                flows += [half._replace(kind=STRETCH), flow, half._replace(kind=STRETCH)]
+            elif k == kicks[0]:
+                flows += [flow._replace(kind=BOX), flow]
+            elif k == kicks[-1]:
+                flows += [flow, flow._replace(kind=BOX)]
+            else:
+                flows += [half, flow._replace(kind=BOX), half] if flow.kind == KICK else [flow]
+        return self._replace(flows=tuple(flows), box=box)
 
     def with_rest(self, every: int) -> "Scheme":
         """This scheme with the total momentum of all molecules taken out at the end of every so many steps."""
@@ -270,5 +301,16 @@ SCHEMES = {
             order=8,
             source=f"{KAHAN_LI}, s17odr8a",
         ),
+    )
+}
+
+#: Rows that have a place for a bath and are nothing without one.
+WITH_BATH = {
+    "baoab": Scheme(
+        "baoab",
+        (Flow(KICK, 0.5), Flow(DRIFT, 0.5), Flow(BATH, 1.0), Flow(DRIFT, 0.5), Flow(KICK, 0.5)),
+        order=2,
+        exact_rotor=False,
+        source="Leimkuhler & Matthews 2013, Appl. Math. Res. Express 34; for rigid bodies Davidchack et al. 2015",
     )
 }

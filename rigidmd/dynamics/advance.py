@@ -1,16 +1,16 @@
-"""The compiled loop: n steps of any row of flows, any terms, any bath."""
+"""The compiled loop: n steps of any row of flows, any terms, any bath, any box."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
-from rigidmd.core.schemes import BATH, DRIFT, KICK, Scheme
+from rigidmd.core.schemes import BATH, BOX, DRIFT, KICK, STRETCH, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN
-from rigidmd.dynamics.baths import apply
+from rigidmd.dynamics.baths import apply, bath_code
+from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import SERIAL
-from rigidmd.forces.terms import load_bodies
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
@@ -29,19 +29,20 @@ class Model(NamedTuple):
     rotor: SplitRotor | ExactRotor | NoRotor
 
 
-def code_of(model: NamedTuple) -> Code | None:
+def code_of(model: NamedTuple, bath: NamedTuple) -> Code | None:
     """The machine code that moves molecules; None of a single body, whose flows are compiled into the loop."""
     if not isinstance(model, Model):
         return None
     state, load = EXAMPLE
     kicked = (model.species, model.inverse_mass, model.inverse_inertia, state, load, 0.0)
-    return Code(kick=(_kick, kicked), drift=(_drift, (model.rotor, model.species, state, 0.0)))
+    drifting = (model.rotor, model.species, state, 0.0)
+    return Code(kick=(_kick, kicked), drift=(_drift, drifting), **bath_code(bath, model))
 
 
 class Row(NamedTuple):
     """The flows of a scheme as arrays, in their order."""
 
-    kind: np.ndarray  # (flows,) KICK, DRIFT, BATH or REST
+    kind: np.ndarray  # (flows,) KICK, DRIFT, BATH, REST, BOX or STRETCH
     fraction: np.ndarray  # (flows,) of the time step
     moment: np.ndarray  # (flows,) of the time step: when each ends, as drifts count
     every: np.ndarray  # (flows,) taken in every so many steps of a stretch
@@ -60,11 +61,12 @@ def row_of(scheme: Scheme) -> Row:
 
 
 @kernel(outer=True)
-def advance(model, code, state, load, terms, bath, row, probe, dt, until, cursor):
+def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, cursor):
     """Step until `until` steps of dt have been taken, counted in state.step.
 
-    code : see `code_of`. terms : workspaces. probe : room for gradients; None compiles none. cursor (2,) : flows done
-    in this step; whether `load` is that of the present positions (1) or that with the gradient (2).
+    code : see `code_of`. terms : workspaces. probe : room for gradients; None compiles none. heat, room : of a bath, of
+    a box (`baths.heat_room`, `boxes.box_room`). cursor (3,) : flows done in this step; whether `load` is that of the
+    present positions (1) or that with the gradient (2); whether a move of the box is made and not yet judged.
 
     Forces are evaluated before a kick where positions have changed since, so the last evaluation of a step serves the
     next one. A status code: when it is not OK, state and cursor are such that calling again continues without a trace.
@@ -76,7 +78,7 @@ def advance(model, code, state, load, terms, bath, row, probe, dt, until, cursor
             if row.kind[k] == KICK:
                 if probe is None:
                     if cursor[1] == 0:
-                        status = load_bodies(terms, state, load)
+                        status = load_for(box, terms, state, load, room, row)
                         if status != OK:
                             return status
                         cursor[1] = 1
@@ -96,7 +98,14 @@ def advance(model, code, state, load, terms, bath, row, probe, dt, until, cursor
             elif (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] != 0:
                 pass
             elif row.kind[k] == BATH:
-                apply(bath, model, state, h, DRAWS * k)
+                apply(bath, model, code, state, heat, h, DRAWS * k)
+            elif row.kind[k] == BOX:
+                status = move_box(box, model, terms, state, load, room, cursor, h, DRAWS * k)
+                if status != OK:
+                    return status
+            elif row.kind[k] == STRETCH:
+                stretch(box, state, h)
+                cursor[1] = 0
             else:
                 rest(model, state)
             cursor[0] += 1

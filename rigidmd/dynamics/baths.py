@@ -1,15 +1,20 @@
 """Baths: flows on the momenta that keep a temperature, chosen by type; NVE compiles none.
 
-`apply(bath, model, state, h, draw)` acts where the row of a step says. What a bath puts in is in `state.books[HEAT]`;
-its random numbers are counted by the step, from `draw` on, see `noise`.
+`apply(bath, model, code, state, room, h, draw)` acts where the row of a step says. What a bath puts in is in
+`state.books[HEAT]`, and what it evolves in `state.bath`; its random numbers are counted by the step, from `draw` on,
+see `noise`.
 """
 
 from math import exp, inf, sqrt
 from typing import NamedTuple
 
-from rigidmd.compile import implements, is_a, kernel
-from rigidmd.core.state import HEAT, NOW
-from rigidmd.dynamics.noise import Key, chi_square, normals
+import numpy as np
+
+from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.core.state import EXAMPLE, HEAT, NOW
+from rigidmd.dynamics.noise import Key, chi_square, fill_words, normal_of, normals, uniforms
+from rigidmd.dynamics.ramps import Ramp, present
+from rigidmd.forces.pairs.sites import SERIAL
 
 
 class NoBath(NamedTuple):
@@ -26,29 +31,87 @@ class VelocityRescaling(NamedTuple):
     direction, and the time scale of single molecules is hardly touched.
     """
 
-    thermal_energy: float  # kB T, u Å²/ps²
+    thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps; if infinite it does nothing
     degrees_of_freedom: int
     key: Key
 
 
-def apply(bath, model, state, h, draw):
-    """The flow of a bath over a time h (ps), in place; `draw` is its first draw in this step."""
+class Langevin(NamedTuple):
+    """Friction and noise on every momentum: the Ornstein-Uhlenbeck process, solved exactly.
+
+    p <- c p + sqrt(m kT (1 - c²)) xi with c = exp(-friction h), and the same for each component of the angular momentum
+    along an axis that has inertia (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114). Total momentum
+    is not conserved.
+    """
+
+    thermal_energy: Ramp  # kB T, u Å²/ps²
+    friction_translation: float  # 1/ps
+    friction_rotation: float  # 1/ps
+    key: Key
+
+
+class Andersen(NamedTuple):
+    """Collisions with a gas (Andersen 1980, J. Chem. Phys. 72, 2384): now and then a molecule gets new momenta.
+
+    Each molecule is hit independently, after `time_constant` on average. Total momentum is not conserved.
+    """
+
+    thermal_energy: Ramp  # kB T, u Å²/ps²
+    time_constant: float  # ps
+    key: Key
+
+
+class NoseHoover(NamedTuple):
+    """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of `state.bath`.
+
+    Each half is eta (links,), then d eta/dt (links,). With masses Q_1 = g kT tau²/(2 pi)² and Q_j = kT tau²/(2 pi)² the
+    kinetic energy of each swings with the period tau. Conserved: the energy of molecules and of both chains,
+    sum Q_j v_j²/2 + g kT eta_1 + kT sum of the other eta (Martyna, Tuckerman, Tobias & Klein 1996, Mol. Phys. 87,
+    1117); what a chain gains is what `books[HEAT]` loses. A flow is solved by the factors of Suzuki and Yoshida.
+    """
+
+    thermal_energy: Ramp  # kB T, u Å²/ps²
+    period: float  # ps
+    links: int  # of each chain
+    freedom_translation: int
+    freedom_rotation: int
+
+    @property
+    def variables(self) -> int:
+        """Numbers in `state.bath`."""
+        return 4 * self.links
+
+
+def heat_room() -> np.ndarray:
+    """Room (BLOCKS,) for the heat that goes into each block of molecules."""
+    return np.zeros(BLOCKS)
+
+
+def bath_code(bath: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
+    """The tasks of a bath that acts on molecules in blocks, see `compile.Code`; none of others."""
+    if not isinstance(bath, Langevin | Andersen):
+        return {}
+    return {"stir": (_stir, (bath, model, EXAMPLE[0], heat_room(), 0.0, 0))}
+
+
+def apply(bath, model, code, state, room, h, draw):
+    """The flow of a bath over a time h (ps), in place; `draw` is its first draw in this step; room: see `heat_room`."""
     raise TypeError("compiled code only")
 
 
 @implements(apply)
-def _apply_none(bath, model, state, h, draw):
+def _apply_none(bath, model, code, state, room, h, draw):
     if is_a(bath, NoBath):
-        return lambda bath, model, state, h, draw: None
+        return lambda bath, model, code, state, room, h, draw: None
 
 
 @implements(apply)
-def _apply_rescaling(bath, model, state, h, draw):
+def _apply_rescaling(bath, model, code, state, room, h, draw):
     if not is_a(bath, VelocityRescaling):
         return None
 
-    def rescale(bath, model, state, h, draw):
+    def rescale(bath, model, code, state, room, h, draw):
         if bath.time_constant == inf:
             return
         kinetic = kinetic_energy(model, state)
@@ -57,32 +120,205 @@ def _apply_rescaling(bath, model, state, h, draw):
             return
         # eq. A7, with one Gaussian apart and the sum of the squares of the others at once
         c = exp(-h / bath.time_constant)
-        share = 0.5 * bath.thermal_energy * (1 - c) / kinetic
+        share = 0.5 * present(bath.thermal_energy, state) * (1 - c) / kinetic
         gauss, _ = normals(bath.key, draw, 0, state.step[NOW])
         others = chi_square(bath.key, draw + 1, 0, state.step[NOW], freedom - 1)
         scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
         state.books[HEAT] += (scale2 - 1) * kinetic
         scale = sqrt(scale2)
-        for m in range(len(state.velocity)):
-            for k in range(3):
-                state.velocity[m, k] *= scale
-        for m in range(len(state.angular_momentum_body)):
-            for k in range(3):
-                state.angular_momentum_body[m, k] *= scale
+        scale_array(state.velocity, scale)
+        scale_array(state.angular_momentum_body, scale)
 
     return rescale
+
+
+@implements(apply)
+def _apply_by_molecule(bath, model, code, state, room, h, draw):
+    if not (is_a(bath, Langevin) or is_a(bath, Andersen)):
+        return None
+
+    def apply_by_molecule(bath, model, code, state, room, h, draw):
+        blocks = BLOCKS if len(state.velocity) > SERIAL else 1
+        call_blocks(code, "stir", packed((bath, model, state, room, h, draw)), blocks)
+        for block in range(blocks):
+            state.books[HEAT] += room[block]
+
+    return apply_by_molecule
+
+
+BATCH = 64  # molecules whose random words are made at once
+# Draws of a molecule in a step: two of four words each, one for its chance, and from FURTHER on those of each number.
+NORMALS, UNIFORM, FURTHER = 2, 2, 1 << 10
+
+
+@task()
+def _stir(parcel, block):
+    """The share of a bath that acts on each molecule by itself; its heat into room[block]."""
+    bath, model, state, room, h, draw = opened(parcel)
+    n, blocks = len(state.velocity), BLOCKS if len(state.velocity) > SERIAL else 1
+    first, end = n * block // blocks, n * (block + 1) // blocks
+    step, key = state.step[NOW], bath.key
+    thermal = present(bath.thermal_energy, state)
+    keep, spread, keep_turning, spread_turning = shares(bath, h)
+    words = np.empty((4 * NORMALS, BATCH), np.uint64)
+    heat = 0.0
+    for start in range(first, end, BATCH):
+        count = min(BATCH, end - start)
+        for k in range(NORMALS):
+            fill_words(words[4 * k : 4 * (k + 1), :count], key, draw + k, start, step)
+        for m in range(start, start + count):
+            if not is_hit(bath, h, key, draw + UNIFORM, m, step):
+                continue
+            kind = model.species[m]
+            gained = 0.0
+            for k in range(3):
+                before = state.velocity[m, k]
+                xi = normal_of(words[k, m - start], key, draw + FURTHER * (k + 1), m, step)
+                after = keep * before + spread * sqrt(thermal * model.inverse_mass[kind]) * xi
+                gained += after * after - before * before
+                state.velocity[m, k] = after
+            heat += 0.5 * model.mass[kind] * gained
+            if m < len(state.angular_momentum_body):
+                for k in range(3):
+                    before = state.angular_momentum_body[m, k]
+                    xi = normal_of(words[3 + k, m - start], key, draw + FURTHER * (k + 4), m, step)
+                    after = keep_turning * before + spread_turning * sqrt(thermal * model.inertia[kind, k]) * xi
+                    heat += 0.5 * (after * after - before * before) * model.inverse_inertia[kind, k]
+                    state.angular_momentum_body[m, k] = after
+    room[block] = heat
+
+
+def shares(bath, h):
+    """What is kept of a momentum and how much is new, of the thermal size of it; translation, then rotation."""
+    raise TypeError("compiled code only")
+
+
+def is_hit(bath, h, key, draw, molecule, step):
+    """Whether a bath acts on a molecule in a step."""
+    raise TypeError("compiled code only")
+
+
+@implements(shares)
+def _shares(bath, h):
+    if is_a(bath, Andersen):
+        return lambda bath, h: (0.0, 1.0, 0.0, 1.0)
+
+    def of_friction(bath, h):
+        c, turning = exp(-bath.friction_translation * h), exp(-bath.friction_rotation * h)
+        return c, sqrt(1 - c * c), turning, sqrt(1 - turning * turning)
+
+    return of_friction
+
+
+@implements(is_hit, inline=True)
+def _is_hit(bath, h, key, draw, molecule, step):
+    if is_a(bath, Langevin):
+        return lambda bath, h, key, draw, molecule, step: True
+
+    def by_chance(bath, h, key, draw, molecule, step):
+        chance, _ = uniforms(key, draw, molecule, step)
+        return chance > exp(-h / bath.time_constant)
+
+    return by_chance
+
+
+#: Fractions of a flow of the chains, Suzuki & Yoshida.
+YOSHIDA = (1 / (2 - 2 ** (1 / 3)), 1 - 2 / (2 - 2 ** (1 / 3)), 1 / (2 - 2 ** (1 / 3)))
+
+
+@implements(apply)
+def _apply_nose_hoover(bath, model, code, state, room, h, draw):
+    if not is_a(bath, NoseHoover):
+        return None
+
+    def apply_chains(bath, model, code, state, room, h, draw):
+        thermal = present(bath.thermal_energy, state)
+        half = 2 * bath.links
+        moving = translational_energy(model, state)
+        turning = kinetic_energy(model, state) - moving
+        chain = state.bath[:half]
+        scale, heat = drive_chain(bath, chain, thermal, moving, bath.freedom_translation, h)
+        scale_array(state.velocity, scale)
+        state.books[HEAT] += heat
+        chain = state.bath[half:]
+        scale, heat = drive_chain(bath, chain, thermal, turning, bath.freedom_rotation, h)
+        scale_array(state.angular_momentum_body, scale)
+        state.books[HEAT] += heat
+
+    return apply_chains
+
+
+@kernel
+def drive_chain(bath, chain, thermal, kinetic, freedom, h):
+    """Move a chain over h, in place: by which factor momenta scale, and what the chain has lost (u Å²/ps²)."""
+    if freedom == 0:
+        return 1.0, 0.0
+    links = bath.links
+    eta, rate = chain[:links], chain[links:]
+    before = chain_energy(bath, chain, thermal, freedom)
+    scale = 1.0
+    for share in YOSHIDA:
+        d = share * h
+        _kick_links(bath, rate, thermal, 2 * scale * scale * kinetic, freedom, d, links - 1, -1, -1)
+        scale *= exp(-d * rate[0])
+        for j in range(links):
+            eta[j] += d * rate[j]
+        _kick_links(bath, rate, thermal, 2 * scale * scale * kinetic, freedom, d, 0, links, 1)
+    return scale, before - chain_energy(bath, chain, thermal, freedom)
+
+
+@kernel
+def _kick_links(bath, rate, thermal, twice_kinetic, freedom, d, first, end, by):
+    """Half a step of the rates of the links, from the last link to the first or back."""
+    links = bath.links
+    unit = thermal * (bath.period / (2 * np.pi)) ** 2
+    for j in range(first, end, by):
+        if j == 0:
+            pull = (twice_kinetic - freedom * thermal) / (freedom * unit)
+        else:
+            mass = freedom * unit if j == 1 else unit
+            pull = (mass * rate[j - 1] * rate[j - 1] - thermal) / unit
+        drag = exp(-0.25 * d * rate[j + 1]) if j + 1 < links else 1.0
+        rate[j] = (rate[j] * drag + 0.5 * d * pull) * drag
+
+
+@kernel
+def chain_energy(bath, chain, thermal, freedom):
+    """Energy of a chain (u Å²/ps²)."""
+    unit = thermal * (bath.period / (2 * np.pi)) ** 2
+    total = 0.0
+    for j in range(bath.links):
+        of_one = freedom if j == 0 else 1
+        rate = chain[bath.links + j]
+        total += of_one * (0.5 * unit * rate * rate + thermal * chain[j])
+    return total
+
+
+@kernel
+def scale_array(values, scale):
+    """Multiply an array (n, 3) by a number, in place."""
+    for m in range(len(values)):
+        for k in range(3):
+            values[m, k] *= scale
 
 
 @kernel
 def kinetic_energy(model, state):
     """Translational and rotational kinetic energy of all molecules (u Å²/ps²)."""
+    total = translational_energy(model, state)
+    for m in range(len(state.angular_momentum_body)):
+        for k in range(3):
+            total += 0.5 * state.angular_momentum_body[m, k] ** 2 * model.inverse_inertia[model.species[m], k]
+    return total
+
+
+@kernel
+def translational_energy(model, state):
+    """Translational kinetic energy of all molecules (u Å²/ps²)."""
     total = 0.0
     for m in range(len(state.velocity)):
         v2 = 0.0
         for k in range(3):
             v2 += state.velocity[m, k] ** 2
         total += 0.5 * model.mass[model.species[m]] * v2
-    for m in range(len(state.angular_momentum_body)):
-        for k in range(3):
-            total += 0.5 * state.angular_momentum_body[m, k] ** 2 * model.inverse_inertia[model.species[m], k]
     return total

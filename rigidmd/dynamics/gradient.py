@@ -56,7 +56,7 @@ def evaluate(model, state, load, terms, probe, tau, known):
         copy(state.position, probe.position)
         copy(state.rotation, probe.rotation)
         displace(model, state, load, FRACTION * tau)
-    status = load_bodies(terms, state, probe.load if known else load)
+    status = load_bodies(terms, state, probe.load if known else load, None)
     if known:
         copy(probe.position, state.position)
         copy(probe.rotation, state.rotation)

@@ -21,8 +21,9 @@ from rigidmd.core.state import (
     no_load,
 )
 from rigidmd.dynamics.advance import Model, advance, code_of, row_of
-from rigidmd.dynamics.baths import NoBath
+from rigidmd.dynamics.baths import NoBath, heat_room
 from rigidmd.dynamics.body import Body
+from rigidmd.dynamics.boxes import BoxRoom, NoBox, Piston, box_room
 from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
@@ -63,6 +64,8 @@ class Engine:
         self._codes: dict = {}
         self.load: Load | None = None
         self._probe: Probe | None = None
+        self._heat = heat_room()
+        self._room: BoxRoom | None = None
         self._stale = True
         self._moved: State | None = None
 
@@ -82,8 +85,9 @@ class Engine:
         self._stale = True
 
     def begin(self, state: State, scheme: Scheme) -> State:
-        """A copy of a state with room for all that evolves when a scheme moves it."""
-        return state.copy()
+        """A copy of a state with room for all that evolves when a scheme moves it; chains and pistons begin at rest."""
+        variables = getattr(scheme.bath, "variables", 0) + isinstance(scheme.box, Piston)
+        return state.copy()._replace(bath=np.zeros(variables))
 
     def advance(self, state: State, scheme: Scheme, dt: float, until: int) -> None:
         """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
@@ -95,13 +99,18 @@ class Engine:
         if scheme.has_gradient and self._probe is None:
             self._probe = probe_for(state)
         probe = self._probe if scheme.has_gradient else None
-        model = self.model_for(scheme)
-        kind = type(model.rotor)
+        if scheme.box is not None and self._room is None:
+            self._room = box_room(state)
+        model, bath, box = self.model_for(scheme), scheme.bath or NoBath(), scheme.box or NoBox()
+        kind = (type(model.rotor), type(bath))
         if kind not in self._codes:
-            self._codes[kind] = code_of(model)
-        code, bath, row = self._codes[kind], scheme.bath or NoBath(), row_of(scheme)
-        cursor = np.array([0, not self._stale], np.int64)
-        while status := advance(model, code, state, self.load, self._workspaces, bath, row, probe, dt, until, cursor):
+            self._codes[kind] = code_of(model, bath)
+        moved = (model, self._codes[kind], state, self.load)
+        flows, room = row_of(scheme), self._room if scheme.box is not None else None
+        cursor = np.array([0, not self._stale, 0], np.int64)
+        while status := advance(
+            *moved, self._workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor
+        ):
             self._answer(status, state)
         self._stale = cursor[1] == 0  # also where there was no step, and nobody has evaluated forces
 
@@ -129,6 +138,11 @@ class Engine:
         if self._moved is None:
             raise ValueError("this engine has moved no state yet")
         return self._moved.copy()
+
+    @property
+    def moves(self) -> tuple[int, int]:
+        """Moves of the box tried and accepted so far."""
+        return (0, 0) if self._room is None else (int(self._room.counts[0]), int(self._room.counts[1]))
 
     def room(self, state: State) -> tuple[NamedTuple, ...]:
         """Workspaces for the cell of a state, new ones, without machine code: what they hold in memory."""

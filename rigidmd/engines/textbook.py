@@ -75,7 +75,7 @@ def slopes(form, model, terms, state, load, time, y, dy):
     W' = the power of drives and brakes, relative to the frame, and of what changes I and h.
     """
     read(form, model, state, time, y)
-    status = load_bodies(terms, state, load)
+    status = load_bodies(terms, state, load, None)
     if status != OK:
         return status
     velocity, omega = relative_motion(model, state)

@@ -75,13 +75,16 @@ def add_term(term, state, load, tally):
 
 
 @kernel(inline=True)
-def load_bodies(terms, state, load):
-    """Forces and torques of all terms (a tuple) at the present positions; the worst status code."""
+def load_bodies(terms, state, load, tally):
+    """Forces and torques of all terms (a tuple) at the present positions; the worst status code.
+
+    Energies and virials add up in `tally`; None compiles none.
+    """
     load.force[:] = 0.0
     load.torque_body[:] = 0.0
     status = OK
     for term in literal_unroll(terms):
-        status = max(status, add_forces(term, state, load, None))
+        status = max(status, add_forces(term, state, load, tally))
     return status
 
 
