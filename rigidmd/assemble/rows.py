@@ -1,0 +1,80 @@
+"""Rows of stages: the integrator of a stage with the thermostat and barostat that act in it."""
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.momenta import mobile
+from rigidmd.assemble.system import System
+from rigidmd.core.schemes import Scheme
+from rigidmd.dynamics.baths import Andersen, Langevin, NoseHoover, VelocityRescaling
+from rigidmd.dynamics.boxes import COUPLINGS, CellRescaling, Pressure, VolumeMoves, piston
+from rigidmd.dynamics.noise import BATH, BOX, key_of
+from rigidmd.dynamics.ramps import Ramp, steady
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
+
+#: Largest change of the volume in a Monte Carlo move, in standard deviations of what it fluctuates by.
+WIDTH = 2.0
+
+
+def row(system: System, k: int) -> Scheme:
+    """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
+    scene, stage = system.scene, system.scene.stages[k]
+    found = stage.scheme
+    if stage.has_thermostat:
+        found = found.with_bath(bath_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
+    elif not stage.has_barostat and any(other.thermostat_kind == "velocity_rescaling" for other in scene.stages):
+        # a stage without a thermostat among others with one has one that rests: all then run the same machine code
+        idle = VelocityRescaling(steady(0.0), inf, system.freedom.total, key_of(scene.seed, BATH, k))
+        found = found.with_bath(idle)
+    if stage.ensemble == "npt":
+        every = max(1, round(stage.barostat_interval / (stage.timestep_fs * FEMTOSECOND)))
+        found = found.with_box(box_of(system, k), every)
+    elif stage.ensemble == "nph":
+        found = found.with_piston(box_of(system, k))
+    if stage.keeps_momentum and (interval := scene.removes_momentum_every) is not None:
+        found = found.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
+    return found
+
+
+def bath_of(system: System, k: int) -> NamedTuple:
+    """The thermostat of stage k."""
+    stage, freedom = system.scene.stages[k], system.freedom_in(k)
+    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, k)
+    match stage.thermostat_kind:
+        case "langevin":
+            return Langevin(thermal, *stage.frictions, key)
+        case "andersen":
+            return Andersen(thermal, stage.thermostat_time, key)
+        case "nose_hoover":
+            links = stage.nose_hoover_links
+            return NoseHoover(thermal, stage.thermostat_time, links, freedom.translation, freedom.rotation)
+    return VelocityRescaling(thermal, stage.thermostat_time, freedom.total, key)
+
+
+def box_of(system: System, k: int) -> NamedTuple:
+    """The barostat of stage k."""
+    stage, key = system.scene.stages[k], key_of(system.scene.seed, BOX, k)
+    first, last = (tuple(value * BAR for value in tensor) for tensor in stage.pressures)
+    # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
+    pressure = Pressure(first, last, float(stage.steps))
+    tail = system.tail
+    beyond = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
+    compressibility, volume = stage.compressibility / BAR, system.state.volume
+    if stage.ensemble == "nph":
+        return piston(pressure, stage.barostat_time, compressibility, volume, beyond)
+    if stage.barostat_kind == "monte_carlo":
+        spread = np.sqrt(BOLTZMANN * max(stage.temperatures) * compressibility * volume)
+        return VolumeMoves(
+            _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), beyond, key
+        )
+    at_rest = (1.0, 1.0, 1.0) if stage.keeps_momentum else (0.0, 0.0, 0.0)
+    rate = compressibility / stage.barostat_time
+    return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], at_rest, beyond, key)
+
+
+def _thermal(stage: Stage) -> Ramp:
+    first, last = stage.temperatures
+    return Ramp(BOLTZMANN * first, BOLTZMANN * last, float(stage.steps))
