@@ -8,19 +8,16 @@ float64.
 The same functions take scalars, so that a formula written once serves pair loops and single numbers.
 """
 
-import operator
 from math import prod, sqrt
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+from numba.extending import intrinsic
 
 from rigidmd.compile import PAIR_FLAGS, SIMD_BITS, implements
-
-FLAGS = tuple(sorted(PAIR_FLAGS))
-COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
+from rigidmd.compile.lane_types import COUNT, FLAGS, Lanes, Mask, filled
 
 
 def lane_count(dtype) -> int:
@@ -39,109 +36,6 @@ def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
     memory = np.zeros(size + vector, np.uint8)
     start = -memory.ctypes.data % vector
     return memory[start : start + size].view(dtype).reshape(shape)
-
-
-class Lanes(types.Type):
-    """Numba type of a vector of `count` numbers."""
-
-    def __init__(self, dtype, count):
-        self.dtype, self.count = dtype, count
-        super().__init__(f"lanes({count} x {dtype})")
-
-
-class Mask(types.Type):
-    """Numba type of a truth value for each of `count` lanes."""
-
-    def __init__(self, count):
-        self.count = count
-        super().__init__(f"mask({count})")
-
-
-@register_model(Lanes)
-class LanesModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(manager[kind.dtype].get_value_type(), kind.count))
-
-
-@register_model(Mask)
-class MaskModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.count))
-
-
-# --- operators -------------------------------------------------------------------------------------------------------
-
-
-def _common(a, b) -> Lanes | None:
-    """The vector type of two operands, at least one of them a vector, the other one like it or a number."""
-    if isinstance(b, Lanes):
-        a, b = b, a
-    return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
-
-
-def _filled(context, builder, value, kind, lanes):
-    """The value as a vector: itself, or a number in every lane."""
-    if kind == lanes:
-        return value
-    number = context.cast(builder, value, kind, lanes.dtype)
-    vector = ir.VectorType(number.type, lanes.count)
-    first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, ir.IntType(32)(0))
-    order = ir.Constant(ir.VectorType(ir.IntType(32), lanes.count), [0] * lanes.count)
-    return builder.shuffle_vector(first, first, order)
-
-
-def _operator(functions, emit, result=lambda lanes: lanes):
-    """Teach Numba a binary operator: emit(builder, left, right) of two vectors."""
-    for function in functions:
-
-        @type_callable(function)
-        def of_types(context):
-            def typer(a, b):
-                lanes = _common(a, b)
-                return result(lanes) if lanes is not None else None
-
-            return typer
-
-        def lower(context, builder, signature, arguments):
-            lanes = _common(*signature.args)
-            left, right = (
-                _filled(context, builder, v, kind, lanes) for v, kind in zip(arguments, signature.args, strict=True)
-            )
-            return emit(builder, left, right)
-
-        for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
-            lower_builtin(function, *kinds)(lower)
-
-
-_operator([operator.add, operator.iadd], lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
-_operator([operator.sub, operator.isub], lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
-_operator([operator.mul, operator.imul], lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
-_operator([operator.truediv, operator.itruediv], lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
-
-
-def _compare(function, sign):
-    def emit(builder, a, b):
-        if isinstance(a.type.element, ir.IntType):
-            return builder.icmp_signed(sign, a, b)
-        return builder.fcmp_ordered(sign, a, b)
-
-    _operator([function], emit, lambda lanes: Mask(lanes.count))
-
-
-for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.eq, "==")):
-    _compare(_function, _sign)
-
-
-def _logic(function, emit):
-    @type_callable(function)
-    def of_types(context):
-        return lambda a, b: a if isinstance(a, Mask) and a == b else None
-
-    lower_builtin(function, Mask, Mask)(lambda context, builder, signature, arguments: emit(builder, *arguments))
-
-
-_logic(operator.and_, lambda builder, a, b: builder.and_(a, b))
-_logic(operator.or_, lambda builder, a, b: builder.or_(a, b))
 
 
 # --- memory ----------------------------------------------------------------------------------------------------------
@@ -199,7 +93,7 @@ def spread(typing, array, index):
 
     def emit(context, builder, signature, arguments):
         data = context.make_array(array)(context, builder, arguments[0]).data
-        return _filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
+        return filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
 
     return lanes(array, types.intp), emit
 
@@ -232,38 +126,30 @@ def _suffix(kind) -> str:
     return f"v{kind.count}{element}"
 
 
+def _square_root(builder, value):
+    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=(*FLAGS, "afn"))
+
+
+def _inverted(builder, value):
+    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=(*FLAGS, "afn"))
+
+
 @intrinsic
 def root(typing, x):
     """Square roots of a vector, to about the last digit."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        return _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
-
-    return x(x), emit
+    return x(x), lambda context, builder, signature, arguments: _square_root(builder, *arguments)
 
 
 @intrinsic
 def _quick_inverse(typing, x):
     """1/sqrt(x) in float32 where LLVM may take the machine's estimate with a Newton step: 2e-7."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        root = _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
-        return builder.fdiv(ir.Constant(kind, [1.0] * kind.count), root, flags=(*FLAGS, "afn"))
-
-    return x(x), emit
+    return x(x), lambda context, builder, signature, arguments: _inverted(builder, _square_root(builder, *arguments))
 
 
 @intrinsic
 def _quick_quotient(typing, x):
     """1/x in float32, likewise."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        return builder.fdiv(ir.Constant(kind, [1.0] * kind.count), arguments[0], flags=(*FLAGS, "afn"))
-
-    return x(x), emit
+    return x(x), lambda context, builder, signature, arguments: _inverted(builder, *arguments)
 
 
 def _converted(dtype):
@@ -343,7 +229,7 @@ def _inverse(x):
 def _chosen(sign):
     def chosen(typing, x, y):
         def emit(context, builder, signature, arguments):
-            a, b = (_filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
+            a, b = (filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
             return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
         return x(x, y), emit
@@ -384,7 +270,7 @@ def select(typing, mask, x, y):
     """x where the mask is set, y elsewhere; y may be a number."""
 
     def emit(context, builder, signature, arguments):
-        return builder.select(arguments[0], arguments[1], _filled(context, builder, arguments[2], signature.args[2], x))
+        return builder.select(arguments[0], arguments[1], filled(context, builder, arguments[2], signature.args[2], x))
 
     return x(mask, x, y), emit
 
@@ -478,7 +364,7 @@ def polynomial(typing, coefficients, x):
         def constant(k):
             number = builder.extract_value(values, k)
             if isinstance(x, Lanes):
-                return _filled(context, builder, number, kinds[k], x)
+                return filled(context, builder, number, kinds[k], x)
             return context.cast(builder, number, kinds[k], x)
 
         def chain(powers, y):
@@ -503,7 +389,7 @@ def fill(typing, number, array):
     lanes = Lanes(array.dtype, COUNT[array.dtype])
 
     def emit(context, builder, signature, arguments):
-        return _filled(context, builder, arguments[0], number, lanes)
+        return filled(context, builder, arguments[0], number, lanes)
 
     return lanes(number, array), emit
 

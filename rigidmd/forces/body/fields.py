@@ -74,17 +74,34 @@ def _add_steady_force(term, state, load, tally):
         for k in range(len(load.torque_body)):
             add_torque(term.point, state.rotation[k], term.force, load.torque_body[k])
         if tally is not None:
-            for i in range(3):
-                x = 0.0
-                if len(state.position):
-                    x += state.position[0, i]
-                if len(state.rotation):
-                    q = state.rotation[0]
-                    x += q[i, 0] * term.point[0] + q[i, 1] * term.point[1] + q[i, 2] * term.point[2]
-                tally[0] -= term.force[i] * x
+            tally[0] += steady_energy(term, state.position, state.rotation)
         return OK
 
     return add_steady_force
+
+
+@kernel(inline=True)
+def steady_energy(term, position, rotation):
+    """-F . (X + Q point) of the one body; position and rotation as in State, empty where the body has none."""
+    energy = 0.0
+    for i in range(3):
+        x = 0.0
+        if len(position):
+            x += position[0, i]
+        if len(rotation):
+            q = rotation[0]
+            x += q[i, 0] * term.point[0] + q[i, 1] * term.point[1] + q[i, 2] * term.point[2]
+        energy -= term.force[i] * x
+    return energy
+
+
+@kernel(outer=True)
+def steady_energies(term, position, rotation):
+    """`steady_energy` (t,) over time: arrays as in State, stacked along a new axis 0."""
+    energy = np.empty(len(position))
+    for t in range(len(energy)):
+        energy[t] = steady_energy(term, position[t], rotation[t])
+    return energy
 
 
 @kernel(inline=True)

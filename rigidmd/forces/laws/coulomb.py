@@ -9,7 +9,7 @@ from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.compile.lanes import inverse_root, load, zeros
 from rigidmd.forces.laws.endings import SWITCHES, Name, Polynomial, Shape, ended, ending, shape_of
 from rigidmd.forces.pairs import loop as pairs
-from rigidmd.units import COULOMB
+from rigidmd.units import COULOMB_CHARGE
 
 
 class ReactionField(NamedTuple):
@@ -44,7 +44,7 @@ def reaction_field(
     # A switching function multiplies what is left at the cut-off, and that must be little: the energy is first shifted
     # to zero there. Unshifted, two unit charges would lose 230 kJ/mol between 8 and 9 Å.
     end = ending("shift" if name in SWITCHES else name, shape, at)
-    return ReactionField(cutoff, shape, end, field, charge_e * sqrt(COULOMB))
+    return ReactionField(cutoff, shape, end, field, charge_e * COULOMB_CHARGE)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
@@ -73,12 +73,7 @@ def _pair(law, i, j, r2):
 def _arrange(law, arranged, order):
     if not is_a(law, ReactionField):
         return None
-
-    def arrange(law, arranged, order):
-        for slot, i in enumerate(order):
-            arranged.charge[slot] = law.charge[i]
-
-    return arrange
+    return lambda law, arranged, order: pairs.into_slots(law.charge, arranged.charge, order)
 
 
 def self_energy(law: ReactionField, position: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from scipy.special import erfc, ive
 from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.compile.lanes import inverse_root, load, polynomial, zeros
 from rigidmd.forces.pairs import loop as pairs
-from rigidmd.units import COULOMB
+from rigidmd.units import COULOMB_CHARGE
 
 #: Largest error of a polynomial, relative to the function at r = 0, by the precision of the lanes: less than rounding
 #: in its evaluation makes, 1.5e-7 and 5e-15 for alpha times the cut-off up to 4.
@@ -100,7 +100,7 @@ def screened_coulomb(
     would only take time; 1/Å²
     """
     shift = float(erfc(alpha * cutoff)) / cutoff if shifted else 0.0
-    return ScreenedCoulomb(cutoff, alpha, shift, error, screening(alpha, cutoff), charge_e * sqrt(COULOMB))
+    return ScreenedCoulomb(cutoff, alpha, shift, error, screening(alpha, cutoff), charge_e * COULOMB_CHARGE)
 
 
 class DampedShiftedForce(NamedTuple):
@@ -127,7 +127,7 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
     x = alpha * cutoff
     slope = float(erfc(x)) / cutoff**2 + 2 * alpha / sqrt(pi) * exp(-(x**2)) / cutoff
     shift = -float(erfc(x)) / cutoff - slope * cutoff
-    return DampedShiftedForce(cutoff, alpha, screening(alpha, cutoff), slope, shift, charge_e * sqrt(COULOMB))
+    return DampedShiftedForce(cutoff, alpha, screening(alpha, cutoff), slope, shift, charge_e * COULOMB_CHARGE)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
@@ -165,12 +165,7 @@ def _pair(law, i, j, r2):
 def _arrange(law, arranged, order):
     if not (is_a(law, ScreenedCoulomb) or is_a(law, DampedShiftedForce)):
         return None
-
-    def arrange(law, arranged, order):
-        for slot, i in enumerate(order):
-            arranged.charge[slot] = law.charge[i]
-
-    return arrange
+    return lambda law, arranged, order: pairs.into_slots(law.charge, arranged.charge, order)
 
 
 def damped_self_energy(law: DampedShiftedForce, position: np.ndarray) -> float:

@@ -42,11 +42,10 @@ from rigidmd.forces.pairs.lists import (
     image_of,
     lanes_of_first,
     lanes_of_second,
-    list_code,
     most_needed,
-    update_list,
 )  # fmt: skip
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
+from rigidmd.forces.pairs.update import list_code, update_list
 from rigidmd.forces.terms import Setup
 
 
@@ -149,6 +148,13 @@ def pair(law, i, j, r2):
 def arrange(law, arranged, order):
     """Fill the numbers that an arranged law has for each slot from those of the sites that are there now."""
     raise TypeError("compiled code only")
+
+
+@kernel
+def into_slots(of_sites, in_slots, order):
+    """Copy numbers (s,) of the sites into the slots (slots,) that the sites have by `order`."""
+    for slot, i in enumerate(order):
+        in_slots[slot] = of_sites[i]
 
 
 @implements(terms.add_forces, counted=False)

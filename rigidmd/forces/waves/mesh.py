@@ -276,22 +276,22 @@ def _few(spline, array, index):
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def weights_at(spline, part):
     """Weights of the grid points from the corner on, as a vector."""
-    order = len(spline.nodes)
-    width = len(spline.value) // order
-    found = few(spline, spline.value, width * (order - 1))
-    for j in range(order - 2, -1, -1):
-        found = found * part + few(spline, spline.value, width * j)
-    return found
+    return _polynomials(spline, spline.value, len(spline.nodes), part)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def slopes_at(spline, part):
     """Their derivatives, per cell."""
-    order = len(spline.nodes)
-    width = len(spline.value) // order
-    found = few(spline, spline.slope, width * (order - 2))
-    for j in range(order - 3, -1, -1):
-        found = found * part + few(spline, spline.slope, width * j)
+    return _polynomials(spline, spline.slope, len(spline.nodes) - 1, part)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def _polynomials(spline, coefficients, terms, part):
+    """Polynomials in `part`, one in each lane, of as many terms as there are vectors of coefficients."""
+    width = len(coefficients) // terms
+    found = few(spline, coefficients, width * (terms - 1))
+    for j in range(terms - 2, -1, -1):
+        found = found * part + few(spline, coefficients, width * j)
     return found
 
 
@@ -333,33 +333,30 @@ def _spread(parcel, block):
 
 @task(counted=False)
 def _convolve(parcel, block):
-    """From waves of charge to waves of potential, for a block of rows."""
-    _alpha, _charge, _spline, mesh = opened(parcel)
-    low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
-    wave = mesh.wave
-    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
-    for x in range(wave.shape[0]):
-        for y in range(low, high):
-            for z in range(wave.shape[2]):
-                wave[x, y, z] *= mesh.influence[x, y, z]
-    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
+    alpha, _charge, _spline, mesh = opened(parcel)
+    convolve_block(alpha, mesh, None, block)
 
 
 @task(counted=False)
 def _convolve_and_count(parcel, block):
-    """The same, with energy and virial."""
     alpha, _charge, _spline, mesh = opened(parcel)
+    convolve_block(alpha, mesh, mesh.tallies, block)
+
+
+@kernel(inline=True, counted=False)
+def convolve_block(alpha, mesh, tallies, block):
+    """From waves of charge to waves of potential for a block of rows; their energy and virial into `tallies`."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
     wave, of, b = mesh.wave, mesh.alias, mesh.reciprocal
-    tally = mesh.tallies[block]
-    mesh.tallies[block] = 0.0
+    if tallies is not None:
+        tallies[block] = 0.0
     c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
     for x in range(wave.shape[0]):
         for y in range(low, high):
             for z in range(wave.shape[2]):
                 value, strength = wave[x, y, z], mesh.influence[x, y, z]
                 wave[x, y, z] = value * strength
-                if x + y + z > 0:
+                if tallies is not None and x + y + z > 0:
                     n = (of[0, 0, x], of[1, 0, y], of[2, 0, z])
                     k = (
                         n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
@@ -371,8 +368,8 @@ def _convolve_and_count(parcel, block):
                     share = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
                     energy = share * strength * (real * real + imaginary * imaginary)
-                    tally[0] += energy
-                    add_wave_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+                    tallies[block, 0] += energy
+                    add_wave_virial(tallies[block], energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
     c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
