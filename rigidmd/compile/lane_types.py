@@ -1,6 +1,6 @@
-"""The Numba types of SIMD vectors and of masks, and their operators; `lanes` has the functions.
+"""The Numba types of SIMD vectors and masks, and their operators; `lanes` has the functions.
 
-A value of these types is an LLVM vector. Everything is portable LLVM, which becomes AVX-512, AVX2, SSE or NEON.
+A value of these types is an LLVM vector. All code is portable LLVM and is compiled to AVX-512, AVX2, SSE or NEON.
 """
 
 import operator
@@ -50,14 +50,14 @@ class MaskModel(models.PrimitiveModel):
 
 
 def _common(a, b) -> Lanes | None:
-    """The vector type of two operands, at least one of them a vector, the other one like it or a number."""
+    """The vector type of two operands: one is a vector, the other the same type or a scalar; otherwise None."""
     if isinstance(b, Lanes):
         a, b = b, a
     return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
 
 
 def filled(context, builder, value, kind, lanes):
-    """The value as a vector: itself, or a number in every lane."""
+    """The value as a vector: itself, or a scalar in every lane."""
     if kind == lanes:
         return value
     number = context.cast(builder, value, kind, lanes.dtype)
@@ -68,7 +68,7 @@ def filled(context, builder, value, kind, lanes):
 
 
 def _operator(functions, emit, result=lambda lanes: lanes):
-    """Teach Numba a binary operator: emit(builder, left, right) of two vectors."""
+    """Define a binary operator for Numba by emit(builder, left, right) of two vectors."""
     for function in functions:
 
         @type_callable(function)

@@ -63,9 +63,7 @@ class Inner(Kernel):
     """
 
     def __call__(self, *arguments):
-        raise TypeError(
-            f"{self.py_func.__name__} can be called from compiled code only; for Python, use kernel(outer=True)"
-        )
+        raise TypeError(f"{self.py_func.__name__} is for compiled code only; for Python, use kernel(outer=True)")
 
 
 def _opened_cache(function: Callable) -> FunctionCache:

@@ -27,12 +27,12 @@ from rigidmd.forces.pairs.clusters import Clusters, clusters_of
 from rigidmd.forces.pairs.tree import BoxTree, box_tree
 
 IMAGE_BITS = 6
-IMAGES = 1 << IMAGE_BITS  # room for those of a box that can be within reach
+IMAGES = 1 << IMAGE_BITS  # enough for all images of a box within reach
 MASK_BITS = 16  # of one site; no vector has more lanes
-SHELLS = 15  # the first holds what is inside the cut-off when the list is built, the others parts of the skin
+SHELLS = 15  # the first: inside the cut-off when the list is built; the others divide the skin
 MOST_BEYOND = 2**16 - 1
 LONGEST_SKIN = 0.45  # of the smallest edge
-ROUNDING = 1e-5  # relative; float32 distances are good to 1e-6
+ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
 
 # Columns of PairList.needed and PairList.counters.
@@ -43,43 +43,44 @@ USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one law.
 
-    An entry is IMAGES * cluster + image; `shift` says where the image is.
+    An entry is the integer IMAGES * cluster + image; `shift` has the displacement of the image.
     """
 
     cutoff: float  # Å
     skin: float  # Å
     shells_per_A: float  # beyond the cut-off
-    reach2: float  # squared distance within which sites of one group lie, Å²; may be infinite
-    group: np.ndarray  # (s,) pairs inside one group are left out
-    cell: np.ndarray  # (3, 3) the cell that it was last used with, Å
+    reach2: float  # square of the largest distance between sites of one group, Å²; may be infinite
+    group: np.ndarray  # (s,) group of each site; pairs inside one group are excluded
+    cell: np.ndarray  # (3, 3) the cell at the last use, Å
     clusters: Clusters
     tree: BoxTree
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
-    row: np.ndarray  # (rows,) int32 row r, of slots 2 r and 2 r + 1, ends in entries[b] at row[r], where r + 1 begins
-    beyond: np.ndarray  # (rows, SHELLS) uint16 so many of its entries, at its end, are beyond shell k
+    row: np.ndarray  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
+    beyond: np.ndarray  # (rows, SHELLS) uint16 how many entries at the end of a row are beyond shell k
     entries: np.ndarray  # (blocks, capacity) int32
-    special: np.ndarray  # (rows,) int32 as `row`, in masked[b]
-    masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and as bits the lanes that count for each site of the row
-    needed: np.ndarray  # (blocks, 3) room expected or asked for: entries, masked entries, clusters from the first on
-    counters: np.ndarray  # (4,) usable (0 or 1); builds; status of the last update; images
+    special: np.ndarray  # (rows,) int32 end of each row in masked[b]
+    masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
+    needed: np.ndarray  # (blocks, 3) room expected or needed: entries, masked entries, clusters from the first on
+    counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
 
 
 @kernel(inline=True)
 def cluster_of(entry):
-    """The cluster that an entry names."""
+    """The cluster of an entry."""
     return entry >> IMAGE_BITS
 
 
 @kernel(inline=True)
 def image_of(entry):
-    """The image of it."""
+    """The image of an entry."""
     return entry & (IMAGES - 1)
 
 
 def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
-    """A list that will be built at its first use, with about the room that sites spread evenly would need.
+    """A list that is built at its first use, with about the room that evenly spread sites would need.
 
-    cell : (3, 3). reach : how far apart sites of one group can be, Å, infinite if nobody knows
+    cell : (3, 3)
+    reach : largest distance between sites of one group, Å; infinite if it is not known
     """
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.farthest), len(clusters.order)
@@ -103,19 +104,19 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         beyond=np.zeros((rows, SHELLS), np.uint16),
         entries=np.empty((blocks, room), np.int32),
         special=np.zeros(rows, np.int32),
-        masked=np.empty((blocks, ceil(1.5 * rows / blocks), 2), np.int32),  # 1.1 (argon) to 1.5 (water) a row: measured
+        masked=np.empty((blocks, ceil(1.5 * rows / blocks), 2), np.int32),  # measured per row: argon 1.1, water 1.5
         needed=needed,
         counters=np.zeros(4, np.int64),
     )
 
 
 def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
-    """The skin, or less: longer, second images could come near between builds, and IMAGES would be too few."""
+    """The skin, shortened if second images could come near between builds; IMAGES would then not be enough."""
     return min(skin, LONGEST_SKIN * cell.diagonal().min()) if cutoff < inf else inf
 
 
 def _clusters_met(cell: np.ndarray, count: int, radius: float) -> float:
-    """Entries of a row to be expected; 0 where nobody knows the density, so that the first build finds out."""
+    """Expected number of entries in a row; 0 if the density is not known, and the first build then finds it."""
     if radius == inf:
         return count / 2 + 1
     volume = cell.diagonal().prod()
@@ -123,11 +124,11 @@ def _clusters_met(cell: np.ndarray, count: int, radius: float) -> float:
         return 0.0
     edge = np.cbrt(volume / count)
     near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3  # Steiner's formula
-    return min(0.42 * near / edge**3, count / 2) + 1  # half of them, a sixth less: measured, cubes touch with corners
+    return min(0.42 * near / edge**3, count / 2) + 1  # half of them; a sixth less: measured, cubes have corners
 
 
 def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
-    """Clusters from the first of a block to the last that its rows are expected to meet."""
+    """Expected number of clusters from the first of a block to the last in its rows."""
     volume = cell.diagonal().prod()
     if volume == inf or radius == inf:
         return 0
@@ -136,9 +137,9 @@ def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) ->
 
 
 def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
-    """The list with, and a tenth to spare, the room its last build asked for, and a skin that the cell has room for.
+    """The list with the room that its last build needed and a tenth more, and with a skin that fits into the cell.
 
-    Raises SimulationError where the cell has become too small for the cut-off.
+    Raises SimulationError if the cell has become too small for the cut-off.
     """
     if pairs.counters[STATUS] == CELL_CHANGED:
         if 2 * pairs.cutoff > cell.diagonal().min():
@@ -159,7 +160,7 @@ def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
 
 @kernel
 def most_needed(pairs, k):
-    """The most that any block needs of what `needed[:, k]` counts."""
+    """The largest of `needed[:, k]` over the blocks."""
     most = 0
     for block in range(len(pairs.needed)):
         most = max(most, pairs.needed[block, k])
@@ -168,7 +169,7 @@ def most_needed(pairs, k):
 
 @kernel(inline=True)
 def farthest(pairs):
-    """How far the site that went farthest has gone since the list was built, Å; infinite if the list is not good."""
+    """The largest displacement of any site since the list was built, Å; infinite if the list is no longer valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
         found = max(found, pairs.clusters.farthest[block])
@@ -177,7 +178,7 @@ def farthest(pairs):
 
 @kernel(inline=True)
 def end_of_row(pairs, r, farthest):
-    """Where those entries of a row end that can hold a site inside the cut-off when none has gone farther."""
+    """End of the entries of row r that can hold a site inside the cut-off; `farthest` as above, Å."""
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
     shell = min(SHELLS - 1, ceil((moved + farthest) * pairs.shells_per_A))
     return pairs.row[r] - pairs.beyond[r, shell]
@@ -185,11 +186,11 @@ def end_of_row(pairs, r, farthest):
 
 @kernel(inline=True)
 def lanes_of_first(bits):
-    """The lanes of a masked entry that count for the first site of the row."""
+    """The lanes of a masked entry that count for the first site of the row, as bits."""
     return bits & ((1 << MASK_BITS) - 1)
 
 
 @kernel(inline=True)
 def lanes_of_second(bits):
-    """Those that count for the second."""
+    """The lanes of a masked entry that count for the second site of the row, as bits."""
     return bits >> MASK_BITS

@@ -36,18 +36,18 @@ from rigidmd.forces.pairs.tree import within_reach
 
 
 class Scratch(NamedTuple):
-    """What the rows of one cluster are made with."""
+    """Scratch arrays for the rows of one cluster."""
 
     stack: np.ndarray  # (levels, 2) for within_reach
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     entry: np.ndarray  # (room,) candidates
-    shell: np.ndarray  # (room * lanes,) where candidate n is for the row of site i, at n * lanes + i: up to which shell
-    end: np.ndarray  # (SHELLS,) of each shell of a row
-    inner: np.ndarray  # (rows of a cluster, room) entries in the first shell of a row
-    outer: np.ndarray  # (rows of a cluster, room) candidates in the others
-    special: np.ndarray  # (rows of a cluster, room) entries that need a mask with a row
-    count: np.ndarray  # (3, rows of a cluster) how many are in inner, outer, special of each row
+    shell: np.ndarray  # (room * lanes,) shell, not rounded, of candidate n in the row of site i, at n * lanes + i
+    end: np.ndarray  # (SHELLS,) end of each shell of a row
+    inner: np.ndarray  # (rows of a cluster, room) entries of the first shell
+    outer: np.ndarray  # (rows of a cluster, room) candidates of the other shells
+    special: np.ndarray  # (rows of a cluster, room) entries that need a mask
+    count: np.ndarray  # (3, rows of a cluster) number in inner, outer, special of each row
 
 
 @kernel
@@ -69,9 +69,9 @@ def _scratch(pairs, room):
 
 @kernel(inline=True)
 def fill_block(pairs, block, room):
-    """Rows of one block. Entries beyond the room are counted, not stored.
+    """Fill the rows of one block. Entries beyond the room are counted but not stored.
 
-    Returns 0, or how much room is needed for candidates; then nothing has been done.
+    Returns 0, or the room needed for candidates if it is too small; the rows are then incomplete.
     """
     clusters = pairs.clusters
     scratch = _scratch(pairs, room)
@@ -90,9 +90,9 @@ def fill_block(pairs, block, room):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def _find_candidates(pairs, c, scratch):
-    """Clusters and images that stand in a cluster's rows and whose box is within reach of its box; how many.
+    """Candidates for a cluster's rows: clusters and images whose box is within reach of its box. Returns their number.
 
-    There may be more than there is room for.
+    The number may exceed the room.
     """
     tree = pairs.tree
     count = len(pairs.clusters.origin) // 4
@@ -125,9 +125,10 @@ def _find_candidates(pairs, c, scratch):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
-    """Rows of a cluster from its candidates.
+    """Fill the rows of a cluster from its candidates.
 
-    Entries and masked entries of the block so far, and how far ahead on the ring the farthest cluster is.
+    Returns the numbers of entries and masked entries of the block so far, and how far ahead on the ring the farthest
+    candidate is.
     """
     width = width_of(pairs.clusters.local)
     rows = width // 2
@@ -159,9 +160,9 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
 
 @kernel(inline=True)
 def _fill_row(beyond, entries, filled, scratch, own, width):
-    """Write the entries of a row, shell by shell; how many there are now in the block.
+    """Write the entries of a row, shell by shell; returns the number of entries in the block so far.
 
-    Beyond a shell are at most so many as `beyond` can hold: any more of them count as if they were inside.
+    `beyond` is limited by its type: entries above that limit count as if they were inside the shell.
     """
     inner, outer, end = scratch.inner[own], scratch.outer[own], scratch.end
     inners, outers = scratch.count[0, own], scratch.count[1, own]
@@ -188,9 +189,10 @@ def _fill_row(beyond, entries, filled, scratch, own, width):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _measure(pairs, c, scratch, n):
-    """In which shell of each row of a cluster candidate n is, or that they need a mask.
+    """Add candidate n to a shell of each row of a cluster, or to the entries that need a mask.
 
-    The sites are the lanes here, and the candidate's sites come one after the other: no sums across lanes, no guesses.
+    The sites of the cluster are the lanes, and the loop runs over the candidate's sites: there are no sums across lanes
+    and no unpredictable branches.
     """
     clusters = pairs.clusters
     local = clusters.local
@@ -202,7 +204,7 @@ def _measure(pairs, c, scratch, n):
     x = load(local, at) + _apart(pairs, c, other, image, 0)
     y = load(local, at + width) + _apart(pairs, c, other, image, 1)
     z = load(local, at + 2 * width) + _apart(pairs, c, other, image, 2)
-    # |x|² - 2 x y + |y|²: three multiply-adds for each y. What that rounds, a few digits of |x|² + |y|², is taken off.
+    # |x|² - 2 x y + |y|²: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|², is subtracted.
     x2 = x * x + y * y + z * z
     x, y, z = -2.0 * x, -2.0 * y, -2.0 * z
     nearest2 = fill(inf, local)
@@ -237,7 +239,7 @@ def _measure(pairs, c, scratch, n):
 
 @kernel(inline=True)
 def _append(rows, count, k, value, which, width):
-    """Add a value to the lists of some rows of a cluster without branches: half of them would be guessed wrong."""
+    """Append a value to the lists of some rows of a cluster, without branches: half of them would be mispredicted."""
     for own in range(width // 2):
         rows[own, count[k, own]] = value
         count[k, own] += which >> 2 * own & 1
@@ -245,7 +247,7 @@ def _append(rows, count, k, value, which, width):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _mask_of_lanes(pairs, i, entry, radius2):
-    """The sites of a cluster that site i may meet, as bits; 0 if none of them is inside the radius."""
+    """The sites of an entry's cluster that interact with site i, as bits; 0 if none is inside the radius."""
     if i >= len(pairs.group):
         return 0
     clusters = pairs.clusters
@@ -269,12 +271,12 @@ def _mask_of_lanes(pairs, i, entry, radius2):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _apart(pairs, c, other, image, k):
-    """From the origin of another cluster to that of cluster c, moved by an image, Å."""
+    """Component k of the vector from the image of another cluster's origin to the origin of cluster c, Å."""
     clusters = pairs.clusters
     return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]
 
 
 @kernel(inline=True)
 def _filler(pairs):
-    """Slots of the last cluster that hold no site."""
+    """Number of slots in the last cluster that hold no site."""
     return len(pairs.clusters.order) - len(pairs.group)

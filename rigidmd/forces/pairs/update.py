@@ -33,7 +33,7 @@ LOST = 1e9  # list radii from the origin; no radius is longer than a box, so 32 
 
 
 def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
-    """The machine code that keeps a list of sites."""
+    """The machine code of the tasks that keep a list."""
     placed = (pairs, sites, EXAMPLE[0])
     return Code(
         place=(_place, placed),
@@ -49,7 +49,7 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
 
 @kernel(counted=False)
 def update_list(pairs, code, sites, state):
-    """Bring clusters to where the molecules are, and build the list anew if it is no longer good. A status code."""
+    """Move the clusters with the molecules, and rebuild the list if it is no longer valid; a status code."""
     blocks = len(pairs.needed)
     parcel = packed(pairs)
     placed = packed((pairs, sites, state))
@@ -105,7 +105,7 @@ def _bin(parcel, block):
 
 @task()
 def _prepare(parcel, block):
-    """Sort the sites for a new list; a status code into counters[2]."""
+    """Sort the sites for a new list; a status code into counters[STATUS]."""
     pairs = opened(parcel)
     pairs.counters[STATUS] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
     pairs.counters[IMAGES_FOUND] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
@@ -113,10 +113,10 @@ def _prepare(parcel, block):
 
 @kernel
 def _find_images(cell, radius, shift):
-    """Shifts of the images of the brick (see clusters) that are within a radius of it; how many. No shift comes first.
+    """Shifts of the images of the brick (see `clusters`) within a radius of it, and their number. Shift 0 is the first.
 
-    Bricks stand in layers along c, in rows along b; 27 in an upright box, up to 48 in a slanted one, the radius being
-    no longer than any edge.
+    Bricks are stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27
+    images in an orthorhombic box and up to 48 in a triclinic one.
     """
     found = 1
     for n in range(3):
@@ -143,7 +143,7 @@ def _find_images(cell, radius, shift):
 
 @kernel
 def _images_along(cell, k, offset, radius):
-    """First and last multiple of edge k that brings a brick, now at an offset, within a radius of the one at 0."""
+    """First and last multiple of edge k that brings a brick at an offset within a radius of the brick at 0."""
     edge = cell[k, k]
     if edge == inf:
         return 0, 0
