@@ -31,9 +31,7 @@ class Clusters(NamedTuple):
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved: np.ndarray  # (slots,) displacement of each site since then, Å
     farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
-    extent: (
-        np.ndarray
-    )  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
+    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:

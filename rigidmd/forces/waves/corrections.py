@@ -1,4 +1,4 @@
-"""The terms of an Ewald sum other than the sums over pairs and over k: its self energy, net charge and surface."""
+"""The corrections of an Ewald sum, beside the sums over pairs and over k; `ewald` has the whole formula."""
 
 from math import pi, sqrt
 from typing import NamedTuple
@@ -15,13 +15,13 @@ from rigidmd.forces.terms import Setup
 
 
 class Background(NamedTuple):
-    """The charge, spread evenly, that makes a charged box neutral."""
+    """The uniform background charge that neutralises a charged box."""
 
     strength: float  # energy times the volume, u Å⁵/ps²
 
 
 def background(square: float, alpha: float) -> Background:
-    """The term for a net charge whose square is given, in units where q²/r is an energy in u Å²/ps²."""
+    """The term for the square of a net charge, in units where q²/r is an energy in u Å²/ps²."""
     return Background(-pi / (2 * alpha**2) * square)
 
 
@@ -41,7 +41,7 @@ def _add_background(term, state, load, tally):
 
 
 class SurfaceDipole(NamedTuple):
-    """The medium around a large sphere of boxes answers its dipole: 2 pi/((2 eps + 1) V) |sum q r|²."""
+    """Response of the medium around a large sphere of boxes to its dipole: energy 2 pi/((2 eps + 1) V) |sum q r|²."""
 
     strength: float  # 2 pi/(2 eps + 1)
     charge: np.ndarray  # (s,)
@@ -84,7 +84,7 @@ def _add_surface_dipole(term, state, load, tally):
                 term.site_force[i, k] = -2 * share * term.charge[i] * dipole
             energy += share * dipole * dipole
         if tally is not None:
-            # at a fixed volume the energy follows the sites, f (x) x; it also falls with the volume
+            # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to 1/V
             for k in (0, 1, 5, 9):
                 tally[k] += energy
             for i in range(len(term.charge)):
@@ -99,12 +99,15 @@ def _add_surface_dipole(term, state, load, tally):
 
 
 def self_energy(charge: np.ndarray, alpha: float) -> float:
-    """Energy of charges (s,), in units where q²/r is an energy in u Å²/ps², less that of their own images near them."""
+    """Energy that removes the interaction of each charge with its own screening charge.
+
+    charge (s,) in units where q²/r is an energy in u Å²/ps²
+    """
     return -alpha / sqrt(pi) * float(charge @ charge)
 
 
 def intramolecular_energy(charge: np.ndarray, position: np.ndarray, alpha: float) -> float:
-    """What the sum over k has of the pairs inside one molecule, taken out; position (s, 3) in Å. Constant."""
+    """Energy that removes the pairs inside one molecule from the sum over k, a constant; position (s, 3) in Å."""
     i, j = np.triu_indices(len(charge), 1)
     r = np.linalg.norm(position[i] - position[j], axis=1)
     return -float(np.sum(charge[i] * charge[j] * erf(alpha * r) / r))

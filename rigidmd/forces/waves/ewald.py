@@ -1,18 +1,19 @@
-"""Ewald sums: charges in a periodic box and all their images, however far.
+"""Ewald sums: charges in a periodic box with all their images, and the sum over wave vectors one by one.
 
-    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r                          screened.ScreenedCoulomb
-      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²,  S(k) = sum q_i exp(i k r_i)   EwaldSum, or pme.Pme
-      - alpha/sqrt(pi) sum q_i²                                                             self_energy
-      - sum over pairs inside molecules q_i q_j erf(alpha r)/r                              intramolecular_energy
-      - pi/(2 V alpha²) (sum q_i)²                                                          Background
-      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                                                 SurfaceDipole
+    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r                       screened.ScreenedCoulomb
+      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|², S(k) = sum q_i exp(i k r_i)EwaldSum, or mesh.Pme
+      - alpha/sqrt(pi) sum q_i²                                                         corrections.self_energy
+      - sum over pairs inside molecules q_i q_j erf(alpha r)/r                          corrections.intramolecular_energy
+      - pi/(2 V alpha²) (sum q_i)²                                                      corrections.Background
+      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                                             corrections.SurfaceDipole
 
-(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with q in units where q²/r is an energy. The last term is
-that of a large sphere of boxes in a medium of permittivity eps; it is 0 for a conductor, "tin foil", the usual choice.
+(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with q in units where q²/r is an energy. The last term
+describes a large sphere of boxes in a medium of permittivity eps; it is 0 for a conductor ("tin foil"), the usual
+choice.
 
-The sum over k has the pairs inside molecules too. In a rigid body the force between such a pair has no net force and no
-torque, so all there is to take out is the constant energy. The cell may have any shape: k = 2 pi (n_x, n_y, n_z) of the
-reciprocal cell.
+The sum over k includes the pairs inside molecules. In a rigid body such a pair exerts no net force and no torque, so
+only its energy, a constant, has to be subtracted. The cell may have any shape: k is 2 pi (n_x, n_y, n_z) times the
+reciprocal edges.
 """
 
 from math import pi
@@ -33,24 +34,24 @@ WIDTH = lane_count(np.float64)
 
 
 class WaveSums(NamedTuple):
-    """Where an Ewald sum is added up. Sites are filled up to whole vectors with charges 0."""
+    """Arrays of an Ewald sum. The sites are padded to whole vectors with charges of 0."""
 
-    cell: np.ndarray  # (3, 3) that the strengths are for
+    cell: np.ndarray  # (3, 3) the cell of the present strengths
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     charge: np.ndarray  # (slots,)
     cosine: np.ndarray  # (3, largest n + 1, slots) of 2 pi n times the fractional coordinate
     sine: np.ndarray
-    strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k² for either of n, -n, the energy of |S|² of both
-    real: np.ndarray  # (waves,) of S(k), then of strength S(k)
+    strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k²: times |S|², the energy of n and -n together
+    real: np.ndarray  # (waves,) real part of S(k), then of 2 strength S(k)
     imaginary: np.ndarray
-    push: np.ndarray  # (3, slots) forces, as vectors of sites
+    push: np.ndarray  # (3, slots) forces on the sites, by component
     tallies: np.ndarray  # (blocks, 10)
 
 
 class EwaldSum(NamedTuple):
-    """The sum over k vectors one by one."""
+    """The sum over wave vectors one by one."""
 
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
@@ -58,7 +59,7 @@ class EwaldSum(NamedTuple):
     waves: Waves
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
-        """Room for the sums; their arithmetic is double whatever the setup says."""
+        """Room for the sums, which are always in double precision."""
         s, over = len(self.charge), self.waves
         slots = -(-s // WIDTH) * WIDTH
         angles = (3, int(over.most.max()) + 1, slots)
@@ -101,7 +102,7 @@ class EwaldWorkspace(NamedTuple):
 
 @kernel
 def invert_cell(cell, reciprocal):
-    """Rows 2 pi times the reciprocal edges of a cell (3, 3) into `reciprocal`; the volume."""
+    """Write 2 pi times the reciprocal edges of a cell (3, 3) into the rows of `reciprocal`; returns the volume."""
     volume = 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -160,7 +161,7 @@ def _set_strengths(over, own, alpha, volume):
 
 @task(counted=False)
 def _turn(parcel, block):
-    """Cosines and sines of a share of the sites, by the angle sum: each power costs one complex product."""
+    """Cosines and sines for a share of the sites, by recurrence: one complex product for each multiple of the angle."""
     _alpha, over, own = opened(parcel)
     blocks, s = len(own.tallies), len(own.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
@@ -193,7 +194,7 @@ def _times(a, b):
 
 @task(fastmath=PAIR_FLAGS, counted=False)
 def _sum(parcel, block):
-    """S(k) of the columns of a block, its energy and virial; times the strength, for the forces."""
+    """S(k) of the columns of a block, with energy and virial; S(k) is then multiplied for the forces."""
     alpha, over, own = opened(parcel)
     width = width_of(own.charge)
     own.tallies[block] = 0.0
@@ -202,7 +203,7 @@ def _sum(parcel, block):
         for n in range(count):
             own.real[first + n] = 0.0
             own.imaginary[first + n] = 0.0
-        # sites in batches that stay in the first cache for all of a column
+        # sites are taken in batches that stay in the L1 cache for a whole column
         for batch in range(0, len(own.charge), 32 * width):
             end = min(batch + 32 * width, len(own.charge))
             for n in range(count):
@@ -239,8 +240,10 @@ def _count_wave(own, alpha, nx, ny, nz, wave, block):
 
 @kernel(inline=True)
 def add_wave_virial(tally, energy, k, slope):
-    """Virial of a wave whose energy is that of |S|² exp(-k²/4 alpha²)/(k² V): energy (1 - slope k k), slope = 2/k² +
-    1/(2 alpha²), with S of sites that move with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)."""
+    """Add the virial energy (1 - slope k k) of a wave with an energy proportional to |S|² exp(-k²/4 alpha²)/(k² V).
+
+    slope = 2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)
+    """
     for row in range(3):
         for column in range(3):
             unit = 1.0 if row == column else 0.0
@@ -281,7 +284,7 @@ def _push(parcel, block):
 def sum_of(
     charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, over: Waves
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3); for once, nothing compiled."""
+    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in NumPy: for single uses."""
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     turns = position @ reciprocal.T
     energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))

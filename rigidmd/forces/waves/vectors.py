@@ -1,4 +1,4 @@
-"""Wave vectors k = 2 pi n of the reciprocal cell: which integers n an Ewald sum has, in columns along n_z."""
+"""The wave vectors of an Ewald sum: integer vectors n, in columns along n_z, with k = 2 pi n times reciprocal edges."""
 
 from math import pi
 from typing import NamedTuple
@@ -7,28 +7,29 @@ import numpy as np
 
 from rigidmd.compile import BLOCKS
 
-#: The basis of a cell that stands as it was described.
+#: The basis of a cell that was not changed from its description.
 AS_GIVEN = np.eye(3, dtype=int)
 
 
 class Waves(NamedTuple):
-    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns of n_z; the others are their opposites."""
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are their negatives."""
 
-    column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, where in the sum that one stands
-    count: np.ndarray  # (columns,) how many n_z there are
-    most: np.ndarray  # (3,) largest |n| of each axis
-    bounds: np.ndarray  # (blocks + 1,) columns of each block
+    column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, index of that vector in the sum
+    count: np.ndarray  # (columns,) number of n_z
+    most: np.ndarray  # (3,) largest |n| along each axis
+    bounds: np.ndarray  # (blocks + 1,) block b has columns bounds[b] ... bounds[b + 1] - 1
 
     @property
     def total(self) -> int:
-        """How many vectors there are, with their opposites."""
+        """Number of vectors, with their negatives."""
         return 2 * int(self.count.sum())
 
 
 def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = AS_GIVEN) -> Waves:
-    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` where it is given.
+    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if given.
 
-    basis (3, 3) : integers; both bound n in another cell of the lattice, and this cell's edges are `basis` times those
+    basis (3, 3) : integers; the edges of this cell are `basis` times those of another cell of the same lattice, and the
+        bounds apply to n in that cell
     """
     square = np.inf if largest_square is None else largest_square
 
@@ -42,10 +43,10 @@ def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: 
 def waves_within(
     reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = AS_GIVEN
 ) -> Waves:
-    """All n != 0 whose k is no longer than `radius` (1/Å), with |n_x|, |n_y|, |n_z| up to `limit` where it is given.
+    """All n != 0 with |k| up to `radius` (1/Å), and with |n_x|, |n_y|, |n_z| up to `limit` if given.
 
     reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
-    basis : of the limit, see `waves`
+    basis : for the limit, see `waves`
     """
     cell = 2 * pi * np.linalg.inv(reciprocal).T
     most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
@@ -58,7 +59,7 @@ def waves_within(
 
 
 def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """The n (..., 3) of the same waves in the cell of which `basis` makes this one."""
+    """The n (..., 3) of the same wave vectors in the other cell, see `waves`."""
     return n @ np.rint(np.linalg.inv(basis)).astype(int).T
 
 
