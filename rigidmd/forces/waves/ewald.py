@@ -1,15 +1,15 @@
 """Ewald sums: charges in a periodic box with all their images, and the sum over wave vectors one by one.
 
-    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r                       screened.ScreenedCoulomb
-      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|², S(k) = sum q_i exp(i k r_i)EwaldSum, or mesh.Pme
-      - alpha/sqrt(pi) sum q_i²                                                         corrections.self_energy
-      - sum over pairs inside molecules q_i q_j erf(alpha r)/r                          corrections.intramolecular_energy
-      - pi/(2 V alpha²) (sum q_i)²                                                      corrections.Background
-      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                                             corrections.SurfaceDipole
+    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r     screened.ScreenedCoulomb
+      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²           EwaldSum, or mesh.Pme
+      - alpha/sqrt(pi) sum q_i²                                       corrections.self_energy
+      - sum over pairs inside molecules q_i q_j erf(alpha r)/r        corrections.intramolecular_energy
+      - pi/(2 V alpha²) (sum q_i)²                                    corrections.Background
+      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                           corrections.SurfaceDipole
 
-(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with q in units where q²/r is an energy. The last term
-describes a large sphere of boxes in a medium of permittivity eps; it is 0 for a conductor ("tin foil"), the usual
-choice.
+(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with S(k) = sum q_i exp(i k r_i), and q in units where
+q²/r is an energy. The last term describes a large sphere of boxes in a medium of permittivity eps; it is 0 for a
+conductor ("tin foil"), the usual choice.
 
 The sum over k includes the pairs inside molecules. In a rigid body such a pair exerts no net force and no torque, so
 only its energy, a constant, has to be subtracted. The cell may have any shape: k is 2 pi (n_x, n_y, n_z) times the
