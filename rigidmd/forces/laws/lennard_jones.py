@@ -194,7 +194,7 @@ def tail(law: LennardJones) -> Tail:
 
     U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated). For endings that shift the whole
     potential the constant inside counts too, as in GROMACS' dispersion correction (Allen & Tildesley 2017, 2.8). All N²
-    pairs are counted, including those inside a molecule: a relative error of 1/(number of molecules).
+    pairs are counted, also those of a molecule with itself: a relative error of 1/(number of molecules).
     """
     count = np.bincount(law.kind, minlength=len(law.c6))
     energy = pressure = 0.0
