@@ -67,7 +67,9 @@ def test_a_dispatcher_opens_its_cache_only_to_compile():
 
 def test_an_inner_kernel_has_no_wrapper_and_says_so():
     assert type(_twice) is Inner
-    with pytest.raises(TypeError, match=r"_twice is for compiled code; for Python it has to be a kernel\(outer=True\)"):
+    with pytest.raises(
+        TypeError, match=r"_twice is for compiled code only; for Python, use kernel\(outer=True\)"
+    ):
         _twice(2.0)
     doubled(1.0)
     _twice.compile((types.float64,))
@@ -132,7 +134,7 @@ def test_an_address_is_not_called_with_what_it_was_not_compiled_for(strange):
 
 
 def test_a_task_that_is_not_there_is_named():
-    with pytest.raises(TypingError, match="there is no machine code of subtract; there is that of add"):
+    with pytest.raises(TypingError, match="there is no task subtract; the tasks are add"):
         call_what_is_not_there(content_of(np.zeros(2)))
 
 

@@ -18,7 +18,8 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.screened import screening
 from rigidmd.forces.pairs.space import Triclinic, cell_of
-from rigidmd.forces.waves.ewald import sum_of, waves
+from rigidmd.forces.waves.ewald import sum_of
+from rigidmd.forces.waves.vectors import waves
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe

@@ -37,7 +37,8 @@ LIBRARIES = {
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
     "numba": {
-        "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lanes.py", "compile/machine.py",
+        "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lane_types.py", "compile/lanes.py",
+        "compile/machine.py",
         "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",
         "run/molecules.py", "measure/summary.py", "measure/body_summary.py",  # number of threads, version
     },

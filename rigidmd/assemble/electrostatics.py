@@ -14,7 +14,7 @@ from rigidmd.forces.laws.screened import damped_self_energy, damped_shifted_forc
 from rigidmd.forces.pairs.loop import pair_forces
 from rigidmd.forces.pairs.sites import BodySites, CentralSites
 from rigidmd.forces.pairs.space import Space, cell_of
-from rigidmd.forces.waves import ewald
+from rigidmd.forces.waves import corrections, ewald, vectors
 from rigidmd.forces.waves.errors import (
     FAREST,
     alpha_for,
@@ -28,7 +28,7 @@ from rigidmd.forces.waves.errors import (
 )
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
-from rigidmd.units import COULOMB, KJ_PER_MOL
+from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 #: Along an edge, as forces.ewald_k_max has it: more would take all memory.
 MOST_WAVES = 1000
@@ -59,7 +59,7 @@ class Charged(NamedTuple):
         total = 0.0
         for k, (m, c) in enumerate(zip(self.species, self.chosen, strict=True)):
             count = int(((self.index == k) & ~self.frozen).sum())
-            total += count * what(ewald.in_energy_units(m.charges[c]), m.positions_body[c]) if count else 0.0
+            total += count * what(m.charges[c] * COULOMB_CHARGE, m.positions_body[c]) if count else 0.0
         return total
 
 
@@ -130,7 +130,7 @@ class Settings(NamedTuple):
     """Of an Ewald sum, and what it leaves out."""
 
     alpha: float  # 1/Å
-    waves: ewald.Waves | None  # of Ewald; of PME those that tell what frozen molecules do to one another
+    waves: vectors.Waves | None  # of Ewald; of PME those that tell what frozen molecules do to one another
     grid: tuple[int, int, int] | None  # of PME
     order: int | None
     radius: float | None  # of waves, 1/Å, where they are those within one
@@ -168,7 +168,7 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
         left = mesh_error(charges, alpha, cell, grid, order)
         over = None
         if charged.frozen.any():
-            over = ewald.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
+            over = vectors.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
         return Settings(alpha, over, grid, order, None, beyond, left)
     radius = forces.ewald_k_radius_per_A
     if forces.gives_waves:
@@ -178,15 +178,15 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
             fault = f"forces.ewald_k_radius_per_A = {radius:g} is more than {MOST_WAVES} waves along an edge of the box"
             raise SceneError(scene.source, [fault])
         over = (
-            ewald.waves(most, forces.ewald_k2_max, basis)
+            vectors.waves(most, forces.ewald_k2_max, basis)
             if radius is None
-            else ewald.waves_within(reciprocal, radius, most, basis)
+            else vectors.waves_within(reciprocal, radius, most, basis)
         )
         if over.total == 0:
             raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no wave at all"])
     else:
         radius = wave_radius_for(charges, alpha, reciprocal, share)
-        over = ewald.waves_within(reciprocal, radius)
+        over = vectors.waves_within(reciprocal, radius)
     left = wave_error(charges, alpha, radius_of(over.total, volume), volume)
     return Settings(alpha, over, None, None, radius, beyond, left)
 
@@ -194,7 +194,7 @@ def _settings(scene: MolecularScene, charged: Charged, space: Space, cutoff: flo
 def _given_grid(scene: MolecularScene, basis: np.ndarray, cell: np.ndarray) -> tuple[int, int, int] | None:
     """The grid that a scene gives, if it is one of the cell (3, 3) that stands for its own too. Raises SceneError."""
     grid = scene.forces.pme_grid
-    if grid is None or len(set(grid)) == 1 or np.array_equal(basis, ewald.AS_GIVEN):
+    if grid is None or len(set(grid)) == 1 or np.array_equal(basis, vectors.AS_GIVEN):
         return grid
     fault = (
         f"forces.pme_grid = {list(grid)} counts points along edges of a cell that leans too much; the box is that with "
@@ -215,13 +215,13 @@ def _ewald(
 ) -> Electrostatics:
     settings = _settings(scene, charged, space, cutoff, basis)
     forces, alpha = scene.forces, settings.alpha
-    charge = ewald.in_energy_units(charged.charge_e)
+    charge = charged.charge_e * COULOMB_CHARGE
     law = screened_coulomb(charged.charge_e, cutoff, alpha, forces.shifts_ewald, FIT_SHARE * settings.real_error)
     if settings.grid is None:
         over = ewald.EwaldSum(alpha, charge, charged.sites, settings.waves)
         most = " ".join(map(str, settings.waves.most))
         how = f"{settings.waves.total} waves, |n| up to {most}"
-        if forces.ewald_k_max is not None and not np.array_equal(basis, ewald.AS_GIVEN):
+        if forces.ewald_k_max is not None and not np.array_equal(basis, vectors.AS_GIVEN):
             how += "; these are the waves that ewald_k_max means in the cell that was described"
     else:
         from rigidmd.forces.waves.mesh import Pme  # rocket-fft is for scenes with PME only
@@ -232,8 +232,10 @@ def _ewald(
     constants = {
         # The shift counts all charges inside a charge's cut-off, itself and its molecule among them, which together are
         # about neutral; pairs inside a molecule and the charge itself, no pairs of the loop, are this constant.
-        "coulomb_self": charged.each(lambda q, x: ewald.self_energy(q, alpha) - 0.5 * law.shift * float(q.sum()) ** 2),
-        "coulomb_intramolecular": charged.each(lambda q, x: ewald.intramolecular_energy(q, x, alpha)),
+        "coulomb_self": charged.each(
+            lambda q, x: corrections.self_energy(q, alpha) - 0.5 * law.shift * float(q.sum()) ** 2
+        ),
+        "coulomb_intramolecular": charged.each(lambda q, x: corrections.intramolecular_energy(q, x, alpha)),
     }
     error = float(np.hypot(settings.real_error, settings.wave_error))
     notes = [
@@ -246,7 +248,7 @@ def _ewald(
     net, net_still = charge.sum(), charge[still].sum()
     neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
     if not neutral:
-        terms["coulomb_background"] = ewald.background(net**2 - net_still**2, alpha)
+        terms["coulomb_background"] = corrections.background(net**2 - net_still**2, alpha)
         notes.append(
             f"the box has a net charge of {charged.charge_e.sum():+.6g} e; an even background of the opposite charge "
             "makes it neutral, and energies and pressure depend on the size of the box"
@@ -255,7 +257,7 @@ def _ewald(
         if not neutral:
             fault = "forces.ewald_surface_permittivity: a box with a net charge has no dipole of its own; leave it out"
             raise SceneError(scene.source, [fault])
-        terms["coulomb_surface"] = ewald.surface_dipole(charge, permittivity, charged.sites)
+        terms["coulomb_surface"] = corrections.surface_dipole(charge, permittivity, charged.sites)
     pressure = 0.0
     if still.any():
         constants["coulomb_frozen"], pressure = _of_frozen(
@@ -264,7 +266,7 @@ def _ewald(
     decided = {"ewald_alpha_per_A": alpha, "ewald_truncation": "shift" if forces.shifts_ewald else "plain"}
     if settings.radius is not None:
         decided["ewald_k_radius_per_A"] = settings.radius
-    if settings.grid is not None and np.array_equal(basis, ewald.AS_GIVEN):  # else it is one of another cell
+    if settings.grid is not None and np.array_equal(basis, vectors.AS_GIVEN):  # else it is one of another cell
         decided |= {"pme_grid": tuple(map(int, settings.grid)), "pme_order": settings.order}
     return Electrostatics(terms, constants, pressure, error * COULOMB, tuple(notes), decided)
 

@@ -20,7 +20,7 @@ from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
 from rigidmd.assemble.structure_files import SAME_MASS, Atoms, read_atoms
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
-from rigidmd.forces.waves.ewald import AS_GIVEN
+from rigidmd.forces.waves.vectors import AS_GIVEN
 from rigidmd.molecules import Molecule
 from rigidmd.validation import meant
 

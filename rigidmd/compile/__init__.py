@@ -1,6 +1,6 @@
-"""The door to Numba: how kernels are compiled, cached and called by address, and vectors.
+"""The interface to Numba: how kernels are compiled, cached and called by address, and SIMD vectors.
 
-What a term's author needs is here by name; `lanes` has the vectors.
+The names that the author of a term needs are exported here; `lanes` has the vectors.
 """
 
 from rigidmd.compile import threads  # noqa: F401  (before Numba is loaded)

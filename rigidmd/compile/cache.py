@@ -1,8 +1,8 @@
 """Where compiled code is kept.
 
-Numba's disk cache looks only at the file of the function itself; a change in a helper in another file would leave
-callers running old code. So the cache lives in a folder named by a digest of every source that compiled code can come
-from: any change of one of them starts a new folder. `RIGIDMD_CACHE` names another place for it.
+Numba's disk cache checks only the file of the function itself: after a change of a helper in another file, callers
+would go on running the old code. So the cache is a folder named by a digest of all sources that are compiled, and any
+change of a source starts a new folder. The environment variable `RIGIDMD_CACHE` moves the folders elsewhere.
 """
 
 import atexit
@@ -21,14 +21,14 @@ import numba
 from rigidmd.compile.machine import SIMD_BITS
 
 PACKAGE = Path(__file__).parent.parent
-#: Files and folders that compiled code comes from; tests/test_rooms.py sees that no other file has a kernel.
+#: Files and folders with compiled code; tests/test_rooms.py checks that no other file has a kernel.
 COMPILED = ("errors.py", "units.py", "core", "compile", "mechanics", "forces", "dynamics", "engines")
 UNUSED_AFTER_DAYS = 30.0
 
 
 @functools.cache
 def source_digest() -> str:
-    """Hexadecimal digest of the sources of compiled code, of Numba's version and of the width of vectors."""
+    """Hexadecimal digest of the sources of compiled code, Numba's version and the width of vectors."""
     digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS}".encode())
     for path in sorted(path for name in COMPILED for path in _sources(PACKAGE / name)):
         digest.update(path.relative_to(PACKAGE).as_posix().encode())
@@ -42,9 +42,9 @@ def _sources(place: Path) -> list[Path]:
 
 @functools.cache
 def cache_folder() -> str:
-    """A writable folder for compiled code; caches of older sources that nobody used for a month are removed.
+    """A writable folder for compiled code. Caches of older sources that were not used for a month are removed.
 
-    Nothing is read, made or removed before the first kernel is compiled.
+    Nothing is read, created or removed before the first kernel is compiled.
     """
     if named := os.environ.get("RIGIDMD_CACHE"):
         base = Path(named)
@@ -59,7 +59,7 @@ def cache_folder() -> str:
         with tempfile.TemporaryFile(dir=folder):
             numba.get_num_threads()
     except OSError:
-        own = tempfile.mkdtemp(prefix="rigidmd-cache-")  # a read-only home: compile, keep it for this process only
+        own = tempfile.mkdtemp(prefix="rigidmd-cache-")  # the home is read-only: keep the code for this process only
         atexit.register(shutil.rmtree, own, ignore_errors=True)
         return own
     for old in base.iterdir():

@@ -1,4 +1,4 @@
-"""Machine code behind addresses, each of which carries the type that it was compiled for."""
+"""Machine code that is called by address. Each address carries the type that the code was compiled for."""
 
 import hashlib
 
@@ -33,7 +33,7 @@ class _ParcelModel(models.PrimitiveModel):
 
 @intrinsic
 def packed(typing, content):
-    """The parcel of a value, to be opened before the calling function returns."""
+    """The parcel of a value. It must be opened before the calling function returns."""
 
     def emit(context, builder, signature, arguments):
         return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), ADDRESS)
@@ -54,10 +54,10 @@ def opened(typing, parcel):
 
 
 class Task:
-    """A function of (parcel, block) that compiled code calls by its address, see `Code`.
+    """A function of (parcel, block) that compiled code calls by address, see `Code`.
 
-    What is called by name is compiled again with every caller, and the callers' callers: the pair loop five times on
-    its way up to the loop over steps, and that for every kind of scene. By address it is compiled once.
+    Numba compiles a function that is called by name again into every caller, and into their callers: the pair loop five
+    times on the way up to the loop over steps, for every kind of scene. Called by address, it is compiled once.
     """
 
     def __init__(self, function, **options):
@@ -65,10 +65,10 @@ class Task:
         self.compiled = {}
 
     def address(self, parcel: Parcel) -> int:
-        """Where the machine code for a parcel of this type is; compiled, or taken from the cache."""
+        """Address of the machine code for a parcel of this type, which is compiled or read from the cache."""
         if parcel not in self.compiled:
-            # Code from the cache that starts threads needs them to be there. Numba sees to that, but loses sight of it
-            # where what was compiled called something that itself came from the cache; that ended in a crash.
+            # Cached code that uses threads needs the threading layer to be running. Numba starts it for such code, but
+            # not where freshly compiled code calls a function that comes from the cache: without this line, a crash.
             numba.get_num_threads()
             code = callback(self.function, (parcel, types.intp), self.options)
             self.compiled[parcel] = code
@@ -76,14 +76,14 @@ class Task:
 
 
 def task(*, fastmath=False, counted=True):
-    """Make a `Task` of a function, with options as those of `kernel`."""
+    """Turn a function into a `Task`; the options are those of `kernel`."""
     return lambda function: Task(function, **options_of(fastmath, False), **uncounted(counted))
 
 
 class Code:
-    """Machine code of tasks, by name, each for contents of one type, which `call` and `call_blocks` hold it to.
+    """Machine code of named tasks, each for contents of one type; `call` and `call_blocks` check that type.
 
-    Code(fill=(_fill, pairs), place=(_place, (pairs, sites, state))) compiles the tasks, or takes them from the cache.
+    Code(fill=(_fill, pairs), place=(_place, (pairs, sites, state))) compiles the tasks, or reads them from the cache.
     """
 
     def __init__(self, **tasks: tuple[Task, object]):
@@ -94,18 +94,18 @@ class Code:
 
 
 class CodeType(types.Type):
-    """Numba type of a `Code`: which tasks it has, and what each may be called with."""
+    """Numba type of a `Code`: its tasks, and the type of parcel that each accepts."""
 
     def __init__(self, parcels: tuple[tuple[str, Parcel], ...]):
         self.parcels = parcels
-        # a digest: the name is part of that of every function that is compiled for it
+        # a digest, because this name becomes part of the name of every function compiled for it
         super().__init__(f"code({hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]})")
 
     def place(self, name: str, parcel: Parcel) -> int:
-        """Which of its addresses is that of a task. Raises TypeError where it was compiled for something else."""
+        """Index of a task's address. Raises TypingError if there is no such task, or not for this type of parcel."""
         names = [known for known, _ in self.parcels]
         if name not in names:
-            raise TypingError(f"there is no machine code of {name}; there is that of {', '.join(names)}")
+            raise TypingError(f"there is no task {name}; the tasks are {', '.join(names)}")
         if self.parcels[names.index(name)][1] != parcel:
             raise TypingError(f"{name} was compiled for {self.parcels[names.index(name)][1]}, not for {parcel}")
         return names.index(name)
@@ -132,7 +132,7 @@ def _unbox_code(kind, value, context):
 
 @intrinsic(prefer_literal=True)
 def _address_of(typing, code, name, parcel):
-    """Where the machine code of a task is."""
+    """Address of the machine code of a task."""
     if not isinstance(name, types.StringLiteral):
         raise TypingError("the name of a task must be a literal")
     place = code.place(name.literal_value, parcel)
@@ -146,7 +146,7 @@ def _address_of(typing, code, name, parcel):
 
 @intrinsic
 def _jump(typing, address, parcel, block):
-    """Call what is at an address."""
+    """Call the machine code at an address."""
 
     def emit(context, builder, signature, arguments):
         kind = ir.FunctionType(ir.VoidType(), [ADDRESS, ir.IntType(64)])
@@ -171,12 +171,12 @@ def _jump_blocks(address, parcel, blocks):
 
 
 def call(code, name, parcel):
-    """Call a task by its name, which is a literal, for block 0. What it was not compiled for does not compile."""
+    """Call a task for block 0 by its name, a literal. A parcel of another type is an error of compilation."""
     raise TypeError("compiled code only")
 
 
 def call_blocks(code, name, parcel, blocks):
-    """Call a task for every block, on all threads if there are several."""
+    """Call a task for every block; on all threads if there are several blocks."""
     raise TypeError("compiled code only")
 
 

@@ -1,37 +1,34 @@
 """SIMD vectors for compiled code: a Numba type whose values are LLVM vectors.
 
-Lanes of float32 or float64 follow `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
-from and stored to contiguous arrays. Everything is portable LLVM; it becomes AVX-512, AVX2, SSE or NEON. How many lanes
-a vector has is chosen for the machine (machine.SIMD_BITS): 16 float32 with AVX-512, 8 with AVX2, 4 else; half as many
-float64.
+Lanes of float32 or float64 support `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
+from and stored to contiguous arrays. The number of lanes follows from the machine (machine.SIMD_BITS): 16 float32 with
+AVX-512, 8 with AVX2, otherwise 4; half as many float64. `lane_types` has the types and operators, this file the
+functions.
 
-The same functions take scalars, so that a formula written once serves pair loops and single numbers.
+Functions that appear in formulas also take scalars, so that one formula serves pair loops and single numbers.
 """
 
-import operator
 from math import prod, sqrt
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+from numba.extending import intrinsic
 
 from rigidmd.compile import PAIR_FLAGS, SIMD_BITS, implements
-
-FLAGS = tuple(sorted(PAIR_FLAGS))
-COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
+from rigidmd.compile.lane_types import COUNT, FLAGS, Lanes, Mask, filled
 
 
 def lane_count(dtype) -> int:
-    """Lanes of a vector of a NumPy dtype on this machine."""
+    """Number of lanes in a vector of a NumPy dtype on this machine."""
     return SIMD_BITS // (8 * np.dtype(dtype).itemsize)
 
 
 def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
-    """Like np.zeros, beginning where a vector fits one line of the cache.
+    """Like np.zeros, aligned so that no vector lies across two cache lines.
 
-    NumPy aligns to 16 bytes, so that each vector of 64 would lie across two lines: 3 to 4 % of the time of pairs.
+    NumPy aligns to 16 bytes, so a vector of 64 bytes would lie across two lines; that costs the pair loop 3 to 4 %.
     """
     shape = (shape,) if isinstance(shape, int) else shape
     size = prod(shape) * np.dtype(dtype).itemsize
@@ -41,114 +38,11 @@ def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
-class Lanes(types.Type):
-    """Numba type of a vector of `count` numbers."""
-
-    def __init__(self, dtype, count):
-        self.dtype, self.count = dtype, count
-        super().__init__(f"lanes({count} x {dtype})")
-
-
-class Mask(types.Type):
-    """Numba type of a truth value for each of `count` lanes."""
-
-    def __init__(self, count):
-        self.count = count
-        super().__init__(f"mask({count})")
-
-
-@register_model(Lanes)
-class LanesModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(manager[kind.dtype].get_value_type(), kind.count))
-
-
-@register_model(Mask)
-class MaskModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.count))
-
-
-# --- operators -------------------------------------------------------------------------------------------------------
-
-
-def _common(a, b) -> Lanes | None:
-    """The vector type of two operands, at least one of them a vector, the other one like it or a number."""
-    if isinstance(b, Lanes):
-        a, b = b, a
-    return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
-
-
-def _filled(context, builder, value, kind, lanes):
-    """The value as a vector: itself, or a number in every lane."""
-    if kind == lanes:
-        return value
-    number = context.cast(builder, value, kind, lanes.dtype)
-    vector = ir.VectorType(number.type, lanes.count)
-    first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, ir.IntType(32)(0))
-    order = ir.Constant(ir.VectorType(ir.IntType(32), lanes.count), [0] * lanes.count)
-    return builder.shuffle_vector(first, first, order)
-
-
-def _operator(functions, emit, result=lambda lanes: lanes):
-    """Teach Numba a binary operator: emit(builder, left, right) of two vectors."""
-    for function in functions:
-
-        @type_callable(function)
-        def of_types(context):
-            def typer(a, b):
-                lanes = _common(a, b)
-                return result(lanes) if lanes is not None else None
-
-            return typer
-
-        def lower(context, builder, signature, arguments):
-            lanes = _common(*signature.args)
-            left, right = (
-                _filled(context, builder, v, kind, lanes) for v, kind in zip(arguments, signature.args, strict=True)
-            )
-            return emit(builder, left, right)
-
-        for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
-            lower_builtin(function, *kinds)(lower)
-
-
-_operator([operator.add, operator.iadd], lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
-_operator([operator.sub, operator.isub], lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
-_operator([operator.mul, operator.imul], lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
-_operator([operator.truediv, operator.itruediv], lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
-
-
-def _compare(function, sign):
-    def emit(builder, a, b):
-        if isinstance(a.type.element, ir.IntType):
-            return builder.icmp_signed(sign, a, b)
-        return builder.fcmp_ordered(sign, a, b)
-
-    _operator([function], emit, lambda lanes: Mask(lanes.count))
-
-
-for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.eq, "==")):
-    _compare(_function, _sign)
-
-
-def _logic(function, emit):
-    @type_callable(function)
-    def of_types(context):
-        return lambda a, b: a if isinstance(a, Mask) and a == b else None
-
-    lower_builtin(function, Mask, Mask)(lambda context, builder, signature, arguments: emit(builder, *arguments))
-
-
-_logic(operator.and_, lambda builder, a, b: builder.and_(a, b))
-_logic(operator.or_, lambda builder, a, b: builder.or_(a, b))
-
-
 # --- memory ----------------------------------------------------------------------------------------------------------
 
 
 def _address(context, builder, array_type, array, index, lanes):
-    """Where the vector at array[index] begins, as a pointer to a vector."""
+    """Pointer to the vector that starts at array[index]."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
 
@@ -167,13 +61,13 @@ def _load(lanes, array):
 
 @intrinsic
 def load(typing, array, index):
-    """The vector array[index], array[index + 1], ...; array contiguous, one axis."""
+    """The vector array[index], array[index + 1], ... of a contiguous array with one axis."""
     return _load(Lanes(array.dtype, COUNT[array.dtype]), array) if _is_row(array) else None
 
 
 @intrinsic
 def load_beside(typing, array, index, other):
-    """`load` with as many lanes as vectors of another array have."""
+    """`load` with the number of lanes that vectors of another array have."""
     signature, emit = _load(Lanes(array.dtype, COUNT[other.dtype]), array)
     return signature.return_type(array, types.intp, other), lambda c, b, s, a: emit(c, b, s, a[:2])
 
@@ -199,7 +93,7 @@ def spread(typing, array, index):
 
     def emit(context, builder, signature, arguments):
         data = context.make_array(array)(context, builder, arguments[0]).data
-        return _filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
+        return filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
 
     return lanes(array, types.intp), emit
 
@@ -227,43 +121,35 @@ def _call(builder, name, result, *arguments, flags=FLAGS):
 
 
 def _suffix(kind) -> str:
-    """How LLVM writes a vector type in names of intrinsics."""
+    """The name of a vector type in names of LLVM intrinsics."""
     element = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}.get(kind.element) or f"i{kind.element.width}"
     return f"v{kind.count}{element}"
 
 
+def _square_root(builder, value):
+    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=(*FLAGS, "afn"))
+
+
+def _inverted(builder, value):
+    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=(*FLAGS, "afn"))
+
+
 @intrinsic
 def root(typing, x):
-    """Square roots of a vector, to about the last digit."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        return _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
-
-    return x(x), emit
+    """Square roots of a vector, accurate to about the last digit."""
+    return x(x), lambda context, builder, signature, arguments: _square_root(builder, *arguments)
 
 
 @intrinsic
 def _quick_inverse(typing, x):
-    """1/sqrt(x) in float32 where LLVM may take the machine's estimate with a Newton step: 2e-7."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        root = _call(builder, f"llvm.sqrt.{_suffix(kind)}", kind, *arguments, flags=(*FLAGS, "afn"))
-        return builder.fdiv(ir.Constant(kind, [1.0] * kind.count), root, flags=(*FLAGS, "afn"))
-
-    return x(x), emit
+    """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of 2e-7."""
+    return x(x), lambda context, builder, signature, arguments: _inverted(builder, _square_root(builder, *arguments))
 
 
 @intrinsic
 def _quick_quotient(typing, x):
-    """1/x in float32, likewise."""
-
-    def emit(context, builder, signature, arguments):
-        kind = arguments[0].type
-        return builder.fdiv(ir.Constant(kind, [1.0] * kind.count), arguments[0], flags=(*FLAGS, "afn"))
-
-    return x(x), emit
+    """1/x in float32, in the same way."""
+    return x(x), lambda context, builder, signature, arguments: _inverted(builder, *arguments)
 
 
 def _converted(dtype):
@@ -287,7 +173,7 @@ double = intrinsic(_converted(types.float64))
 
 
 def inverse_root(x):
-    """1/sqrt(x), to about the last digit."""
+    """1/sqrt(x), accurate to about the last digit."""
     raise TypeError("compiled code only")
 
 
@@ -299,7 +185,7 @@ def _inverse_root(x):
         return lambda x: _quick_inverse(x)
 
     def refined(x):
-        # From the float32 result (24 bits) one step of third order reaches 53; a float64 root and division take longer.
+        # One step of third order takes the float32 result from 24 bits to 53; a float64 root and division are slower.
         y = double(_quick_inverse(single(x)))
         e = 1.0 - x * y * y
         return y + y * e * (0.5 + 0.375 * e)
@@ -309,7 +195,7 @@ def _inverse_root(x):
 
 @intrinsic
 def smaller_of_two(typing, x):
-    """In lanes 2 k and 2 k + 1 the smaller of both."""
+    """The smaller of lanes 2 k and 2 k + 1, in both lanes."""
 
     def emit(context, builder, signature, arguments):
         value, count = arguments[0], x.count
@@ -321,7 +207,7 @@ def smaller_of_two(typing, x):
 
 
 def inverse(x):
-    """1/x, to about the last digit."""
+    """1/x, accurate to about the last digit."""
     raise TypeError("compiled code only")
 
 
@@ -343,7 +229,7 @@ def _inverse(x):
 def _chosen(sign):
     def chosen(typing, x, y):
         def emit(context, builder, signature, arguments):
-            a, b = (_filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
+            a, b = (filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
             return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
         return x(x, y), emit
@@ -356,7 +242,7 @@ _smaller = intrinsic(_chosen("<"))
 
 
 def larger(x, y):
-    """The larger of x and y, which may be a number, in each lane; y where x is not a number."""
+    """The larger of x and y in each lane, y where x is NaN; y may be a scalar."""
     raise TypeError("compiled code only")
 
 
@@ -368,7 +254,7 @@ def _larger_of_both(x, y):
 
 
 def smaller(x, y):
-    """The smaller of x and y, which may be a number, in each lane; y where x is not a number."""
+    """The smaller of x and y in each lane, y where x is NaN; y may be a scalar."""
     raise TypeError("compiled code only")
 
 
@@ -381,10 +267,10 @@ def _smaller_of_both(x, y):
 
 @intrinsic
 def select(typing, mask, x, y):
-    """x where the mask is set, y elsewhere; y may be a number."""
+    """x where the mask is set, y elsewhere; y may be a scalar."""
 
     def emit(context, builder, signature, arguments):
-        return builder.select(arguments[0], arguments[1], _filled(context, builder, arguments[2], signature.args[2], x))
+        return builder.select(arguments[0], arguments[1], filled(context, builder, arguments[2], signature.args[2], x))
 
     return x(mask, x, y), emit
 
@@ -402,7 +288,7 @@ def bits(typing, mask):
 
 @intrinsic
 def lowest_bit(typing, word):
-    """Index of the lowest bit that is set; the word is not 0."""
+    """Index of the lowest set bit of a word that is not 0."""
 
     def emit(context, builder, signature, arguments):
         return builder.cttz(arguments[0], ir.IntType(1)(1))
@@ -412,7 +298,7 @@ def lowest_bit(typing, word):
 
 @intrinsic
 def mask_of(typing, word, lanes):
-    """The mask for such lanes whose lane k is bit k of an integer."""
+    """The mask for lanes of this type, with lane k from bit k of an integer."""
     mask = Mask(lanes.count)
 
     def emit(context, builder, signature, arguments):
@@ -423,7 +309,7 @@ def mask_of(typing, word, lanes):
 
 @intrinsic
 def total(typing, x):
-    """The sum of all lanes as a float64; added in pairs, always in the same order."""
+    """The sum of all lanes as a float64, added pairwise in a fixed order."""
 
     def emit(context, builder, signature, arguments):
         value, count = arguments[0], x.count
@@ -443,7 +329,7 @@ def total(typing, x):
 
 @intrinsic
 def largest(typing, x):
-    """The largest number of all lanes; what it makes of lanes that are none is not defined."""
+    """The largest of all lanes; undefined if a lane is NaN."""
 
     def emit(context, builder, signature, arguments):
         kind, flags = arguments[0].type, (*FLAGS, "nnan")
@@ -464,9 +350,9 @@ def lane(typing, x, k):
 
 @intrinsic
 def polynomial(typing, coefficients, x):
-    """Sum of coefficients[k] x^k; a tuple of floats in ascending order, x a number or a vector.
+    """Sum of coefficients[k] x^k for a tuple of floats in ascending order; x is a scalar or a vector.
 
-    Even and odd powers apart: two chains of multiply-adds, each half as long, hide one another's latency.
+    Even and odd powers are summed separately: two independent chains of multiply-adds, each half as long, overlap.
     """
     if not isinstance(coefficients, types.BaseTuple) or not isinstance(x, Lanes | types.Float):
         return None
@@ -478,7 +364,7 @@ def polynomial(typing, coefficients, x):
         def constant(k):
             number = builder.extract_value(values, k)
             if isinstance(x, Lanes):
-                return _filled(context, builder, number, kinds[k], x)
+                return filled(context, builder, number, kinds[k], x)
             return context.cast(builder, number, kinds[k], x)
 
         def chain(powers, y):
@@ -499,17 +385,17 @@ def polynomial(typing, coefficients, x):
 
 @intrinsic
 def fill(typing, number, array):
-    """A vector of an array's type with a number in every lane."""
+    """A vector of an array's type with the same number in every lane."""
     lanes = Lanes(array.dtype, COUNT[array.dtype])
 
     def emit(context, builder, signature, arguments):
-        return _filled(context, builder, arguments[0], number, lanes)
+        return filled(context, builder, arguments[0], number, lanes)
 
     return lanes(number, array), emit
 
 
 def width_of(array):
-    """Lanes of the vectors of an array, known when compiled."""
+    """Number of lanes in the vectors of an array, a constant at compile time."""
     raise TypeError("compiled code only")
 
 
@@ -520,7 +406,7 @@ def _width_of(array):
 
 
 def narrowed(x, array):
-    """A vector in the precision of an array."""
+    """A vector converted to the precision of an array."""
     raise TypeError("compiled code only")
 
 

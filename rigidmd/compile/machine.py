@@ -1,14 +1,14 @@
-"""What this machine computes with."""
+"""Properties of this machine: the width of its vectors, and how finely work is divided."""
 
 import os
 
 from numba.core.codegen import get_host_cpu_features
 
-BLOCKS = 16  # that threads share: enough for 16 of them
+BLOCKS = 16  # of work, which any thread may take: enough for 16 threads
 
 
 def _simd_bits() -> int:
-    """Bits of the vectors that pair loops use: the widest that this machine computes with."""
+    """Bits of the vectors in pair loops: the widest that this machine supports."""
     if named := os.environ.get("RIGIDMD_SIMD_BITS"):
         return int(named)
     features = get_host_cpu_features().split(",")

@@ -1,11 +1,11 @@
-"""What we use of Numba that it does not promise to keep. tests/test_compile.py has a test of each assumption.
+"""The private parts of Numba that this package relies on. tests/test_compile.py tests each assumption.
 
-- `FunctionCache` takes its folder from `numba.config.CACHE_DIR` when it is made, and keeps its index in an
+- `FunctionCache` reads its folder from `numba.config.CACHE_DIR` when it is created, and keeps its index in an
   `IndexDataCacheFile`, whose class may be changed.
-- A dispatcher reads its cache from `_cache`, and only to compile.
+- A dispatcher uses `_cache` only when it compiles.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for Python.
-- `_nrt` is an option too: without it references are not counted.
-- A `CFunc` compiles for given types and takes a cache of ours.
+- `_nrt` is an option too: if it is False, references are not counted.
+- A `CFunc` compiles for given types and accepts a cache that we set.
 """
 
 import contextlib
@@ -22,11 +22,11 @@ from rigidmd.compile.cache import cache_folder
 
 
 class Index(IndexDataCacheFile):
-    """What is compiled, by the types of the arguments. One with types of a module that is not there counts as absent.
+    """Index of a cache: compiled functions by types of arguments. It counts as empty if it cannot be read.
 
-    A term of somebody's own would otherwise leave an index that nobody else can read. Files of machine code have names
-    of their own: Numba numbers them, and two processes that compile at once, for different types, would write under one
-    number what the index then gives to either; seen, it ended in a crash of every later run.
+    That is so if a type belongs to a module that is absent, such as a user's own term: another program could otherwise
+    not read the index. The files of machine code have random names. Numba numbers them, and two processes that compile
+    at the same time for different types would write to the same number; every later run then crashed.
     """
 
     def _data_name(self, number):
@@ -40,7 +40,7 @@ class Index(IndexDataCacheFile):
 
 
 class Kernel(CPUDispatcher):
-    """A dispatcher with a cache of ours, which it opens when it first compiles."""
+    """A dispatcher with our own cache, which is opened at the first compilation."""
 
     @property
     def _cache(self):
@@ -51,18 +51,19 @@ class Kernel(CPUDispatcher):
 
     @_cache.setter
     def _cache(self, none) -> None:
-        """Numba sets one that does nothing when it makes a dispatcher."""
+        """Ignored: Numba sets a null cache when it creates a dispatcher."""
 
 
 class Inner(Kernel):
-    """A kernel that only compiled code calls. It has no wrapper for Python, which would take every term apart.
+    """A kernel that only compiled code calls. It has no wrapper for Python, which would unpack every term.
 
-    To call one that has none ends in a crash. Without wrappers, and without copies between slices of arrays, whose
-    checks Numba compiles too, all that systems/water.toml needs compiled in 40 s instead of 66.
+    Calling a kernel without a wrapper from Python would crash, so `__call__` raises TypeError. Without wrappers, and
+    without copies between slices of arrays, whose checks Numba also compiles, the kernels of systems/water.toml
+    compiled in 40 s instead of 66 s.
     """
 
     def __call__(self, *arguments):
-        raise TypeError(f"{self.py_func.__name__} is for compiled code; for Python it has to be a kernel(outer=True)")
+        raise TypeError(f"{self.py_func.__name__} is for compiled code only; for Python, use kernel(outer=True)")
 
 
 def _opened_cache(function: Callable) -> FunctionCache:
@@ -74,7 +75,7 @@ def _opened_cache(function: Callable) -> FunctionCache:
 
 @contextlib.contextmanager
 def _own_folder() -> Iterator[None]:
-    """Other users of Numba keep their own cache folder."""
+    """Set our cache folder for the moment, so that other users of Numba keep theirs."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = cache_folder()
     try:
@@ -84,9 +85,9 @@ def _own_folder() -> Iterator[None]:
 
 
 def dispatcher(function: Callable, options: dict, outer: bool) -> CPUDispatcher:
-    """A function to be compiled with these options of Numba when it is first called, from our cache if it is there.
+    """A function that is compiled with these options of Numba, or read from our cache, when it is first called.
 
-    outer : whether Python calls it, which takes a wrapper
+    outer : whether Python calls it, for which it needs a wrapper
     """
     options = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer}
     compiled = numba.njit(**options)(function)
@@ -95,7 +96,7 @@ def dispatcher(function: Callable, options: dict, outer: bool) -> CPUDispatcher:
 
 
 def callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
-    """A function compiled for these types of arguments, for its address; from our cache if it is there."""
+    """A function compiled for these types of arguments, or read from our cache; it is called by address."""
     code = CFunc(function, (arguments, types.void), locals={}, options=options)
     code._cache = _opened_cache(function)
     code.compile()
@@ -103,5 +104,5 @@ def callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
 
 
 def uncounted(counted: bool) -> dict:
-    """Options of a function in which references to arrays are not counted, or of one in which they are."""
+    """Options of a function in which references to arrays are counted, or are not."""
     return {} if counted else {"_nrt": False}

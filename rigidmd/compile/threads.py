@@ -1,4 +1,4 @@
-"""How threads wait for one another. Imported before Numba, because OpenMP reads it when it is loaded."""
+"""How OpenMP threads wait for work. Imported before Numba, because OpenMP reads these settings when it is loaded."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""The flows of a single body: one of everything, each chosen by its type, so what a scene lacks is not compiled."""
+"""The flows of a single body. Each part is chosen by its type, so what a scene does not have is not compiled."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from rigidmd.mechanics.rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor
 
 
 class Body(NamedTuple):
-    """What never changes during a run of a single body; SI units. `Model` is the like for molecules."""
+    """What never changes during a run of a single body, in SI units; the counterpart of `Model` for molecules."""
 
     flight: Free | Pinned | Immersed
     rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
@@ -98,7 +98,7 @@ def _pay_body(model, terms, state, h):
 
 @kernel
 def relative_motion(model, state):
-    """(velocity along the lab's, omega along the body's axes) relative to the frame, as tuples; else 0."""
+    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples; 0 where the body has none."""
     W = frame_rate(model.frame, state.time[NOW])
     velocity = (0.0, 0.0, 0.0)
     omega = (0.0, 0.0, 0.0)

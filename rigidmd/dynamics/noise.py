@@ -1,7 +1,7 @@
-"""Random numbers by counting: Philox4x32-10 (Salmon et al. 2011, SC '11: Parallel random numbers: as easy as 1, 2, 3).
+"""Counter-based random numbers: Philox4x32-10 (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC '11).
 
-A number is a function of a key and a counter, so there is no generator to carry along and no state to save, and any
-number of threads draws the same. The key is that of (seed, purpose, stage); the counter is (draw, molecule, step).
+A number is a function of a key and a counter, so there is no generator and no state to save, and the numbers are the
+same for any number of threads. The key depends on (seed, purpose, stage); the counter is (draw, molecule, step).
 """
 
 from math import cos, exp, log, pi, sin, sqrt
@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.compile import kernel
 
-#: Purposes, each with its own stream, so that one more draw here changes nothing there.
+#: Purposes. Each has its own stream, so that an additional draw for one changes nothing for the others.
 LATTICE, MOMENTA, BATH, BOX = 1, 2, 3, 4
 
 MULTIPLIER_0, MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
@@ -29,14 +29,14 @@ class Key(NamedTuple):
 
 
 def key_of(seed: int, purpose: int, stage: int = 0) -> Key:
-    """The key of a purpose (LATTICE, MOMENTA, BATH) in a stage; well mixed, so that seeds may be 1, 2, 3."""
+    """The key of a purpose (LATTICE, MOMENTA, BATH) in a stage. It is well mixed, so seeds may be 1, 2, 3."""
     low, high = np.random.SeedSequence([seed, purpose, stage]).generate_state(2, np.uint32)
     return Key(np.uint64(low), np.uint64(high))
 
 
 @kernel(outer=True)
 def philox(key, draw, molecule, step):
-    """Four 32-bit numbers, as uint64, of a counter: draw and molecule below 2^32, step below 2^63."""
+    """Four 32-bit numbers, as uint64, for a counter with draw and molecule below 2^32, step below 2^63."""
     a, b = np.uint64(draw) & LOW, np.uint64(molecule) & LOW
     c, d = np.uint64(step) & LOW, np.uint64(step) >> HALF
     low, high = key.low, key.high
@@ -49,7 +49,7 @@ def philox(key, draw, molecule, step):
 
 @kernel(outer=True)
 def uniforms(key, draw, molecule, step):
-    """Two independent numbers in (0, 1), to 2^-64: neither 0 nor 1 comes up."""
+    """Two independent uniform numbers in (0, 1], from 64 bits each: never 0, and 1 only by rounding."""
     a, b, c, d = philox(key, draw, molecule, step)
     return ((a + 0.5) * WHOLE + b) * WHOLE, ((c + 0.5) * WHOLE + d) * WHOLE
 
@@ -64,9 +64,9 @@ def normals(key, draw, molecule, step):
 
 @kernel(outer=True)
 def chi_square(key, draw, molecule, step, freedom):
-    """The sum of squares of so many normal numbers, from draws `draw`, draw + 1, ... (Marsaglia & Tsang 2000).
+    """The sum of squares of `freedom` normal numbers, from draws `draw`, draw + 1, ... (Marsaglia & Tsang 2000).
 
-    Twice a number of the Gamma distribution of shape freedom/2; below shape 1 by that of shape + 1 (their section 6).
+    It is twice a Gamma variate of shape freedom/2; for a shape below 1, from one of shape + 1 (their section 6).
     """
     if freedom == 0:
         return 0.0

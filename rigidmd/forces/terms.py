@@ -1,10 +1,10 @@
-"""Terms and workspaces: what acts on the bodies, how it is computed, and the one dispatch over them.
+"""Terms and workspaces: what acts on the bodies, how it is computed, and the dispatch over them.
 
-A term is a frozen NamedTuple of numbers: it says what acts. A workspace is what an engine makes of a term to compute
-it: the term's numbers and, where it needs them, lists, grids, sums and machine code. It belongs to that engine.
-`add_forces(workspace, state, load, tally)` is chosen by the workspace's type at compile time; what a scene does not
-have is never compiled. To add a law, write one file with a NamedTuple and an `@implements(add_forces)` (or, for a law
-between pairs of sites, an `@implements(pairs.pair)`). A term that needs no workspace is its own.
+A term is a frozen NamedTuple of numbers: it says what acts. A workspace is made from a term by one engine and belongs
+to it: the term's numbers and, if needed, lists, grids, sums and machine code. `add_forces(workspace, state, load,
+tally)` is chosen by the workspace's type at compile time; what a scene does not have is never compiled. To add a law,
+write one file with a NamedTuple and an `@implements(add_forces)` (or, for a law between pairs of sites, an
+`@implements(pairs.pair)`). A term that needs no workspace serves as its own.
 """
 
 from typing import NamedTuple
@@ -17,15 +17,15 @@ from rigidmd.core.state import OK
 
 
 class Setup(NamedTuple):
-    """What an engine makes workspaces for."""
+    """What the workspaces of an engine depend on."""
 
-    cell: np.ndarray  # (3, 3) as it is at first; workspaces follow that of the state
+    cell: np.ndarray  # (3, 3) at the start; workspaces follow the cell of the state
     dtype: type  # of the arithmetic between sites: numpy.float64 or numpy.float32
     skin: float  # extra radius of neighbour lists, Å
 
 
 def workspace_of(term: NamedTuple, setup: Setup) -> NamedTuple:
-    """Room to compute a term, nothing compiled yet; the term itself where it needs none."""
+    """The workspace of a term, with nothing compiled yet; the term itself if it needs none."""
     return term.workspace(setup) if hasattr(term, "workspace") else term
 
 
@@ -35,18 +35,20 @@ def with_code(workspace: NamedTuple) -> NamedTuple:
 
 
 def with_room(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
-    """The workspace with all the room that it asked for, for a cell (3, 3). Raises SimulationError."""
+    """The workspace with the room that it needed, for a cell (3, 3). May raise SimulationError."""
     return workspace.with_room(cell) if hasattr(workspace, "with_room") else workspace
 
 
 def add_forces(term, state, load, tally):
     """Add a term's forces and torques to `load`, its energy and virial to `tally` unless None; a status code."""
-    raise TypeError(f"{type(term).__name__} is no term, or this was called outside compiled code")
+    raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")
 
 
 def power(term, state, velocity, omega):
-    """Power of a term whose class says `drives = True` at a body's velocity and angular velocity (lab and body frame,
-    tuples, relative to the frame); 0 of any other, whose energy says it all."""
+    """Power of a term whose class has `drives = True`; 0 for any other term, because its energy includes its work.
+
+    velocity (lab axes) and omega (body axes) : tuples, relative to the frame
+    """
     raise TypeError("compiled code only")
 
 
@@ -57,7 +59,7 @@ def _no_power(term, state, velocity, omega):
 
 
 class NoForce(NamedTuple):
-    """Stands in for an empty tuple of terms, which Numba cannot loop over: free flight."""
+    """Replaces an empty tuple of terms, over which Numba cannot loop: free flight."""
 
     force: float = 0.0
 
@@ -70,13 +72,13 @@ def _add_no_force(term, state, load, tally):
 
 @kernel(outer=True)
 def add_term(term, state, load, tally):
-    """`add_forces` of one term, to be called from Python."""
+    """`add_forces` of one term, for calls from Python."""
     return add_forces(term, state, load, tally)
 
 
 @kernel(inline=True)
 def load_bodies(terms, state, load, tally):
-    """Forces and torques of all terms (a tuple) at the present positions; the worst status code.
+    """Write the forces and torques of all terms (a tuple) at the present positions; the worst status code.
 
     Energies and virials add up in `tally`; None compiles none.
     """

@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.assemble.body import BodySystem
 from rigidmd.core.state import WORK, State
-from rigidmd.forces.body.fields import Drive, SteadyForce, Told
+from rigidmd.forces.body.fields import Drive, SteadyForce, Told, steady_energies
 from rigidmd.forces.body.frame import Inertial
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.measure.columns import BODY, BODY_COLUMNS, MATRIX, Column
@@ -127,10 +127,7 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
     kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
     for term in system.terms.values():
         if isinstance(term, SteadyForce):
-            if system.flies:
-                potential -= position @ term.force
-            if system.turns:
-                potential -= np.einsum("i,tij,j->t", term.force, rotation, term.point)
+            potential += steady_energies(term, states.position, states.rotation)
     return {
         "kinetic": kinetic,
         "potential": potential,

@@ -1,1 +1,1 @@
-"""The rigid body itself: orientation, inertia and the flows that turn it. Knows nothing of molecules."""
+"""The rigid body: orientation, inertia and the flows that rotate it. Nothing here depends on molecules."""

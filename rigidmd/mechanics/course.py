@@ -1,4 +1,4 @@
-"""Courses: vectors that follow time as told (a motor's torque, a shrinking inertia, a frame that spins up)."""
+"""Courses: vectors as given functions of time (a motor's torque, a changing inertia, a frame that spins up)."""
 
 from math import inf
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from rigidmd.compile import kernel
 
 
 class Course(NamedTuple):
-    """Pieces of constant, linear or quadratic change.
+    """A vector that is piecewise constant, linear or quadratic in time.
 
-    Piece i holds from times[i] to times[i + 1]: constant[i] + d slope[i] + d² curvature[i] with d = t - times[i]. The
-    first begins at time 0, where runs begin; the last has no end. Compiled code gets one piece at a time (`during`): a
-    run is stepped from break to break, and no step sees a jump or a kink.
+    Piece i, from times[i] to times[i + 1], is constant[i] + d slope[i] + d² curvature[i] with d = t - times[i]. The
+    first piece begins at time 0, like every run; the last has no end. Compiled code gets one piece at a time
+    (`during`): a run is stepped from break to break, so that no step contains a jump or a kink.
     """
 
     times: np.ndarray  # (k,) increasing, the first 0
@@ -23,12 +23,12 @@ class Course(NamedTuple):
 
 
 def steady(vector) -> Course:
-    """A vector (3,) that does not change."""
+    """A constant vector (3,)."""
     return Course(np.zeros(1), np.array([vector], dtype=float), np.zeros((1, 3)), np.zeros((1, 3)))
 
 
 def table(times, values) -> Course:
-    """Straight lines between values (k, 3) at increasing times (k,), none negative; the outer values hold outside."""
+    """Linear interpolation of values (k, 3) at increasing times (k,) >= 0; constant before and after these times."""
     times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     if times[0] > 0:
         times, values = np.insert(times, 0, 0.0), np.insert(values, 0, values[0], axis=0)
@@ -38,7 +38,7 @@ def table(times, values) -> Course:
 
 
 def window(vector, begin: float, end: float) -> Course:
-    """A vector (3,) from one time to another (which may be infinite), zero outside."""
+    """A vector (3,) from time `begin` to time `end`, which may be infinite; zero outside."""
     on, off = np.asarray(vector, dtype=float), np.zeros(3)
     pieces = [(0.0, off)] * (begin > 0) + [(max(begin, 0.0), on)] + [(end, off)] * (end < inf)
     times, values = (np.array(column) for column in zip(*pieces, strict=True))
@@ -46,7 +46,7 @@ def window(vector, begin: float, end: float) -> Course:
 
 
 def integral(course: Course, start) -> Course:
-    """start (3,) plus the integral since time 0 of a course of constant and linear pieces."""
+    """start (3,) plus the integral from time 0 of a course with constant and linear pieces."""
     constant = np.empty_like(course.constant)
     constant[0] = start
     for i, length in enumerate(np.diff(course.times)):
@@ -55,12 +55,12 @@ def integral(course: Course, start) -> Course:
 
 
 def is_steady(course: Course) -> bool:
-    """Whether it never changes."""
+    """Whether a course is constant."""
     return not (course.slope.any() or course.curvature.any() or np.ptp(course.constant, axis=0).any())
 
 
 def keeps_direction(course: Course) -> bool:
-    """Whether it changes linearly along one line through zero, from break to break."""
+    """Whether every piece is linear and the vector stays on one line through zero."""
     parts = np.concatenate([course.constant, course.slope])
     longest = parts[np.linalg.norm(parts, axis=1).argmax()]
     off = np.abs(np.cross(parts, longest)).max()
@@ -74,7 +74,7 @@ def value_at(course: Course, times: np.ndarray) -> np.ndarray:
 
 
 def during(course: Course, time: float) -> Course:
-    """The one piece that holds just after a time, for ever."""
+    """The piece just after a time, without an end, as a course."""
     i, d = _places(course, np.array([time]))
     constant = course.constant[i] + d * (course.slope[i] + d * course.curvature[i])
     return Course(np.array([time]), constant, course.slope[i] + 2 * d * course.curvature[i], course.curvature[i])
@@ -99,12 +99,12 @@ def _places(course: Course, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @kernel(inline=True)
 def value(course, time, k):
-    """Component k at a time, by the first piece."""
+    """Component k at a time, from the first piece."""
     d = time - course.times[0]
     return course.constant[0, k] + d * (course.slope[0, k] + d * course.curvature[0, k])
 
 
 @kernel(inline=True)
 def rate(course, time, k):
-    """Rate of change of component k at a time, by the first piece."""
+    """Rate of change of component k at a time, from the first piece."""
     return course.slope[0, k] + 2 * (time - course.times[0]) * course.curvature[0, k]

@@ -1,6 +1,7 @@
-"""How a single body gets from place to place: freely, not at all, or through a fluid that it carries along.
+"""The translation of a single body: free, none, or through an ideal fluid with added mass.
 
-A flight is a term: `carry(flight, ...)` is chosen by its type when compiled, so a pinned body compiles no translation.
+A flight is a term: `carry(flight, ...)` is chosen by its type at compile time, so that a pinned body compiles no
+translation.
 """
 
 from typing import NamedTuple
@@ -12,13 +13,13 @@ from rigidmd.mechanics.rotor import turn_alone
 
 
 class Free(NamedTuple):
-    """The centre of mass flies straight on."""
+    """The centre of mass moves freely."""
 
     mass: float
 
 
 class Pinned(NamedTuple):
-    """One point of the body stays at the origin; position and velocity are not stored."""
+    """One point of the body is fixed at the origin; position and velocity are not stored."""
 
     mass: float
 
@@ -27,8 +28,8 @@ class Immersed(NamedTuple):
     """A body in an ideal fluid: Kirchhoff's equations P' = P x omega, L' = L x omega + P x v with v = M^-1 P.
 
     `state.velocity` is the impulse of body and fluid over the body's mass, lab frame. The principal axes of M are those
-    of I, and the centre of mass is the centre of the fluid's inertia (Lamb, Hydrodynamics, art. 124). Added moments of
-    inertia are part of the rotor's.
+    of I, and the centre of mass is the centre of the fluid's inertia (Lamb, Hydrodynamics, art. 124). The moments of
+    inertia of the rotor include the added ones.
     """
 
     mass: float
@@ -36,7 +37,7 @@ class Immersed(NamedTuple):
 
 
 def carry(flight, rotor, state, time, h):
-    """Flow of the kinetic energy of a single body from `time` for h, in place."""
+    """Flow of the kinetic energy of a single body, from `time` to time + h, in place."""
     raise TypeError("compiled code only")
 
 
@@ -63,7 +64,7 @@ def _carry(flight, rotor, state, time, h):
 
 @kernel(inline=True)
 def glide(flight, state, h):
-    """Exact flow of sum P_k²/(2 M_k): P and Q stay, X += h Q v, L += h P x v."""
+    """Exact flow of sum P_k²/(2 M_k): P and Q are constant, X += h Q v, L += h P x v."""
     q = state.rotation[0]
     p0 = flight.mass * along(q, state.velocity[0], 0)
     p1 = flight.mass * along(q, state.velocity[0], 1)
@@ -85,7 +86,7 @@ def along(rotation, vector_lab, k):
 
 
 def inertial_mass(flight, k):
-    """Mass (with added mass) that resists motion along body axis k."""
+    """Mass, with added mass, for motion along body axis k."""
     raise TypeError("compiled code only")
 
 
@@ -97,5 +98,5 @@ def _inertial_mass(flight, k):
 
 
 def inertial_masses(flight: Free | Pinned | Immersed) -> np.ndarray:
-    """Mass (with added mass) along the body's axes (3,), outside compiled code."""
+    """Mass, with added mass, along the body's axes (3,), for Python."""
     return flight.inertial_mass if isinstance(flight, Immersed) else np.full(3, flight.mass)

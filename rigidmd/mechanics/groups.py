@@ -1,6 +1,6 @@
-"""The turns of many bodies at a time, part by part: loops without branches or calls, which the compiler vectorises.
+"""Rotations of many bodies at a time, part by part, in loops without branches or calls that the compiler vectorises.
 
-One body at a time, each part waits for the one before it; a water takes two and a half times as long.
+With one body at a time, each part waits for the one before it, and a water takes two and a half times as long.
 """
 
 import numpy as np
@@ -8,8 +8,8 @@ import numpy as np
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.mechanics.rotor import SHORT, SplitRotor, series_of_square, turn, turned
 
-GROUP = 128  # bodies; what is kept of them stays in the fastest cache
-SHARE, RATE, SIGN, L, Q, ROWS = 0, 1, 4, 5, 8, 17  # rows of a group: first of each
+GROUP = 128  # bodies; their data stay in the L1 cache
+SHARE, RATE, SIGN, L, Q, ROWS = 0, 1, 4, 5, 8, 17  # first row of each quantity in a group
 
 
 def turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
@@ -26,7 +26,7 @@ def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
 
     def turn_together(rotor, species, rotation, angular_momentum_body, first, end, h):
         count = end - first
-        # to bring together few bodies, or such as turn about their momenta only, takes longer than to turn them
+        # few bodies, or bodies that rotate about their momenta only, take longer to collect than to rotate
         if count < 8 or not rotor.excess.any():
             _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
             return
@@ -65,9 +65,9 @@ def _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end
 
 @kernel(inline=True)
 def _collect(group, rotor, species, rotation, angular_momentum_body, first, count, h):
-    """Fill the rows of a group; no turn is longer than the angle returned, and there are some about these axes.
+    """Fill the rows of a group; returns a bound on all angles, and which axes have rotations.
 
-    Columns stand in the order of the rotor's axes a, b, c. Where that is not cyclic, the frame is left-handed: SIGN.
+    Components are in the order of the rotor's axes a, b, c. If it is not cyclic, the frame is left-handed: SIGN.
     """
     longest = 0.0
     about_a = about_b = about_c = False
@@ -97,7 +97,7 @@ def _collect(group, rotor, species, rotation, angular_momentum_body, first, coun
 
 @kernel(inline=True)
 def _about_momenta(group, count):
-    """`rotor.about_momentum` of each."""
+    """`rotor.about_momentum` of each body."""
     for n in range(count):
         x = group[SHARE, n] * group[L, n]
         y = group[SHARE, n] * group[L + 1, n]
@@ -112,7 +112,7 @@ def _about_momenta(group, count):
 
 @kernel(inline=True)
 def _about_axes(group, count, k, part):
-    """`rotor.about_axis` of each, about the axis in column k, over a part of the time."""
+    """`rotor.about_axis` of each body, about its k-th axis in the rotor's order, for a part of the time."""
     i, j = (k + 1) % 3, (k + 2) % 3
     for n in range(count):
         angle = part * group[RATE + k, n] * group[L + k, n]

@@ -6,14 +6,14 @@ import numpy as np
 
 Kind = Literal["point", "linear", "spherical", "symmetric", "asymmetric"]
 
-#: Two principal moments that differ by less than this fraction of the largest are one and the same. It says what a body
-#: IS CALLED (its degrees of freedom follow), never how it is moved. 1e-8 in inertia is 1e-4 in length: a bend of
-#: 0.0001 Å on a bond of 1 Å is a coordinate that was rounded, and at 300 K would spin ten thousand times too fast.
+#: Two principal moments that differ by less than this fraction of the largest count as equal, and a smaller moment as
+#: zero. 1e-8 in inertia is 1e-4 in length: a bend of 0.0001 Å on a bond of 1 Å is a rounded coordinate, and at 300 K
+#: the body would spin about that axis ten thousand times too fast.
 SAME_MOMENT = 1e-8
 
 
 class PrincipalFrame(NamedTuple):
-    """Where a body's masses sit, in the frame in which its inertia is diagonal.
+    """The principal frame of a body, in which its inertia is diagonal.
 
     mass (u), centre (3,), axes (3, 3) with the principal axes as columns (right-handed), inertia (3,) ascending
     (u Å²), kind. A moment that counts as zero (point, linear) is exactly 0.
@@ -34,18 +34,18 @@ def inertia_tensor(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def shifted(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
-    """Inertia tensor (3, 3) about a point from that about the centre of mass, `offset` (3,) away (parallel axes).
+    """Inertia tensor (3, 3) about a point at `offset` (3,) from the centre of mass, from that about it (parallel axes).
 
-    A negative mass goes the other way.
+    A negative mass gives the inverse.
     """
     return tensor + inertia_tensor(np.array([mass]), np.array([offset], dtype=float))
 
 
 def impossible(tensor: np.ndarray, scale: float = 0.0) -> str:
-    """Why no distribution of mass has this inertia tensor (3, 3); empty if one has.
+    """Why no mass distribution has this inertia tensor (3, 3); empty if one exists.
 
-    Moments are not negative and none is more than the sum of the others. The two sides may differ by rounding, 1e-12
-    of the largest moment, or of `scale` where the tensor is a difference of larger ones.
+    Moments must not be negative, and none may exceed the sum of the others. The tolerance for rounding is 1e-12 of the
+    largest moment, or of `scale` if the tensor is a difference of larger ones.
     """
     low, middle, high = np.linalg.eigvalsh(tensor)
     slack = 1e-12 * max(abs(low), abs(high), scale)
@@ -59,8 +59,8 @@ def impossible(tensor: np.ndarray, scale: float = 0.0) -> str:
 def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | None = None) -> PrincipalFrame:
     """Principal frame of masses (s,) at positions (s, 3).
 
-    `size` is the body's own length scale, against which "all masses at one place" is judged; the largest distance
-    of any position from the centre of mass when not given.
+    `size` is the length scale for the decision that all masses are at one point; by default, the largest distance of a
+    position from the centre of mass.
     """
     masses = np.asarray(masses, dtype=float)
     positions = np.asarray(positions, dtype=float)
@@ -72,7 +72,7 @@ def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | Non
     moments, axes = np.linalg.eigh(inertia_tensor(masses, relative))
     if moments[2] <= SAME_MOMENT * mass * size**2:
         return PrincipalFrame(mass, centre, np.eye(3), np.zeros(3), "point")
-    # eigh leaves signs open: point each axis along its largest component, then make the frame right-handed.
+    # eigh leaves signs undefined: make the largest component of each axis positive, then the frame right-handed.
     axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), [0, 1, 2]])
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     kind = kind_of_body(moments)
@@ -80,14 +80,14 @@ def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | Non
         moments = np.array([0.0, moments[2], moments[2]])
     elif kind == "spherical":
         moments = np.full(3, moments.mean())
-    elif kind == "symmetric":  # equal to the last bit, which the rotor turns exactly
+    elif kind == "symmetric":  # equal to the last bit, so that the rotor is exact
         pair = [0, 1] if moments[1] - moments[0] < moments[2] - moments[1] else [1, 2]
         moments[pair] = moments[pair].mean()
     return PrincipalFrame(mass, centre, axes, moments, kind)
 
 
 def kind_of_body(inertia: np.ndarray) -> Kind:
-    """Kind of body of three principal moments (any order)."""
+    """Kind of body from three principal moments in any order."""
     low, middle, high = np.sort(inertia)
     if high == 0:
         return "point"
@@ -101,5 +101,5 @@ def kind_of_body(inertia: np.ndarray) -> Kind:
 
 
 def rotational_freedom(kind: Kind) -> int:
-    """Rotational degrees of freedom: none for a point, two for a linear body, three for any other."""
+    """Rotational degrees of freedom: 0 for a point, 2 for a linear body, otherwise 3."""
     return {"point": 0, "linear": 2}.get(kind, 3)

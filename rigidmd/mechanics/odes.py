@@ -1,7 +1,7 @@
-"""The attitude as variables of a first-order system, in the three ways of the textbooks.
+"""The attitude as variables of a first-order system of ODEs, in the three forms of the textbooks.
 
-y holds the attitude first; its rates follow from the angular velocity in the body frame (relative to the frame the
-attitude is told in). Each is a term, chosen by its type.
+The attitude variables come first in y. Their rates follow from the angular velocity, body axes, relative to the frame
+of reference. Each form is a term, chosen by its type.
 """
 
 from math import cos, sin
@@ -14,13 +14,13 @@ from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 
 class Matrix(NamedTuple):
-    """Nine direction cosines, Q' = Q hat(omega). Nothing enforces Q^T Q = 1: how well it holds is the control."""
+    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced; its error measures the accuracy."""
 
     variables: int = 9
 
 
 class Quaternion(NamedTuple):
-    """w, x, y, z with q' = q (0, omega) / 2. Nothing enforces |q| = 1: how well it holds is the control."""
+    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced; its error measures the accuracy."""
 
     variables: int = 4
 
@@ -32,7 +32,7 @@ class EulerAngles(NamedTuple):
 
 
 class NoAttitude(NamedTuple):
-    """A point has none."""
+    """No attitude: a point."""
 
     variables: int = 0
 
@@ -48,7 +48,7 @@ def variables_of(form: Form, rotation: np.ndarray) -> np.ndarray:
 
 
 def read_attitude(form, y, rotation):
-    """Q (1, 3, 3) of the variables, in place. Nothing is normalised: Q of a quaternion is |q|² times a rotation."""
+    """Write Q (1, 3, 3) of the variables, without normalisation: Q of a quaternion is |q|² times a rotation."""
     raise TypeError("compiled code only")
 
 
@@ -100,7 +100,7 @@ def _read_attitude(form, y, rotation):
 
 
 def attitude_rates(form, y, w0, w1, w2, rates):
-    """Rates of the attitude variables for an angular velocity in the body frame, in place."""
+    """Write the rates of the attitude variables for an angular velocity along the body's axes."""
     raise TypeError("compiled code only")
 
 

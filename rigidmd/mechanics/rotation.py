@@ -1,7 +1,7 @@
-"""Rotation matrices Q (body to lab, x_lab = Q x_body), stacks of them included. Plain NumPy; nothing here is hot.
+"""Rotation matrices Q (body to lab, x_lab = Q x_body) and stacks of them, in NumPy; not performance critical.
 
-Also what other people write instead of Q: quaternions (w, x, y, z), Euler angles (phi, theta, psi) in the sequence
-3-1-3, yaw, pitch and roll in the sequence 3-2-1, attitude matrices. Angles are in rad.
+Also other descriptions of Q: quaternions (w, x, y, z), Euler angles (phi, theta, psi) in the sequence 3-1-3, yaw, pitch
+and roll in the sequence 3-2-1, attitude matrices. Angles are in rad.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ def random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
-    """Q (..., 3, 3) of quaternions (..., 4) in order w, x, y, z; any non-zero length, the direction counts."""
+    """Q (..., 3, 3) of quaternions (..., 4) in order w, x, y, z, which are normalised; the length must not be 0."""
     q = np.asarray(quaternion_wxyz, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -25,16 +25,16 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
 
 
 def direction(vector: np.ndarray) -> np.ndarray:
-    """Unit vector along a vector (k,) that is not zero, however short or long."""
+    """Unit vector along a non-zero vector (k,) of any length, without overflow or underflow."""
     vector = np.asarray(vector, dtype=float)
     vector = vector / np.abs(vector).max()
     return vector / np.linalg.norm(vector)
 
 
 def to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z, the first component that is not 0 positive.
+    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z; the first non-zero component is positive.
 
-    Q determines all products of two components; the row of the largest component has no cancellation at any angle
+    Q determines the products of any two components; the row of the largest component has no cancellation at any angle
     (Shepperd 1978, J. Guid. Control 1, 223).
     """
     q = np.asarray(rotation, dtype=float)
@@ -78,8 +78,8 @@ def from_euler_angles(euler_angles: np.ndarray) -> np.ndarray:
 def to_euler_angles(rotation: np.ndarray) -> np.ndarray:
     """3-1-3 Euler angles (..., 3) of Q (..., 3, 3): phi and psi in (-pi, pi], theta in [0, pi].
 
-    Where sin(theta) is 0 only phi + psi (theta = 0) or phi - psi (theta = pi) is defined: there psi = 0. Close to it
-    phi is what rounding left of it, and psi is read off Rz(-phi) Q, so that the three together are still Q to rounding.
+    Where sin(theta) is 0, only phi + psi (theta = 0) or phi - psi (theta = pi) is defined, and psi is set to 0. Nearby,
+    phi is limited by rounding; psi follows from Rz(-phi) Q, so that the three together still give Q to rounding.
     """
     q = np.asarray(rotation, dtype=float)
     sin_theta = np.hypot(q[..., 0, 2], q[..., 1, 2])
@@ -105,8 +105,8 @@ def from_yaw_pitch_roll(yaw_pitch_roll: np.ndarray) -> np.ndarray:
 def to_yaw_pitch_roll(rotation: np.ndarray) -> np.ndarray:
     """3-2-1 angles (..., 3) of Q (..., 3, 3): yaw and roll in (-pi, pi], pitch in [-pi/2, pi/2].
 
-    Where cos(pitch) is 0 only yaw - roll (pitch = pi/2) or yaw + roll (pitch = -pi/2) is defined: there roll = 0.
-    Close to it yaw is what rounding left of it, and roll is read off Rz(-yaw) Q.
+    Where cos(pitch) is 0, only yaw - roll (pitch = pi/2) or yaw + roll (pitch = -pi/2) is defined, and roll is set to
+    0. Nearby, yaw is limited by rounding; roll follows from Rz(-yaw) Q.
     """
     q = np.asarray(rotation, dtype=float)
     cos_pitch = np.hypot(q[..., 0, 0], q[..., 1, 0])
@@ -125,7 +125,7 @@ def hat(vector: np.ndarray) -> np.ndarray:
 
 
 def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """omega (..., 3) in the body frame of 3-1-3 angles (..., 3) and their time derivatives (..., 3), rad per time."""
+    """omega (..., 3), body frame, from 3-1-3 angles (..., 3) and their time derivatives (..., 3), rad per time."""
     (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
     phi_dot, theta_dot, psi_dot = np.moveaxis(np.asarray(rates, dtype=float), -1, 0)
     return np.stack(
@@ -139,15 +139,15 @@ def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray)
 
 
 def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> np.ndarray:
-    """Time derivatives (..., 3) of the 3-1-3 angles (..., 3) of a body turning with omega (..., 3), body frame.
+    """Time derivatives (..., 3) of the 3-1-3 angles (..., 3) of a body that rotates with omega (..., 3), body frame.
 
-    ValueError where sin(theta) is 0 to rounding: there phi and psi turn about one axis and have no rates of their own.
+    Raises ValueError where sin(theta) is 0 to rounding: phi and psi then rotate about the same axis and have no rates.
     """
     (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
     if np.any(np.abs(st) <= 4 * np.finfo(float).eps):
         raise ValueError(
             "the rates of the 3-1-3 Euler angles are singular at theta = 0 and theta = pi (sin theta = 0), "
-            "where phi and psi turn about one and the same axis; use the angular velocity itself there"
+            "where phi and psi rotate about the same axis; use the angular velocity instead"
         )
     w1, w2, w3 = np.moveaxis(np.asarray(angular_velocity_body, dtype=float), -1, 0)
     phi_dot = (w1 * sp + w2 * cp) / st
@@ -155,7 +155,7 @@ def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> 
 
 
 def attitude_matrix(rotation: np.ndarray) -> np.ndarray:
-    """T = Q^T (..., 3, 3) of the satellite texts: lab to body, dT/dt = -hat(omega_body) T."""
+    """T = Q^T (..., 3, 3) of the satellite literature: lab to body, dT/dt = -hat(omega_body) T."""
     return np.swapaxes(np.asarray(rotation, dtype=float), -1, -2).copy()
 
 
@@ -174,9 +174,8 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 def orthogonality_error(rotation: np.ndarray) -> float:
     """Largest entry of |Q^T Q - 1| over a stack (..., 3, 3); 0 for an empty stack.
 
-    The split rotor multiplies Q by plane rotations whose cos² + sin² is 1 to rounding, so each step adds at most a few
-    1e-17 of random sign and nothing pulls Q back: the error grows like a random walk, and its size tells how long the
-    run can still be trusted.
+    The split rotor multiplies Q by plane rotations whose cos² + sin² is 1 to rounding. Each step adds at most a few
+    1e-17 of random sign, and nothing corrects Q, so the error grows like a random walk.
     """
     if len(rotation) == 0:
         return 0.0
@@ -187,7 +186,7 @@ def align(points_body: np.ndarray, points_lab: np.ndarray, weights: np.ndarray) 
     """Best proper rotations Q (n, 3, 3) with Q points_body ~ points_lab (Kabsch 1976, Acta Cryst. A32, 922).
 
     points_body (s, 3) and points_lab (n, s, 3) relative to their weighted centres; weights (s,), in practice masses.
-    Linear and planar bodies are fine; a mirror image is not reached, since only proper rotations are allowed.
+    Linear and planar bodies are allowed. A mirror image is not matched, because the rotations are proper.
     """
     covariance = np.einsum("s,nsi,sj->nij", weights, points_lab, points_body)
     u, _, vt = np.linalg.svd(covariance)
@@ -207,6 +206,6 @@ def _cosines_and_sines(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Angle in (-pi, pi]; arctan2 alone gives -pi for a sine of -0 or one too small to show beside pi."""
+    """Angle in (-pi, pi]; arctan2 alone gives -pi for a sine of -0, or a negative one too small to change pi."""
     angle = np.arctan2(sine, cosine)
     return np.where(angle <= -np.pi, np.pi, angle)

@@ -1,6 +1,6 @@
-"""Free-rotor flows: how a body turns under no torque.
+"""Free-rotor flows: the rotation of a body without torque.
 
-A rotor is a term: `turn(rotor, ...)` is chosen by its type when compiled, so a scene of points compiles no rotation.
+A rotor is a term: `turn(rotor, ...)` is chosen by its type at compile time, so a scene of points compiles no rotation.
 """
 
 from math import cos, inf, nan, sin, sqrt
@@ -16,36 +16,38 @@ from rigidmd.mechanics.course import Course, rate, value
 class SplitRotor(NamedTuple):
     """Composition of exact rotations: about L, and about the principal axes (Dullweber, Leimkuhler & McLachlan 1997).
 
-    H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part, a round body, turns about L and commutes with the rest, which
-    is Ra(h/2) Rb(h/2) Rc(h) Rb(h/2) Ra(h/2): order 2, symplectic, reversible; |L| and Q^T Q are kept to rounding.
+    H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part, a spherical top, rotates about L and commutes with the rest,
+    which is Ra(h/2) Rb(h/2) Rc(h) Rb(h/2) Ra(h/2): order 2, symplectic, reversible; |L| and Q^T Q are conserved to
+    rounding.
 
-    a is the axis of the middle 1/I, b that of the one farther from it, c the third; g = (2/I_a + 1/I_c)/3.
-    With x, y, z = L_a², L_b², L_c² and A, B, C = 1/I - g, what any such composition conserves to order h² is H + h²/24
-    times 2A (C - B) (B y (x - z) + C z (y - x)) - B²C y (x - z) - 2BC² z (y - x) - A² (B - C) x (z - y). With this g
-    C = -2A, which leaves A² ((2A - 3B) xy + 8A yz + (3B - 10A) zx): second order in 1/I_a - 1/I_c. Its rms in thermal
-    motion is 1/8 (SPC/E water), 1/140 (H2S) of the smallest of any order of axes with g = 0; of the smallest with
-    g = 1/I_c (DLML's symmetric and asymmetric part) less than 1/6 for each of 1,000 random bodies, 1/19 for most.
+    a is the axis of the middle 1/I, b the axis whose 1/I is farther from it, c the third; g = (2/I_a + 1/I_c)/3.
+    With x, y, z = L_a², L_b², L_c² and A, B, C = 1/I - g, any such composition conserves, to order h², H + h²/24 times
+    2A (C - B) (B y (x - z) + C z (y - x)) - B²C y (x - z) - 2BC² z (y - x) - A² (B - C) x (z - y). This g makes C = -2A
+    and the error A² ((2A - 3B) xy + 8A yz + (3B - 10A) zx), of second order in 1/I_a - 1/I_c. Its rms in thermal motion
+    is 1/8 (SPC/E water) and 1/140 (H2S) of the smallest rms of any order of axes with g = 0. Compared with the smallest
+    for g = 1/I_c (the symmetric and asymmetric part of Dullweber et al.), it is less than 1/6 for each of 1,000 random
+    bodies, and 1/19 for most.
 
-    Bodies with two equal moments turn exactly: A = C = 0, and of a linear or spherical body nothing but g is left.
+    The flow of bodies with two equal moments is exact: A = C = 0. For a linear or spherical body only g remains.
     """
 
     inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
     symmetry: np.ndarray  # (species,) ROUND, or the axis of symmetry 0, 1, 2, or NONE
     common: np.ndarray  # (species,) g
-    excess: np.ndarray  # (species, 3) 1/I - g; 0 of linear bodies, for on their axis no momentum can be
+    excess: np.ndarray  # (species, 3) 1/I - g; 0 for linear bodies, which have no momentum along their axis
     order: np.ndarray  # (species, 3) axes a, b, c
 
 
 class ExactRotor(NamedTuple):
-    """The free motion itself, to rounding, for any body and any time step.
+    """The exact free motion, to rounding, for any body and any time step.
 
-    Bodies with two equal moments turn in closed form; any other by the Taylor series of omega and of the quaternion of
-    the turn, whose terms follow from one another (omega' and q' are quadratic) and are summed until they no longer
-    count. Unlike Jacobi's functions it has no limits that need care (m -> 1, L along an axis, moments nearly equal). A
-    turn of 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are taken in parts.
+    Bodies with two equal moments have a closed form. For all others, the Taylor series of omega and of the quaternion
+    of the rotation are summed to rounding. Their terms follow by recurrence, because omega' and q' are quadratic.
+    Unlike Jacobi's functions, the series need no special cases (m -> 1, L along an axis, nearly equal moments). A
+    rotation by 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are divided into parts.
     """
 
-    inverse_inertia: np.ndarray  # these as in SplitRotor
+    inverse_inertia: np.ndarray  # these five as in SplitRotor
     symmetry: np.ndarray
     common: np.ndarray
     excess: np.ndarray
@@ -54,8 +56,8 @@ class ExactRotor(NamedTuple):
 
 NONE, ROUND = -1, 3  # of SplitRotor.symmetry
 MOST_TERMS = 30
-#: rad in one drift. A body that blows up would otherwise be turned part by part for hours; it becomes no number, which
-#: stops the run.
+#: rad in one drift. A body that gains energy without bound would otherwise be rotated in parts for hours; its momentum
+#: is set to NaN, which stops the run.
 LONGEST_TURN = 1e4
 SHORT = 0.0625  # square of an angle, rad²
 LONGEST_PART = 0.5  # rad; 0.3 rad takes 14 terms, 1 rad 26
@@ -72,7 +74,7 @@ def split_rotor(inertia: np.ndarray) -> SplitRotor:
 
 
 def _parts(inverse: np.ndarray) -> tuple[float, tuple[int, int, int]]:
-    """g and the axes a, b, c of SplitRotor; the axis of a symmetric body last, where it turns once."""
+    """g and the axes a, b, c of SplitRotor; for a symmetric body the axis of symmetry is last, with one rotation."""
     low, middle, high = np.argsort(inverse)
     far, near = (high, low) if inverse[middle] - inverse[low] < inverse[high] - inverse[middle] else (low, high)
     beyond = inverse[middle] - inverse[near]
@@ -86,12 +88,12 @@ def _symmetry(moments: np.ndarray) -> int:
 
 
 class DrivenRotor(NamedTuple):
-    """A single body that carries rotors or changes its inertia: L = I(t) omega + h(t), about fixed principal axes.
+    """A single body with rotors (wheels) or a changing inertia: L = I(t) omega + h(t), with fixed principal axes.
 
-    h is the angular momentum of all rotors relative to the lab, along the body's axes. L' = L x omega + n then holds
+    h is the angular momentum of all rotors relative to the lab, along the body's axes. L' = L x omega + n then includes
     the terms -h' and -I' omega of Euler's equations, and H = sum (L_k - h_k)²/(2 I_k) still splits into exact plane
-    rotations. I and h are those of the middle of each time interval; the exact changes of H with them are work done on
-    the body.
+    rotations. I and h are taken at the middle of each time interval. The changes of H with I and h are computed exactly
+    and counted as work done on the body.
     """
 
     inertia: Course
@@ -99,14 +101,14 @@ class DrivenRotor(NamedTuple):
 
 
 class NoRotor(NamedTuple):
-    """Points: nothing turns."""
+    """No rotation: points."""
 
     inverse_inertia: float = 0.0
 
 
 def turn(rotor, species, rotation, angular_momentum_body, m, h):
-    """Let molecule m of the given species turn freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1 L, in place."""
-    raise TypeError(f"{type(rotor).__name__} is no rotor, or this was called outside compiled code")
+    """Rotate molecule m of the given species freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1 L, in place."""
+    raise TypeError(f"{type(rotor).__name__} is not a rotor, or this was called outside compiled code")
 
 
 @implements(turn, inline=True)
@@ -136,7 +138,7 @@ def _turn_body(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel(inline=True)
 def turn_by_parts(rotor, species, rotation, angular_momentum_body, m, h):
-    """About L, then about the axes: the two commute."""
+    """Rotate about L, then about the axes; the two flows commute."""
     about_momentum(rotation, angular_momentum_body, m, h * rotor.common[species])
     a, b, c = rotor.order[species, 0], rotor.order[species, 1], rotor.order[species, 2]
     excess = rotor.excess[species]
@@ -145,7 +147,7 @@ def turn_by_parts(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel
 def turn_by_series(rotation, angular_momentum_body, m, inverse, h):
-    """Free motion of an asymmetric body by Taylor series of omega and of the quaternion of the turn."""
+    """Free motion of an asymmetric body by the Taylor series of omega and of the quaternion of the rotation."""
     L = angular_momentum_body[m]
     fastest = abs(L[0] * inverse[0]) + abs(L[1] * inverse[1]) + abs(L[2] * inverse[2])
     if not 0.0 < fastest * abs(h) < inf:
@@ -158,7 +160,7 @@ def turn_by_series(rotation, angular_momentum_body, m, inverse, h):
     a0 = part * inverse[0] * (1 / inverse[1] - 1 / inverse[2])
     a1 = part * inverse[1] * (1 / inverse[2] - 1 / inverse[0])
     a2 = part * inverse[2] * (1 / inverse[0] - 1 / inverse[1])
-    terms = np.empty((MOST_TERMS + 1, 7))  # omega h^k/k! and q h^k/k! of the k-th derivatives
+    terms = np.empty((MOST_TERMS + 1, 7))  # k-th derivatives of omega and q, times h^k/k!
     for _ in range(parts):
         terms[0, 0] = L[0] * inverse[0]
         terms[0, 1] = L[1] * inverse[1]
@@ -212,7 +214,7 @@ def apply_turn(rotation, angular_momentum_body, m, w, x, y, z):
 
 @kernel(inline=True)
 def turned(a, b, d, x, y, z, first, second):
-    """v + first u x v + second u x (u x v) of v = (a, b, d), u = (x, y, z): a turn, written as a change."""
+    """v + first u x v + second u x (u x v) for v = (a, b, d), u = (x, y, z): a rotation, written as a change."""
     p = y * d - z * b
     q = z * a - x * d
     r = x * b - y * a
@@ -234,9 +236,9 @@ def turn_rows(rotation, x, y, z, first, second):
 
 @kernel(inline=True)
 def turn_by_axes(rotation, angular_momentum_body, m, order, rate, offset, h):
-    """Five exact rotations about the axes in this order, angles h rate (L_k - offset).
+    """Five exact rotations about the axes in this order, by angles h rate (L_k - offset).
 
-    A gyrostat's offset is the momentum of its rotors.
+    The offset of a gyrostat is the momentum of its rotors.
     """
     L = angular_momentum_body
     a, b, c = order
@@ -267,10 +269,10 @@ def about_axis(rotation, angular_momentum_body, m, k, angle):
 
 @kernel(inline=True)
 def sine_and_versine(angle):
-    """sin and 1 - cos, which a turn adds to what it turns.
+    """sin and 1 - cos of an angle, for rotations that are written as a change.
 
-    cos² + sin² is 1 only to rounding, and a turn by the same angle repeats the same error at every step: written as a
-    change, its error is smaller by the angle squared, and only the sum rounds, differently every time.
+    cos² + sin² is 1 only to rounding, and a rotation by the same angle would repeat the same error at every step.
+    Written as a change, the error is smaller by the angle squared, and only the sum rounds, differently each time.
     """
     odd, even = of_square(angle * angle)
     return angle * odd, angle * angle * even
@@ -289,7 +291,7 @@ def of_square(x):
 
 @kernel(inline=True)
 def series_of_square(x):
-    """The same by Taylor's series: below SHORT, where steps are, good to rounding, and faster than the library."""
+    """`of_square` by Taylor series: accurate to rounding below SHORT, and faster than sin and cos of the library."""
     x2 = x * x
     odd = (1 - 1 / 6 * x) + x2 * (
         (1 / 120 - 1 / 5040 * x) + x2 * ((1 / 362880 - 1 / 39916800 * x) + 1 / 6227020800 * x2)
@@ -302,20 +304,20 @@ def series_of_square(x):
 
 @kernel(inline=True)
 def about_momentum(rotation, angular_momentum_body, m, share):
-    """Turn about L by the angle share |L|: L stays, Q <- Q R(share L)."""
+    """Rotate about L by the angle share |L|: L is constant, Q <- Q R(share L)."""
     L = angular_momentum_body[m]
     turn_along(rotation[m], share * L[0], share * L[1], share * L[2])
 
 
 @kernel(inline=True)
 def turn_along(rotation, x, y, z):
-    """Q <- Q R, with R the rotation by the vector (x, y, z), in the body frame. Without its length a third faster."""
+    """Q <- Q R with the rotation vector (x, y, z) of R, body frame. It avoids the length, which is a third faster."""
     odd, even = of_square(x * x + y * y + z * z)
     turn_rows(rotation, x, y, z, -odd, even)
 
 
 def turn_alone(rotor, state, time, h):
-    """Let a single body turn freely from `time` for h, in place."""
+    """Rotate a single body freely from `time` to time + h, in place."""
     raise TypeError("compiled code only")
 
 
@@ -352,7 +354,7 @@ def driven_energy(rotor, angular_momentum_body, time):
 
 
 def moments(rotor, time, k):
-    """(1/I_k, h_k) of a single body's rotor at a time; 1/I_k is 0 about an axis without inertia."""
+    """(1/I_k, h_k) of a single body's rotor at a time; 1/I_k is 0 for an axis without inertia."""
     raise TypeError("compiled code only")
 
 

@@ -1,7 +1,7 @@
-"""Homogeneous solids by name: principal moments, an outline to draw, and the fluid an ellipsoid carries along.
+"""Homogeneous solids by name: principal moments, an outline to draw, and the added mass of an ellipsoid in a fluid.
 
-Every solid here is one of unit size stretched along the axes 1, 2, 3 of its principal frame; axis 3 is its axis of
-symmetry and the origin its centre of mass. Nothing depends on the units as long as they belong together.
+Every solid is one of unit size, stretched along the axes 1, 2, 3 of its principal frame. Axis 3 is the axis of
+symmetry, and the origin is the centre of mass. Any consistent units may be used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,17 +12,18 @@ import numpy as np
 
 
 class Solid(NamedTuple):
-    """A homogeneous solid: principal moments inertia (3,), outline (k, 3) of points on it to draw, body frame."""
+    """A homogeneous solid: principal moments `inertia` (3,), and an `outline` (k, 3) of points to draw, body frame."""
 
     inertia: np.ndarray
     outline: np.ndarray
 
 
 class Shape(NamedTuple):
-    """A kind of solid, as it is when all its dimensions are 1.
+    """A kind of solid with all dimensions equal to 1.
 
-    dimensions: the axes (of 0, 1, 2) that each dimension stretches, by the name it has in a scene; an axis that none
-    stretches is thin. mean_squares (3,): <x²>, <y²>, <z²> over its mass. outline (k, 3): points on its surface.
+    dimensions: the axes (0, 1, 2) that each dimension stretches, by the name of the dimension in a scene; the solid is
+    thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²> over its mass. outline (k, 3): points on
+    its surface.
     """
 
     dimensions: dict[str, list[int]]
@@ -30,18 +31,18 @@ class Shape(NamedTuple):
     outline: np.ndarray
 
 
-#: How many numbers each dimension is.
+#: How many numbers each dimension has.
 NUMBERS = {"radius_m": 1, "height_m": 1, "length_m": 1, "lengths_m": 3, "semi_axes_m": 3}
 
 
 def _ring(count: int, radius: float, z: float) -> np.ndarray:
-    """count points (count, 3) evenly on the circle of this radius about axis 3 at height z."""
+    """Points (count, 3), evenly spaced on a circle of this radius about axis 3 at height z."""
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], axis=-1)
 
 
 def _outline(*rings: tuple[int, float, float]) -> np.ndarray:
-    """Points (k, 3) of all rings (count, radius, z) together; a ring of one point and radius 0 is a tip or a centre."""
+    """Points (k, 3) of all rings (count, radius, z); a ring of one point with radius 0 is a tip or a centre."""
     return np.concatenate([_ring(*ring) for ring in rings])
 
 
@@ -73,7 +74,11 @@ SOLIDS = {
 
 
 def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[float]]) -> Solid:
-    """The homogeneous solid of this mass: a key of SOLIDS and all dimensions it names, NUMBERS numbers each."""
+    """The homogeneous solid of this mass.
+
+    shape : a key of SOLIDS
+    dimensions : all dimensions of that shape, each with as many numbers as NUMBERS says
+    """
     unit = SOLIDS[shape]
     stretch = np.zeros(3)
     for name, axes in unit.dimensions.items():
@@ -86,18 +91,18 @@ def added_mass_of_ellipsoid(semi_axes: Sequence[float], density: float) -> tuple
     """Added mass (3,) and added inertia (3,) along and about the axes of an ellipsoid in an ideal fluid at rest.
 
     semi_axes (3,), all positive; density of the fluid. H. Lamb, Hydrodynamics (6th ed. 1932), art. 114-115, with
-    alpha_i = abc ∫ dl / ((a_i² + l) Delta), whose sum is 2. His differences are written as integrals of one sign:
+    alpha_i = abc ∫ dl / ((a_i² + l) Delta), whose sum is 2. Lamb's differences are written as integrals of one sign:
     gamma - beta = (b² - c²) near and 2 (b² - c²) + (b² + c²) (beta - gamma) = (b² - c²) (alpha + 2 far), so that
-    (b² - c²)² near / (alpha + 2 far) has neither the 0/0 of equal axes nor the cancellation close to it.
+    (b² - c²)² near / (alpha + 2 far) is not 0/0 for equal axes, and has no cancellation for nearly equal ones.
     """
-    from scipy.special import elliprd  # scenes of other solids need no SciPy
+    from scipy.special import elliprd  # other solids do not need SciPy
 
     axes = np.asarray(semi_axes, dtype=float)
     following, last = axes[[1, 2, 0]], axes[[2, 0, 1]]
     a, b, c = axes**2, following**2, last**2
     alpha = 2 / 3 * axes.prod() * elliprd(b, c, a)
-    # The trapezoid rule in log l is exact to rounding: the integrands are analytic in a strip of ± pi about the real
-    # axis of log l, and fall off as powers of l at both ends, by more than 1e-16 within these limits.
+    # The trapezoidal rule in log l is exact to rounding: the integrands are analytic in a strip of ± pi about the real
+    # axis of log l, and decay as powers of l at both ends, to below 1e-16 at these limits.
     step = 0.4
     l = np.exp(np.arange(np.log(a.min()) - 40, np.log(a.max()) + 30, step))[:, None]  # noqa: E741
     weight = step * l * axes.prod() / (np.sqrt(a + l) * ((b + l) * (c + l)) ** 1.5)

@@ -51,12 +51,12 @@ from scipy.special import erfc
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.system import build
 from rigidmd.compile.cache import cache_folder
-from rigidmd.forces.waves.ewald import in_energy_units, intramolecular_energy
+from rigidmd.forces.waves.corrections import intramolecular_energy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import align
 from rigidmd.output.report import FAINT, INK
-from rigidmd.units import COULOMB, KJ_PER_MOL
+from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 HERE = Path(__file__).resolve().parent
 SPEED_STEP = 2.0  # fs
@@ -298,7 +298,7 @@ def describe(work: Workload, folder: Path) -> Start:
     potentials["RF without self"] = potentials["RF"] - own
     if work.pme:  # LAMMPS sums over k with the pairs inside molecules, and takes none of them out
         alpha = build(Scene.from_dict(work.scene(), folder)).terms["coulomb_real"].law.alpha
-        inside = intramolecular_energy(in_energy_units(species.charges), species.positions_body, alpha)
+        inside = intramolecular_energy(species.charges * COULOMB_CHARGE, species.positions_body, alpha)
         potentials["DSF"] = potentials["RF"] - inside / KJ_PER_MOL
         sites["alpha"] = np.array(alpha)
     elif work.charged:

@@ -1,1 +1,1 @@
-"""What acts on a single body: fields, resistance, the axes it is told in."""
+"""What acts on a single body: fields, resistance, and the frame of reference."""

@@ -1,4 +1,4 @@
-"""Forces on a single body from outside: weight, buoyancy, whatever a scene or a Python function applies."""
+"""External forces on a single body: weight, buoyancy, and those that a scene or a Python function applies."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ class SteadyForce(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Force at a point of the body and torque, each following time as told; along the lab's or the body's axes."""
+    """A force at a point of the body and a torque, given functions of time, along the lab's or the body's axes."""
 
     force: Course
     torque: Course
@@ -27,7 +27,7 @@ class Drive(NamedTuple):
     follows_body: bool  # force and torque are given along the body's axes
 
     def workspace(self, setup: Setup) -> "Driving":
-        """Room for what it is at present."""
+        """Room for its present values."""
         return Driving(*self, np.zeros(3), np.zeros(3))
 
 
@@ -39,23 +39,23 @@ class Driving(NamedTuple):
     point: np.ndarray
     follows_body: bool
     force_lab: np.ndarray  # (3,) as last evaluated
-    torque_body: np.ndarray  # (3,) as last evaluated, that of the force included
+    torque_body: np.ndarray  # (3,) as last evaluated, including that of the force
 
     drives = True
 
 
 class Told(NamedTuple):
-    """Force and torque that a Python function says; the engine knows which one."""
+    """Force and torque from a Python function, which the engine holds."""
 
     def workspace(self, setup: Setup) -> "Asked":
-        """Room for the answer."""
+        """Room for the values."""
         return Asked(np.zeros(1, np.int64), np.zeros(3), np.zeros(3))
 
 
 class Asked(NamedTuple):
-    """Workspace of a `Told`; it asks wherever positions have changed."""
+    """Workspace of a `Told`; it asks for new values whenever positions have changed."""
 
-    fresh: np.ndarray  # (1,) whether the answer is that for the present moment
+    fresh: np.ndarray  # (1,) 1 if the values are those of the present moment
     force_lab: np.ndarray  # (3,)
     torque_body: np.ndarray  # (3,)
 
@@ -74,17 +74,34 @@ def _add_steady_force(term, state, load, tally):
         for k in range(len(load.torque_body)):
             add_torque(term.point, state.rotation[k], term.force, load.torque_body[k])
         if tally is not None:
-            for i in range(3):
-                x = 0.0
-                if len(state.position):
-                    x += state.position[0, i]
-                if len(state.rotation):
-                    q = state.rotation[0]
-                    x += q[i, 0] * term.point[0] + q[i, 1] * term.point[1] + q[i, 2] * term.point[2]
-                tally[0] -= term.force[i] * x
+            tally[0] += steady_energy(term, state.position, state.rotation)
         return OK
 
     return add_steady_force
+
+
+@kernel(inline=True)
+def steady_energy(term, position, rotation):
+    """-F . (X + Q point) of the body; position and rotation as in State, empty where the body has none."""
+    energy = 0.0
+    for i in range(3):
+        x = 0.0
+        if len(position):
+            x += position[0, i]
+        if len(rotation):
+            q = rotation[0]
+            x += q[i, 0] * term.point[0] + q[i, 1] * term.point[1] + q[i, 2] * term.point[2]
+        energy -= term.force[i] * x
+    return energy
+
+
+@kernel(outer=True)
+def steady_energies(term, position, rotation):
+    """`steady_energy` at t times, (t,); position and rotation as in State, stacked along a new axis 0."""
+    energy = np.empty(len(position))
+    for t in range(len(energy)):
+        energy[t] = steady_energy(term, position[t], rotation[t])
+    return energy
 
 
 @kernel(inline=True)
@@ -139,7 +156,7 @@ def _add_told(term, state, load, tally):
 
 @kernel(inline=True)
 def hand_over(term, load):
-    """Add a term's present force and torque to the load of the one body."""
+    """Add a term's present force and torque to the load of the body."""
     for k in range(len(load.force)):
         for i in range(3):
             load.force[k, i] += term.force_lab[i]
@@ -167,7 +184,7 @@ def _drive_power(term, state, velocity, omega):
 
 
 def answer(term: Asked, function, state) -> None:
-    """Ask a Python function of (time, state) for its force (3,) in the lab and torque (3,) in the body frame."""
+    """Call a Python function of (time, state) for a force (3,) in the lab frame and a torque (3,) in the body frame."""
     force, torque = function(float(state.time[0]), state)
     term.force_lab[:] = force
     term.torque_body[:] = torque

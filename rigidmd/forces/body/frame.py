@@ -1,8 +1,8 @@
-"""Accelerated frames: motion told relative to axes that turn, from an origin that may be accelerated.
+"""Non-inertial frames: motion relative to axes that rotate, about an origin that may be accelerated.
 
-Momenta stay those relative to axes that do not turn, only written along the frame's axes. Then the frame adds one flow,
-a plain rotation of position, velocity and Q; Coriolis, centrifugal and Euler forces come out without being computed.
-The acceleration of the origin is a uniform field.
+Momenta remain those relative to non-rotating axes, with components along the frame's axes. The frame then adds one
+flow, a rotation of position, velocity and Q; Coriolis, centrifugal and Euler forces follow without being computed. The
+acceleration of the origin is a uniform field.
 """
 
 from math import sqrt
@@ -14,22 +14,23 @@ from rigidmd.mechanics.rotor import sine_and_versine, turned
 
 
 class Inertial(NamedTuple):
-    """Axes that do not turn."""
+    """Axes that do not rotate."""
 
     rate: float = 0.0
 
 
 class Turning(NamedTuple):
-    """Axes that turn. Exact for a constant rate, and for one that changes linearly about a fixed direction.
+    """Axes that rotate. The flow is exact for a constant rate, and for one that changes linearly about a fixed axis.
 
-    Else each drift is of order 2 and symmetric: compositions of such steps keep their order, other schemes fall to 2.
+    Otherwise each drift is of order 2 and symmetric: compositions of symmetric steps keep their order, other schemes
+    fall to order 2.
     """
 
     angular_velocity: Course  # along the frame's own axes
 
 
 def follow(frame, state, time, h):
-    """Write the state of a single body along the frame's axes as they are at time + h, in place."""
+    """Rotate the state of a single body from the frame's axes at `time` to those at time + h, in place."""
     raise TypeError("compiled code only")
 
 
@@ -55,7 +56,7 @@ def _follow(frame, state, time, h):
 
 @kernel(inline=True)
 def turn_vector(vector, x, y, z):
-    """Turn a vector (3,) by the rotation vector (x, y, z), in place (Rodrigues)."""
+    """Rotate a vector (3,) by the rotation vector (x, y, z), in place (Rodrigues)."""
     angle = sqrt(x * x + y * y + z * z)
     if angle == 0.0:
         return

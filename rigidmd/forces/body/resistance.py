@@ -1,8 +1,8 @@
 """Resistance: bearings, air and fluids that take energy from a single body, along and about its own axes.
 
-It acts within the kick: momentum under a constant load and resistance, positions held, follows each axis in closed
-form. So a body in a thick fluid moves at its terminal speed whatever the step, and dry friction holds what it can hold.
-The step is of order 2.
+It acts within the kick: with positions fixed, the momentum along each axis under a constant load and resistance has a
+closed form. So a body in a viscous fluid moves at its terminal speed for any step, and dry friction holds a body at
+rest as it should. The step is of order 2.
 """
 
 from math import copysign, exp, expm1, log1p, sqrt
@@ -16,21 +16,21 @@ from rigidmd.forces.body.frame import frame_rate
 from rigidmd.mechanics.flight import Pinned, along, inertial_mass
 from rigidmd.mechanics.rotor import NoRotor, moments
 
-MOST_TRIALS = 100  # of |v|; some six are needed
-SAME_SIZE = 1e-14
+MOST_TRIALS = 100  # values of |v|; about six are needed
+SAME_SIZE = 1e-14  # relative error of |v|
 
 
 class NoResistance(NamedTuple):
-    """Nothing is lost."""
+    """No resistance."""
 
     nothing: float = 0.0
 
 
 class Resistance(NamedTuple):
-    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), by body axis.
+    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for each body axis.
 
-    v and w are relative to the frame, |v| and |w| their whole size, so equal coefficients mean resistance alike in all
-    directions. Dry friction is that of a bearing about a body axis under constant load.
+    v and w are relative to the frame; |v| and |w| are the lengths of the vectors, so equal coefficients mean isotropic
+    resistance. Dry friction is that of a bearing about a body axis under constant load.
     """
 
     linear: np.ndarray  # (3,)
@@ -41,7 +41,7 @@ class Resistance(NamedTuple):
 
 
 def push(resistance, flight, rotor, frame, state, load, h):
-    """Momentum of a single body under a load and resistance for a time h, positions held, in place."""
+    """Change the momenta of a single body by a load and resistance for a time h at fixed positions, in place."""
     raise TypeError("compiled code only")
 
 
@@ -56,7 +56,7 @@ def _push(resistance, flight, rotor, frame, state, load, h):
                     state.velocity[m, k] += h / flight.mass * load.force[m, k]
             for m in range(len(load.torque_body)):
                 for k in range(3):
-                    if moments(rotor, state.time[0], k)[0] > 0:  # no momentum gathers on an axis without inertia
+                    if moments(rotor, state.time[0], k)[0] > 0:  # an axis without inertia has no momentum
                         state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
 
         return push_freely
@@ -72,7 +72,7 @@ def _push(resistance, flight, rotor, frame, state, load, h):
 
 @kernel
 def push_spin(resistance, rotor, frame, state, load, h):
-    """L under torque and resistance; |w| is that of the middle of the kick."""
+    """Change L by torque and resistance; |w| is its value at the middle of the kick."""
     W = frame_rate(frame, state.time[0])
     q = state.rotation[0]
     L = state.angular_momentum_body[0]
@@ -97,10 +97,10 @@ def push_spin(resistance, rotor, frame, state, load, h):
 
 @kernel
 def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
-    """|v| at the middle of a kick whose resistance is that of this very |v|, v its start, per unit inertia.
+    """|v| at the middle of a kick, consistent with the resistance that this |v| causes; all per unit inertia.
 
-    Between 0 and the most that the push can make of v, |v| found less |v| assumed changes sign: a root by regula falsi
-    (Illinois). A first guess alone would brake a fast body to nothing at the middle, and then not at all.
+    The computed |v| minus the assumed |v| changes sign between 0 and the largest |v| that the push can produce; regula
+    falsi (Illinois) finds the root. A single guess would brake a fast body to rest at the middle, or not at all.
     """
     if quadratic[0] == 0.0 and quadratic[1] == 0.0 and quadratic[2] == 0.0:
         return 0.0
@@ -131,7 +131,7 @@ def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
 
 @kernel
 def size_found(before, pushes, dries, inverse, linear, quadratic, h, size):
-    """|v| after half of h with the resistance of a |v|."""
+    """|v| after half of h, with the resistance of an assumed |v| = size."""
     squares = 0.0
     for k in range(3):
         if inverse[k] > 0.0:
@@ -142,7 +142,7 @@ def size_found(before, pushes, dries, inverse, linear, quadratic, h, size):
 
 
 def push_flight(resistance, flight, rotor, frame, state, load, h):
-    """Velocity (or impulse over mass) under force and resistance; |v| as |w| in `push_spin`."""
+    """Change the velocity (or impulse over mass) by force and resistance; |v| is treated like |w| in `push_spin`."""
     raise TypeError("compiled code only")
 
 
@@ -177,7 +177,7 @@ def _push_flight(resistance, flight, rotor, frame, state, load, h):
             state.books[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
             gain = (after - before[k]) * mass[k] / flight.mass
             if turns:
-                for i in range(3):  # along axis k only: what the other axes see stays as it was
+                for i in range(3):  # along axis k only, so that components along the other axes do not change
                     V[i] += state.rotation[0, i, k] * gain
             else:
                 V[k] += gain
@@ -187,9 +187,9 @@ def _push_flight(resistance, flight, rotor, frame, state, load, h):
 
 @kernel
 def pushed(speed, push, dry, linear, h):
-    """(s, integral of s) after h of s' = push - dry sign(s) - linear s, per unit inertia; dry and linear not negative.
+    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0.
 
-    Dry friction brings it to rest in finite time, and holds it there unless the push is stronger.
+    Dry friction brings the motion to rest in a finite time, and holds it at rest unless the push is stronger.
     """
     s = abs(speed)
     sign = copysign(1.0, speed)
@@ -200,7 +200,7 @@ def pushed(speed, push, dry, linear, h):
     net = sign * push - dry
     if net < 0.0:
         rest = log1p(linear * s / -net) / linear if linear > 0.0 else s / -net
-        if rest <= h:  # it stops, and may then be pushed the other way
+        if rest <= h:  # it stops, and the push may then reverse the motion
             back = max(0.0, abs(push) - dry) if sign * push < 0.0 else 0.0
             there = eased(linear, rest)
             after, way = run_up(0.0, back, linear, h - rest)
@@ -211,16 +211,16 @@ def pushed(speed, push, dry, linear, h):
 
 @kernel(inline=True)
 def run_up(s, net, linear, h):
-    """(s, way) of s' = net - linear s."""
+    """(s, integral of s) after a time h of s' = net - linear s."""
     first, second = eased(linear, h)
     return s * exp(-linear * h) + net * first, s * first + net * second
 
 
 @kernel(inline=True)
 def eased(linear, h):
-    """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h: h and h²/2 where nothing resists."""
+    """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h; h and h²/2 without resistance."""
     x = linear * h
-    if x < 1e-2:  # the difference of nearly equal numbers, by its series
+    if x < 1e-2:  # a series avoids the difference of nearly equal numbers
         return (
             h * (1 - x / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6 * (1 - x / 7)))))),
             h * h / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6 * (1 - x / 7))))),
@@ -230,7 +230,7 @@ def eased(linear, h):
 
 
 def braking(resistance, state, load, velocity, omega):
-    """Add resistance to a load at a velocity (lab) and angular velocity (body), relative to the frame; its power."""
+    """Add resistance to a load, and return its power; velocity (lab), angular velocity (body) relative to the frame."""
     raise TypeError("compiled code only")
 
 

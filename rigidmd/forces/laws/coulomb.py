@@ -9,19 +9,19 @@ from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.compile.lanes import inverse_root, load, zeros
 from rigidmd.forces.laws.endings import SWITCHES, Name, Polynomial, Shape, ended, ending, shape_of
 from rigidmd.forces.pairs import loop as pairs
-from rigidmd.units import COULOMB
+from rigidmd.units import COULOMB_CHARGE
 
 
 class ReactionField(NamedTuple):
     """q_i q_j (1/r + field r²), with an ending at the cut-off.
 
-    field = (eps - 1)/((2 eps + 1) cutoff³): the continuum of permittivity eps beyond the cut-off answers the charges
-    inside (Tironi et al. 1995, J. Chem. Phys. 102, 5451). Without a cut-off the field is 0: plain Coulomb.
+    field = (eps - 1)/((2 eps + 1) cutoff³) is the response of a continuum of permittivity eps beyond the cut-off to the
+    charges inside (Tironi et al. 1995, J. Chem. Phys. 102, 5451). Without a cut-off the field is 0: plain Coulomb.
     """
 
     cutoff: float  # Å
     shape: Shape
-    end: Polynomial  # see truncation.ending
+    end: Polynomial  # see endings.ending
     field: float  # 1/Å³
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
@@ -33,7 +33,7 @@ class ReactionField(NamedTuple):
 def reaction_field(
     charge_e: np.ndarray, cutoff: float, permittivity: float = inf, name: Name = "plain", start: float = 0.0
 ) -> ReactionField:
-    """The law for sites with charges (s,) in e; permittivity of the continuum, `inf` for a conductor."""
+    """The law for sites with charges (s,) in e; the permittivity of the continuum is `inf` for a conductor."""
     shape = shape_of(name, cutoff, start)
     strength = 0.5 if permittivity == inf else (permittivity - 1) / (2 * permittivity + 1)
     field = strength / cutoff**3
@@ -41,10 +41,10 @@ def reaction_field(
     def at(r: float) -> tuple[float, float, float]:
         return 1 / r + field * r**2, 1 / r**2 - 2 * field * r, -2 / r**3 - 2 * field
 
-    # A switching function multiplies what is left at the cut-off, and that must be little: the energy is first shifted
-    # to zero there. Unshifted, two unit charges would lose 230 kJ/mol between 8 and 9 Å.
+    # A switching function multiplies the energy near the cut-off, which must be small there, so the energy is first
+    # shifted to zero at the cut-off. Unshifted, a pair of unit charges would lose 230 kJ/mol between 8 and 9 Å.
     end = ending("shift" if name in SWITCHES else name, shape, at)
-    return ReactionField(cutoff, shape, end, field, charge_e * sqrt(COULOMB))
+    return ReactionField(cutoff, shape, end, field, charge_e * COULOMB_CHARGE)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
@@ -73,19 +73,14 @@ def _pair(law, i, j, r2):
 def _arrange(law, arranged, order):
     if not is_a(law, ReactionField):
         return None
-
-    def arrange(law, arranged, order):
-        for slot, i in enumerate(order):
-            arranged.charge[slot] = law.charge[i]
-
-    return arrange
+    return lambda law, arranged, order: pairs.into_slots(law.charge, arranged.charge, order)
 
 
 def self_energy(law: ReactionField, position: np.ndarray) -> float:
-    """Energy (u Å²/ps²) of one molecule's charges in the field that they themselves raise in the continuum.
+    """Energy (u Å²/ps²) of one molecule's charges in their own reaction field.
 
-    position (s, 3) of the molecule's charged sites in the order of law.charge's first s. Constant for a rigid body, so
-    no force comes of it; for a neutral molecule of dipole mu well inside the cut-off it is -field mu².
+    position (s, 3) of the molecule's charged sites, in the order of the first s of law.charge. It is constant for a
+    rigid body, so it exerts no force; for a neutral molecule of dipole mu well inside the cut-off it is -field mu².
     """
     charge = law.charge[: len(position)]
     energy = 0.5 * charge @ charge * law.end[0]

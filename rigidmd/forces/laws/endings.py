@@ -1,10 +1,10 @@
-"""How a radial law ends at its cut-off: plain, shift, force_shift, force_switch, switch or smooth_switch.
+"""Truncation of a radial law at its cut-off: plain, shift, force_shift, force_switch, switch or smooth_switch.
 
-A law is a sum of radial parts v(r). Inside the cut-off a part becomes
+A law is a sum of radial parts v(r). Inside the cut-off, v(r) becomes
 
     v(r) + constant - integral of p(x) dx,   x = r - start,   p(x) = linear + quadratic x² + cubic x³   (r > start)
 
-so p is what is added to the force -v'; or, for `switch` and `smooth_switch`, v(r) S(r) with S falling from 1 to 0.
+so p is added to the force -v'; or, for `switch` and `smooth_switch`, v(r) S(r) with S falling from 1 to 0.
 
 | name | what it does | continuous at the cut-off |
 |---|---|---|
@@ -15,8 +15,8 @@ so p is what is added to the force -v'; or, for `switch` and `smooth_switch`, v(
 | switch | multiplies the energy by a quintic beyond `start` (OpenMM) | energy, force, its derivative |
 | smooth_switch | multiplies the energy by a polynomial of degree 9 beyond `start` | also three more derivatives |
 
-An integrator has its order only where forces have as many derivatives: with `switch` those of order 4 and 6 fall off to
-about 3 in liquid water, with `smooth_switch` from 5 to 9 Å they have 4.0 and 6.
+An integrator reaches its order only if the forces have enough derivatives. In liquid water, integrators of order 4 and
+6 fall to about order 3 with `switch`; with `smooth_switch` from 5 to 9 Å they keep 4.0 and 6.
 """
 
 from collections.abc import Callable
@@ -31,27 +31,27 @@ NAMES: tuple[str, ...] = get_args(Name)
 
 
 class Plain(NamedTuple):
-    """Nothing happens before the cut-off; `plain` and `shift`."""
+    """No change of the force inside the cut-off; `plain` and `shift`."""
 
     cutoff: float  # Å, may be infinite
 
 
 class Bent(NamedTuple):
-    """A polynomial is added to the force from the start on; `force_shift` and `force_switch`."""
+    """A polynomial is added to the force beyond the start; `force_shift` and `force_switch`."""
 
     cutoff: float  # Å
     start: float  # Å
 
 
 class Switched(NamedTuple):
-    """The energy is multiplied by a polynomial of degree 5 that falls from 1 at the start to 0; `switch`."""
+    """The energy is multiplied by a polynomial of degree 5, from 1 at the start to 0 at the cut-off; `switch`."""
 
     cutoff: float  # Å
     start: float  # Å
 
 
 class SmoothlySwitched(NamedTuple):
-    """The same by one of degree 9; `smooth_switch`."""
+    """The energy is multiplied by a polynomial of degree 9, from 1 at the start to 0; `smooth_switch`."""
 
     cutoff: float  # Å
     start: float  # Å
@@ -63,7 +63,7 @@ SWITCHES = {"switch": Switched, "smooth_switch": SmoothlySwitched}
 
 
 def shape_of(name: Name, cutoff: float, start: float) -> Shape:
-    """The shape of the ending called `name`; `start` (Å) counts for force_switch and switch only."""
+    """The shape of the ending `name`; `start` (Å) matters for force_switch, switch and smooth_switch only."""
     if cutoff == inf or name in ("plain", "shift"):
         return Plain(cutoff)
     if name in SWITCHES:
@@ -72,7 +72,7 @@ def shape_of(name: Name, cutoff: float, start: float) -> Shape:
 
 
 def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, float, float]]) -> Polynomial:
-    """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) is its energy v, force -v' and -v''."""
+    """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) gives its energy v, force -v' and -v''."""
     if shape.cutoff == inf or name == "plain" or name in SWITCHES:
         return (0.0, 0.0, 0.0, 0.0)
     v, force, slope = at_cutoff(shape.cutoff)
@@ -87,9 +87,9 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
 
 
 def ended(shape, end, r, inverse, u, w):
-    """(energy, force/r) with the ending: u, w without it at distance r = 1/inverse; numbers or vectors.
+    """(energy, force/r) with the ending, from u, w without it at distance r = 1/inverse; scalars or vectors.
 
-    The constant of `end` is part of u already.
+    u already includes the constant of `end`.
     """
     raise TypeError("compiled code only")
 
@@ -123,7 +123,7 @@ def _ended(shape, end, r, inverse, u, w):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def added(end, x):
-    """(energy, force) that an ending adds at x = r - start >= 0, its constant not counted."""
+    """(energy, force) that an ending adds at x = r - start >= 0, without its constant."""
     linear = end[1]
     quadratic = end[2]
     cubic = end[3]
@@ -133,7 +133,7 @@ def added(end, x):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def quintic(shape, r):
-    """(S, dS/dr) of 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start), and 1 before the start."""
+    """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start); S = 1 below the start."""
     per_width = 1 / (shape.cutoff - shape.start)
     t = larger((r - shape.start) * per_width, 0.0)
     left = 1.0 - t
@@ -142,7 +142,7 @@ def quintic(shape, r):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def nonic(shape, r):
-    """The same of 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹."""
+    """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t as in `quintic`."""
     per_width = 1 / (shape.cutoff - shape.start)
     t = larger((r - shape.start) * per_width, 0.0)
     four = t * t * t * t

@@ -1,4 +1,4 @@
-"""Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), its endings at the cut-off, mixing rules, tail correction."""
+"""Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with endings at the cut-off, mixing rules, tail correction."""
 
 from math import pi
 from typing import Literal, NamedTuple
@@ -26,18 +26,18 @@ Mixing = Literal["lorentz-berthelot", "geometric"]
 
 
 class LennardJones(NamedTuple):
-    """c12/r¹² - c6/r⁶ between kinds of sites, each power with its own ending."""
+    """c12/r¹² - c6/r⁶ between kinds of sites; each power has its own ending."""
 
     cutoff: float  # Å
     shape: Shape
-    end12: Polynomial  # see truncation.ending
+    end12: Polynomial  # see endings.ending
     end6: Polynomial
     kind: np.ndarray  # (s,) kind of each site, index into c6 and c12
     c12: np.ndarray  # (kinds, kinds) u Å¹⁴/ps²
     c6: np.ndarray  # (kinds, kinds) u Å⁸/ps²
 
     def room(self, slots: int, dtype: type) -> "OneKind | ManyKinds":
-        """What the loop reads: two numbers where all sites are of one kind, else a table with room for all slots."""
+        """What the loop reads: two numbers if all sites are of one kind, else a table with room for all slots."""
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
             return OneKind(*head, float(self.c12[0, 0]), float(self.c6[0, 0]))
@@ -46,7 +46,7 @@ class LennardJones(NamedTuple):
 
 
 class OneKind(NamedTuple):
-    """The law between sites that are all of one kind."""
+    """The law for sites of a single kind."""
 
     cutoff: float
     shape: Shape
@@ -57,7 +57,7 @@ class OneKind(NamedTuple):
 
 
 class ManyKinds(NamedTuple):
-    """The law with what each kind does to the site in each slot, so that the loop loads it without gathering."""
+    """The law with coefficients between each kind and the site in each slot, so that the loop needs no gathers."""
 
     cutoff: float
     shape: Shape
@@ -80,7 +80,7 @@ def lennard_jones(
 ) -> LennardJones:
     """The law for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps².
 
-    special : (kind, kind) -> (sigma, epsilon) in place of the mixing rule, for both orders of the kinds
+    special : (kind, kind) -> (sigma, epsilon) instead of the mixing rule, for both orders of the kinds
     """
     shape = shape_of(name, cutoff, start)
     sigma_ij = (sigma[:, None] + sigma) / 2 if mixing == "lorentz-berthelot" else np.sqrt(sigma[:, None] * sigma)
@@ -100,7 +100,7 @@ def lennard_jones(
 
 
 def _inverse_power(p: int):
-    """r⁻ᵖ, its force and the derivative of its force."""
+    """Function of r that gives r⁻ᵖ, its force and the derivative of its force."""
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
 
 
@@ -130,7 +130,7 @@ def energy_and_force(law, c12, c6, r2):
 
 
 def inverses(shape, r2):
-    """(1/r², 1/r) at squared distances r2; the second is for endings, and no root is taken where there is none."""
+    """(1/r², 1/r) at squared distances r2; without an ending 1/r is not needed, and is 0 to save the square root."""
     raise TypeError("compiled code only")
 
 
@@ -148,7 +148,7 @@ def _inverses(shape, r2):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def mixed(end12, end6, c12, c6):
-    """The ending of a whole potential from those of its powers."""
+    """The ending of the whole potential from those of its two powers."""
     return (
         c12 * end12[0] - c6 * end6[0],
         c12 * end12[1] - c6 * end6[1],
@@ -175,7 +175,7 @@ def _arrange(law, arranged, order):
 
 
 class Tail(NamedTuple):
-    """What the cut-off takes away, at any volume."""
+    """Energy and pressure lost by the cut-off, at any volume."""
 
     energy_volume: float  # energy times the volume, u Å⁵/ps²
     pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
@@ -190,17 +190,17 @@ class Tail(NamedTuple):
 
 
 def tail(law: LennardJones) -> Tail:
-    """Energy and pressure that the cut-off takes away, for g(r) = 1 beyond where it acts.
+    """Energy and pressure lost by the cut-off, for g(r) = 1 where the ending changes the potential.
 
-    U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated); for endings that shift the whole
-    potential the constant inside counts too, as in GROMACS' dispersion correction. Allen & Tildesley (2017), 2.8.
-    All N² pairs are counted, those of a molecule with itself among them: a relative error of 1/(number of molecules).
+    U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated). For endings that shift the whole
+    potential the constant inside counts too, as in GROMACS' dispersion correction (Allen & Tildesley 2017, 2.8). All N²
+    pairs are counted, also those of a molecule with itself: a relative error of 1/(number of molecules).
     """
     count = np.bincount(law.kind, minlength=len(law.c6))
     energy = pressure = 0.0
     for sign, c, p, end in ((1, law.c12, 12, law.end12), (-1, law.c6, 6, law.end6)):
         lost = _lost(law, end, p)
-        # The pressure is that of the force alone: a jump of the energy at the cut-off (plain) has none.
+        # The pressure follows from the force alone: a jump of the energy at the cut-off (plain) does not contribute.
         jump = law.cutoff ** (3 - p) / 3 if end[0] == 0 and isinstance(law.shape, Plain) else 0.0
         strength = sign * count @ c @ count
         energy += 2 * pi * strength * lost

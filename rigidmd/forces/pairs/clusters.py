@@ -1,8 +1,8 @@
 """Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
 
-A slot is a place in that order. Positions are kept relative to the origin of their cluster, where a float32 has digits
-enough: 2e-7 Å for sites in each other's reach. Arrays of positions and forces hold x, y, z of a cluster as three
-vectors one after the other; slot k of cluster c has its x at `3 * width * c + k`.
+A slot is a position in that order. Coordinates are stored relative to the origin of their cluster, so that float32 is
+accurate enough: 2e-7 Å for sites within reach of one another. Arrays of positions and forces hold x, y, z of a cluster
+as three consecutive vectors; slot k of cluster c has its x at `3 * width * c + k`.
 """
 
 from math import ceil, floor, inf, nan
@@ -14,28 +14,28 @@ from rigidmd.compile import BLOCKS, PAIR_FLAGS, kernel
 from rigidmd.compile.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
 from rigidmd.forces.pairs.sites import place
 
-SERIAL_SITES = 1000  # up to this many there is one block, and no thread is started
+SERIAL_SITES = 1000  # up to this number there is one block, and no thread is started
 
 
 class Clusters(NamedTuple):
-    """The sites of one law in clusters. The last cluster is filled up with copies of the last site."""
+    """The sites of one law in clusters. The last cluster is padded with copies of the last site."""
 
-    bounds: np.ndarray  # (blocks + 1,) block b holds clusters bounds[b] ... bounds[b + 1] - 1
+    bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
     order: np.ndarray  # (slots,) int32 the site in each slot
     slot: np.ndarray  # (s,) int32 the slot of each site
     group: np.ndarray  # (slots,) int32 group of the site in each slot
-    boxes: np.ndarray  # (s, 3) int32 how many times a site is taken back along each edge, into the brick
-    origin: np.ndarray  # (4 clusters,) x, y, z, 0 in the box, Å
+    boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is moved back into the brick
+    origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
     local: np.ndarray  # (3 slots,) positions relative to the origins, Å
-    square: np.ndarray  # (3 slots,) squared distances from the origins when sorted, Å²; then for others to use
+    square: np.ndarray  # (3 slots,) squared distances from the origins when sorted, Å²; later scratch for others
     reference: np.ndarray  # (3 slots,) `local` when last sorted
-    moved: np.ndarray  # (slots,) how far each has gone since, Å
-    farthest: np.ndarray  # (blocks,) the largest of them; infinite where that is too far for a list, Å
-    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z of the sites of a share of molecules, in the brick, Å
+    moved: np.ndarray  # (slots,) displacement of each site since then, Å
+    farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
+    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
-    """Room for clusters of this many sites with positions of a NumPy dtype."""
+    """Room for the clusters of this many sites, with positions of a NumPy dtype."""
     width = lane_count(dtype)
     count = max(1, ceil(sites / width))
     blocks = min(BLOCKS, count) if sites > SERIAL_SITES else 1
@@ -58,17 +58,17 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
 
 @kernel(inline=True)
 def _share(sites, blocks, block):
-    """The first molecule of a block, and the first that is no more in it."""
+    """The first molecule of a block, and the first after it."""
     n = len(sites.first) - 1
     return n * block // blocks, n * (block + 1) // blocks
 
 
 @kernel(counted=False)
 def wrap_block(clusters, cell, sites, state, farthest, block):
-    """Count the boxes that take sites of a share of the molecules into the brick; its extent is theirs there.
+    """Number of edges that move the sites of a share of the molecules into the brick, and their extent there.
 
-    The brick is upright and has the diagonal of the cell (3, 3) for edges; it fills space as well as the cell. NaN for
-    an extent if a coordinate is farther from the origin than that, or no number.
+    The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
+    extent is NaN if a coordinate is farther from the origin than `farthest`, or is not finite.
     """
     extent = clusters.extent[block]
     for k in range(3):
@@ -89,10 +89,10 @@ def wrap_block(clusters, cell, sites, state, farthest, block):
 
 @kernel(counted=False)
 def bin_block(clusters, cell, sites, state, block):
-    """Bins and, within them, heights of the sites of a share of the molecules, into `slot` and `moved`.
+    """Bins of the sites of a share of the molecules, and heights within bins, into `slot` and `moved`.
 
-    Columns along z as wide as a cluster, up one and down the next, so that a cluster that begins in one column and ends
-    in the next is compact too.
+    Bins form columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that
+    begins in one column and ends in the next is compact too.
     """
     low, extent, (nx, ny, nz) = _bins(clusters)
     first, end = _share(sites, len(clusters.extent), block)
@@ -110,7 +110,7 @@ def bin_block(clusters, cell, sites, state, block):
 
 @kernel
 def sort_into_clusters(clusters):
-    """Sort sites by their bins and heights; they must then be settled. False if they have no extent."""
+    """Sort sites by bin and height; `settle_block` must follow. False if the extent is not finite."""
     s = len(clusters.slot)
     _, extent, (nx, ny, nz) = _bins(clusters)
     if not extent[0] >= 0:
@@ -124,7 +124,7 @@ def sort_into_clusters(clusters):
     for i in range(s):
         order[start[bin_of[i]]] = i
         start[bin_of[i]] += 1
-    # now start[p] is where bin p ends; sites of a bin are in the order of their indices and few
+    # now start[p] is the end of bin p; the sites of a bin are few, and in the order of their indices
     for a in range(1, s):
         i = order[a]
         b = a
@@ -139,9 +139,9 @@ def sort_into_clusters(clusters):
 
 @kernel(inline=True)
 def _bins(clusters):
-    """Lowest corner of all sites in the brick, their extents, and how many bins there are along each.
+    """Lowest corner of all sites in the brick, their extents, and the number of bins along each axis.
 
-    NaN for the first extent if there is none.
+    The first extent is NaN if there is none.
     """
     low, high = (inf, inf, inf), (-inf, -inf, -inf)
     lost = False
@@ -160,7 +160,7 @@ def _bins(clusters):
 
 @kernel(inline=True)
 def _count_boxes(boxes, cell, i, at):
-    """Count what takes a site at (x, y, z) into the brick."""
+    """Number of edges by which a site at (x, y, z) is moved back into the brick."""
     x, y, z = at
     c = floor(z / cell[2, 2]) if cell[2, 2] < inf else 0.0
     if c != 0.0:
@@ -174,7 +174,7 @@ def _count_boxes(boxes, cell, i, at):
 
 @kernel(inline=True)
 def _in_brick(boxes, cell, i, at):
-    """Where site i, at (x, y, z), is once it has been taken to where it was in the brick when sites were sorted, Å."""
+    """Position of site i, at (x, y, z), after the shift that moved it into the brick when sites were sorted, Å."""
     x, y, z = at
     a, b, c = boxes[i, 0], boxes[i, 1], boxes[i, 2]
     if c != 0:
@@ -193,7 +193,7 @@ def _bin(x, extent, count):
 
 @kernel(counted=False)
 def settle_block(clusters, cell, sites, state, group, block):
-    """Origins and places of newly sorted clusters; their origin is the middle of their box."""
+    """Origins and positions of newly sorted clusters; the origin is the middle of the bounding box."""
     width = width_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     clusters.farthest[block] = 0.0
@@ -226,9 +226,9 @@ def settle_block(clusters, cell, sites, state, group, block):
 
 @kernel(inline=True)
 def _pair_up(order, at, width, first, end):
-    """Change the order of slots first ... end - 1 of a cluster so that the two sites of each row are near one another.
+    """Reorder slots first ... end - 1 of a cluster so that the two sites of each row are near one another.
 
-    Where they are stands in `at`, which follows them.
+    `at` has their positions and is reordered with them.
     """
     vectors = 2 * (first // width) * width
     for a in range(first, end - 2, 2):
@@ -246,7 +246,7 @@ def _pair_up(order, at, width, first, end):
 
 @kernel(counted=False)
 def place_block(clusters, cell, sites, state, block):
-    """Bring `local` of the sites of a share of the molecules to where the molecules are."""
+    """Set `local` of the sites of a share of the molecules to the present positions of the molecules."""
     width = width_of(clusters.local)
     local, origin = clusters.local, clusters.origin
     first, end = _share(sites, len(clusters.extent), block)
@@ -263,7 +263,7 @@ def place_block(clusters, cell, sites, state, block):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def follow_block(clusters, limit, block):
-    """How far the sites of a block have gone: `moved` and `farthest`, for which the limit holds."""
+    """Displacements of the sites of a block: `moved`, and `farthest`, infinite if one exceeds the limit."""
     width = width_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1

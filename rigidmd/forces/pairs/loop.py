@@ -1,8 +1,8 @@
 """Forces between pairs of sites: the one loop for every such law.
 
-A law says only what one site and a vector of others at their distances do: an `@implements(pair)` for its NamedTuple,
-and how its numbers for each site follow the sites into another order (`arrange`). This loop finds the pairs, takes the
-images, sums energies, virial and forces, and hands the forces to the bodies.
+A law gives only the energy and force between one site and a vector of others at given distances, by an
+`@implements(pair)` for its NamedTuple, and puts its numbers for each site into the order of the slots (`arrange`). This
+loop finds the pairs and their images, sums energies, virial and forces, and adds the forces to the bodies.
 """
 
 from math import inf
@@ -42,37 +42,36 @@ from rigidmd.forces.pairs.lists import (
     image_of,
     lanes_of_first,
     lanes_of_second,
-    list_code,
     most_needed,
-    update_list,
 )  # fmt: skip
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
+from rigidmd.forces.pairs.update import list_code, update_list
 from rigidmd.forces.terms import Setup
 
 
 class Sums(NamedTuple):
-    """Where forces and energies are added up."""
+    """Sums of forces and energies."""
 
-    own: np.ndarray  # (3 slots,) what its own row does to each site, then all rows; stored as Clusters.local
-    others: np.ndarray  # (blocks, room) what the rows of a block do to the clusters from its first one on
+    own: np.ndarray  # (3 slots,) force on each site from its own row, then from all rows; stored as Clusters.local
+    others: np.ndarray  # (blocks, room) forces of a block's rows on the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
 
 
 class PairForces(NamedTuple):
     """A pair law and the sites that take part in it."""
 
-    law: NamedTuple  # in the order of the sites
+    law: NamedTuple  # its arrays are in the order of the sites
     sites: BodySites | CentralSites
-    group: np.ndarray  # (s,) sites of one group do not act on one another
+    group: np.ndarray  # (s,) sites of one group do not interact
 
     def workspace(self, setup: Setup) -> "PairWorkspace":
-        """Room for a neighbour list, which is built at the first use, and for sums."""
+        """Room for a neighbour list, which is built at its first use, and for sums."""
         law, sites = self.law, self.sites
         reach = _diameter(sites) if np.array_equal(self.group, sites.molecule) else inf
         pairs = empty_list(setup.cell, self.group, reach, law.cutoff, setup.skin, setup.dtype)
         blocks, slots = len(pairs.needed), len(pairs.clusters.order)
         sums = Sums(
-            own=pairs.clusters.square,  # while forces are summed nobody builds a list
+            own=pairs.clusters.square,  # no list is built while forces are summed
             others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
             tallies=np.zeros((blocks, TALLY_SIZE)),
         )
@@ -83,7 +82,7 @@ class PairWorkspace(NamedTuple):
     """Workspace of a `PairForces`."""
 
     law: NamedTuple
-    arranged: NamedTuple  # what the loop reads: numbers for each site in the order of slots, in the precision of lanes
+    arranged: NamedTuple  # what the loop reads: the law's numbers in the order of slots, in the precision of lanes
     sites: BodySites | CentralSites
     pairs: PairList
     sums: Sums
@@ -97,7 +96,7 @@ class PairWorkspace(NamedTuple):
 
     @property
     def forces_in_slots(self) -> InSlots:
-        """The same in the order of the lists."""
+        """Forces on its sites as last evaluated, in slots."""
         return InSlots(self.sums.own, self.pairs.clusters.slot)
 
     def with_code(self) -> "PairWorkspace":
@@ -115,7 +114,7 @@ class PairWorkspace(NamedTuple):
         return self._replace(code=code, list_code=lists)
 
     def with_room(self, cell: np.ndarray) -> "PairWorkspace":
-        """With as much room as the last list asked for."""
+        """With the room that the last build of the list needed."""
         pairs = neighbors.with_room(self.pairs, cell)
         others, clusters = self.sums.others, int(pairs.needed[:, WINDOW].max())
         if 3 * lane_count(others.dtype) * clusters > others.shape[1]:
@@ -129,26 +128,33 @@ def _room_for_others(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
 
 
 def pair_forces(law: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None) -> PairForces:
-    """The term for a law with a `cutoff`; sites of one molecule do not act on one another if no groups are given."""
+    """The term of a law with a `cutoff`; without groups, sites of one molecule do not interact."""
     return PairForces(law, sites, sites.molecule if group is None else group)
 
 
 def _diameter(sites: BodySites | CentralSites) -> float:
-    """A bound on how far apart the sites of a molecule are, Å."""
+    """An upper bound on the distance between sites of a molecule, Å."""
     return 2 * float(np.linalg.norm(sites.offsets(), axis=1).max()) if isinstance(sites, BodySites) else 0.0
 
 
 def pair(law, i, j, r2):
-    """(energy, force/r) of the site in slot i and those in slots j, j + 1, ... at squared distances r2, as vectors.
+    """(energy, force/r) of the site in slot i with those in slots j, j + 1, ... at squared distances r2, as vectors.
 
-    Below cutoff² only; force > 0 repels.
+    Valid below cutoff²; a positive force repels.
     """
-    raise TypeError(f"{type(law).__name__} is no pair law, or this was called outside compiled code")
+    raise TypeError(f"{type(law).__name__} is not a pair law, or this was called outside compiled code")
 
 
 def arrange(law, arranged, order):
-    """Fill the numbers that an arranged law has for each slot from those of the sites that are there now."""
+    """Fill the numbers that an arranged law has for each slot with those of the site now in that slot."""
     raise TypeError("compiled code only")
+
+
+@kernel
+def into_slots(of_sites, in_slots, order):
+    """Copy numbers of the sites (s,) into slots (slots,); `order` has the site in each slot."""
+    for slot, i in enumerate(order):
+        in_slots[slot] = of_sites[i]
 
 
 @implements(terms.add_forces, counted=False)
@@ -182,7 +188,7 @@ def _add_pair_forces(term, state, load, tally):
 
 @task()
 def _find(parcel, block):
-    """Bring sites, and what the loop reads of them, to where the bodies are; a status code into counters[STATUS]."""
+    """Update the list, and the law's numbers in slots, for the present state; a status code into counters[STATUS]."""
     code, law, arranged, sites, pairs, sums, state = opened(parcel)
     builds = pairs.counters[BUILDS]
     status = update_list(pairs, code, sites, state)
@@ -220,7 +226,7 @@ def _gather(parcel, block):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def block_forces(law, pairs, own, others, tallies, block):
-    """What the rows of one block do: to their own sites in `own`, to the sites they meet in `others`."""
+    """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
     others = others[block]
@@ -245,8 +251,8 @@ def block_forces(law, pairs, own, others, tallies, block):
                 between = _displacements(pairs, c, here, masked[n, 0])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
                 sums = _meet(law, pairs, block, i, masked[n, 0], between, masks, others, sums, tallies)
-            # Displacements one entry ahead: what waits for them would fill the processor's queues before the next
-            # entry's could enter.
+            # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
+            # processor's queues before those of the next entry could enter.
             last = end_of_row(pairs, i // 2, moved) - 1
             entry = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
@@ -270,7 +276,7 @@ def block_forces(law, pairs, own, others, tallies, block):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _displacements(pairs, c, here, entry):
-    """From a vector of other sites, those of an entry, to each of two sites of cluster c."""
+    """Displacements from the sites of an entry, as vectors, to each of two sites of cluster c; see `_separation`."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
     other = cluster_of(entry)
@@ -289,14 +295,14 @@ def _displacements(pairs, c, here, entry):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _separation(here, x, y, z):
-    """Displacements, and their squares, of a site from a vector of others."""
+    """Displacements of a site from a vector of others, and the squared distances."""
     dx, dy, dz = here[0] - x, here[1] - y, here[2] - z
     return dx, dy, dz, dx * dx + dy * dy + dz * dz
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
-    """The sites in slots i, i + 1 meet those of an entry: forces into `others` and, with energies, onto `sums`."""
+    """Forces between the sites in slots i, i + 1 and those of an entry, added to `others` and `sums`; energies too."""
     width = width_of(pairs.clusters.local)
     other = cluster_of(entry)
     first, second, totals = sums
@@ -318,7 +324,7 @@ def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _act(law, i, j, between, mask, totals, tallies):
-    """Force on a site from each of a vector of others; energy and virial, where wanted, onto the vectors `totals`."""
+    """Force on a site from each of a vector of others; energy and virial, if wanted, are added to `totals`."""
     dx, dy, dz, r2 = between
     counts = r2 < law.cutoff * law.cutoff
     if mask is not None:
@@ -342,7 +348,7 @@ def _act(law, i, j, between, mask, totals, tallies):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def gather_block(pairs, own, others, block):
-    """Forces on the sites of a block: what their own rows and all blocks do to them, always added in the same order."""
+    """Forces on the sites of a block from their own rows and from all blocks, added in a fixed order."""
     clusters = pairs.clusters
     width = width_of(clusters.local)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):

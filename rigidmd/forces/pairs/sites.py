@@ -1,6 +1,6 @@
-"""Sites of one law: where they are when the bodies are where they are, and what their forces do to the bodies.
+"""Sites of one law: their positions for a state of the bodies, and the forces and torques on the bodies from theirs.
 
-Each law has its own sites, only those that take part in it. Sites of one molecule are consecutive.
+Each law has its own list of sites: those that take part in it. Sites of one molecule are consecutive.
 """
 
 from typing import NamedTuple
@@ -11,19 +11,19 @@ from numba import prange, types
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import lane_count, width_of
 
-# Up to this many molecules loops over molecules stay on one thread. Measured, two threads: starting them costs about
-# 40 µs, placing the sites of a water 9.5 ns; so placing alone would gain only beyond some 8000 molecules. The bound is
-# shared with the drift, whose sines and cosines make a molecule dearer.
+# Up to this number, loops over molecules stay on one thread. Measured: starting two threads costs about 40 µs,
+# placing the sites of a water 9.5 ns, so placing alone would gain only beyond some 8000 molecules. The drift uses the
+# same bound; with its sines and cosines a molecule takes longer.
 SERIAL = 512
 
 
 class BodySites(NamedTuple):
     """Sites fixed in bodies."""
 
-    first: np.ndarray  # (n + 1,) int32 sites of molecule m are first[m] ... first[m + 1] - 1
-    molecule: np.ndarray  # (s,) int32
-    kind: np.ndarray  # (n,) int32 offsets of molecule m are offset_body[kind[m]], offset_body[kind[m] + 1] ...
-    offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; once for all molecules of a species
+    first: np.ndarray  # (n + 1,) int32 molecule m has sites first[m] ... first[m + 1] - 1
+    molecule: np.ndarray  # (s,) int32 molecule of each site
+    kind: np.ndarray  # (n,) int32 molecule m has offsets offset_body[kind[m]], offset_body[kind[m] + 1], ...
+    offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
 
     def offsets(self) -> np.ndarray:
         """Offsets (s, 3) of all sites, body frame, Å."""
@@ -31,21 +31,21 @@ class BodySites(NamedTuple):
 
 
 class CentralSites(NamedTuple):
-    """Sites that are their molecules' centres of mass: nothing to rotate, no torque."""
+    """Sites at their molecules' centres of mass: they have no offsets and exert no torque."""
 
     first: np.ndarray
     molecule: np.ndarray
 
     def offsets(self) -> np.ndarray:
-        """Offsets (s, 3) of all sites: none."""
+        """Offsets (s, 3) of all sites, which are 0."""
         return np.zeros((len(self.molecule), 3))
 
 
 class InSlots(NamedTuple):
-    """Vectors of sites in the order in which `clusters` keeps them."""
+    """Vectors (x, y, z) of sites in the order of the slots of `clusters`."""
 
-    value: np.ndarray  # (3 slots,) x, y, z of a cluster as three vectors one after the other
-    slot: np.ndarray  # (s,) where each site is
+    value: np.ndarray  # (3 slots,) x, y, z of a cluster as three consecutive vectors
+    slot: np.ndarray  # (s,) slot of each site
 
     def of_sites(self) -> np.ndarray:
         """The vectors (s, 3) in the order of the sites, float64."""
@@ -55,7 +55,7 @@ class InSlots(NamedTuple):
 
 
 def of_site(vectors, i):
-    """(x, y, z) of site i, from an array (s, 3) or from slots."""
+    """(x, y, z) of site i in an array (s, 3) or `InSlots`."""
     raise TypeError("compiled code only")
 
 
@@ -74,7 +74,7 @@ def _of_site(vectors, i):
 
 
 def place(sites, state, m, i):
-    """Where site i, of molecule m, is: (x, y, z) in the lab frame, Å."""
+    """Position (x, y, z) of site i of molecule m, lab frame, Å."""
     raise TypeError("compiled code only")
 
 
@@ -92,7 +92,7 @@ def _place(sites, state, m, i):
 
 @kernel(inline=True)
 def turned(sites, state, m, i):
-    """From the centre of molecule m to its site i: (x, y, z) in the lab frame, Å."""
+    """Vector (x, y, z) from the centre of mass of molecule m to its site i, lab frame, Å."""
     at = sites.kind[m] - sites.first[m] + i
     q = state.rotation[m]
     x, y, z = sites.offset_body[at, 0], sites.offset_body[at, 1], sites.offset_body[at, 2]
@@ -104,7 +104,7 @@ def turned(sites, state, m, i):
 
 
 def load_molecule(sites, state, load, m, site_force):
-    """Add the sum of molecule m's site forces, and their torque about its centre, to its load."""
+    """Add the sum of molecule m's site forces, and their torque about the centre of mass, to its load."""
     raise TypeError("compiled code only")
 
 
@@ -145,7 +145,7 @@ def _load_molecule(sites, state, load, m, site_force):
 
 @kernel(inline=True)
 def place_molecule(sites, state, m, site_position):
-    """Positions (lab) of molecule m's sites into site_position (s, 3)."""
+    """Write the positions of molecule m's sites into site_position (s, 3), lab frame."""
     for i in range(sites.first[m], sites.first[m + 1]):
         site_position[i, 0], site_position[i, 1], site_position[i, 2] = place(sites, state, m, i)
 
@@ -164,7 +164,7 @@ def _load_threaded(sites, state, load, site_force):
 
 @kernel(outer=True)
 def place_sites(sites, state, site_position):
-    """Positions of all sites (s, 3) in the lab frame, molecules whole."""
+    """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
     if len(state.position) <= SERIAL:
         for m in range(len(state.position)):
             place_molecule(sites, state, m, site_position)
@@ -174,7 +174,7 @@ def place_sites(sites, state, site_position):
 
 @kernel
 def load_from_sites(sites, state, load, site_force):
-    """Add the site forces, an array (s, 3) or in slots, to the bodies' forces and torques."""
+    """Add site forces, an array (s, 3) or `InSlots`, to the bodies' forces and torques."""
     if len(state.position) <= SERIAL:
         for m in range(len(state.position)):
             load_molecule(sites, state, load, m, site_force)
@@ -183,7 +183,7 @@ def load_from_sites(sites, state, load, site_force):
 
 
 def virial_of_offsets(sites, state, site_force, tally):
-    """Turn the site virial in `tally` into the molecular one: subtract sum f (x) (x_site - X_molecule)."""
+    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule)."""
     raise TypeError("compiled code only")
 
 

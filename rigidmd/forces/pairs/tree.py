@@ -1,6 +1,6 @@
-"""A tree of boxes around clusters, to find those within reach of one another in O(N log N), whatever the shape.
+"""A tree of bounding boxes of clusters. It finds clusters within reach of one another in O(N log N) for any shape.
 
-A node holds as many children as a vector of float64 has lanes; one look tells which of them are within reach.
+A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of them.
 """
 
 from math import ceil, inf
@@ -13,15 +13,15 @@ from rigidmd.compile.lanes import bits, lane_count, larger, load, lowest_bit, wi
 
 
 class BoxTree(NamedTuple):
-    """Boxes of clusters (level 0), of families of those (level 1), and so on up to one family."""
+    """Boxes of clusters (level 0), of groups of such boxes, called families (level 1), and so on up to one family."""
 
-    low: np.ndarray  # (3, nodes) all levels one after the other, each filled up with boxes that are nowhere
+    low: np.ndarray  # (3, nodes) the levels one after the other, each padded with empty boxes
     high: np.ndarray  # (3, nodes)
-    level: np.ndarray  # (levels + 1,) where each level begins
+    level: np.ndarray  # (levels + 1,) first node of each level
 
 
 def box_tree(count: int) -> BoxTree:
-    """Room for the tree of this many clusters."""
+    """Room for a tree of this many clusters."""
     arity = lane_count(np.float64)
     level = [0]
     while len(level) == 1 or count > 1:
@@ -33,7 +33,7 @@ def box_tree(count: int) -> BoxTree:
 
 @kernel(counted=False)
 def grow(tree, clusters):
-    """Fit the boxes to the clusters as they are."""
+    """Fit the boxes to the present clusters."""
     arity = width_of(tree.low)
     width = width_of(clusters.local)
     tree.low[:] = inf
@@ -54,10 +54,10 @@ def grow(tree, clusters):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
-    """Append to found[count:] the clusters whose boxes are closer than a radius to a box (3,), (3,); ascending.
+    """Write to found[count:], ascending, the clusters whose boxes are closer than a radius to a box (3,), (3,).
 
-    Only those that are at most half a round ahead of cluster c, all clusters being thought of as a ring. Returns the
-    new count, which may exceed the room; stack (levels, 2) is scratch.
+    Only clusters at most half a turn ahead of cluster c on the ring are taken. Returns the new count, which may exceed
+    the room; stack (levels, 2) is scratch.
     """
     arity = width_of(tree.low)
     top = len(tree.level) - 2
@@ -91,7 +91,7 @@ def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _near(tree, node, low, high, radius2):
-    """Which boxes of the family that begins at a node are within reach, as bits."""
+    """The boxes within reach in the family that begins at a node, as bits."""
     dx = larger(larger(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
     dy = larger(larger(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
     dz = larger(larger(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)

@@ -1,8 +1,8 @@
-"""What Ewald sums leave out, estimated before anything is computed, and settings that keep it to what is asked for.
+"""Errors of Ewald sums, estimated before a run, and the settings that keep them within a given accuracy.
 
-An error here is the root mean square over sites of the vector by which the force on a site is wrong, for charges whose
-molecules stand and turn at random. It is given in units of COULOMB: of the force between two charges e, 1 Å apart, as
-the accuracy of LAMMPS' kspace_style is.
+An error is the root mean square over sites of the error vector of the force on a site, for molecules with random
+positions and orientations. Its unit is COULOMB, the force between two charges e at a distance of 1 Å, like that of the
+accuracy of LAMMPS' kspace_style.
 """
 
 from math import exp, pi, sqrt
@@ -14,20 +14,20 @@ from scipy.optimize import brentq
 from rigidmd.forces.waves.splines import aliases
 
 FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
-PROXY = 32  # points along an edge that stand for a grid of more: errors depend on the spacing, not on their number
+PROXY = 32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
 ORDERS = (4, 5, 6, 7, 8)
 SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
 
 
 class Charges(NamedTuple):
-    """What errors depend on: how much charge there is, and how it stands together in rigid molecules."""
+    """What the errors depend on: the charges, and their arrangement in rigid molecules."""
 
     count: int  # charged sites
     square: float  # sum of q², e²
-    pairs: np.ndarray  # (p, 2) q_i q_j (e²) of pairs of sites inside molecules, both orders, and their distance (Å)
+    pairs: np.ndarray  # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
 
     def form(self, k: np.ndarray) -> np.ndarray:
-        """sum over molecules of |sum q exp(i k r)|², averaged over how they are turned, e²; k (1/Å) of any shape."""
+        """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any shape."""
         found = np.full(np.shape(k), self.square)
         for product, distance in self.pairs:
             found += product * np.sinc(k * distance / pi)
@@ -35,7 +35,7 @@ class Charges(NamedTuple):
 
 
 def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
-    """Of (how many, charges (s,) in e, positions (s, 3) in Å) for each species."""
+    """The `Charges` of species, each given as (number of molecules, charges (s,) in e, positions (s, 3) in Å)."""
     square, count, pairs = 0.0, 0, {}
     for n, charge, position in molecules:
         count += n * len(charge)
@@ -48,21 +48,21 @@ def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
-    """Of pairs beyond the cut-off (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
+    """Error from the pairs beyond the cut-off (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
     return 2 * charges.square / sqrt(charges.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
 
 
 def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> float:
-    """alpha (1/Å) with which pairs beyond the cut-off are missed by this error."""
+    """alpha (1/Å) at which the pairs beyond the cut-off make this error."""
     most = real_error(charges, 0.0, cutoff, volume)
-    # a large demand is met by hardly any screening at all; half a screening length is as far as the formula holds
+    # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
 
 
 def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
-    """Of waves beyond k = radius (1/Å): the integral of what they would do over all of them.
+    """Error from the waves beyond k = radius (1/Å): an integral over all of them.
 
-    As Kolafa & Perram's (eq. 32), with charges that are not independent inside molecules, and without their expansion
+    Like eq. 32 of Kolafa & Perram, but the charges inside a molecule are correlated, and the integral is not expanded
     for large radius/alpha.
     """
     k = np.linspace(radius, radius + 12 * alpha, 600)
@@ -72,7 +72,7 @@ def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> 
 
 
 def wave_radius_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
-    """The length of waves (1/Å) beyond which this error is left."""
+    """The radius of k (1/Å) at which the waves beyond it make this error."""
     volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
     least = np.linalg.norm(reciprocal, axis=1).min()
     longest = 12 * alpha + least
@@ -85,16 +85,16 @@ def wave_radius_for(charges: Charges, alpha: float, reciprocal: np.ndarray, erro
 
 
 def radius_of(count: int, volume: float) -> float:
-    """Radius (1/Å) of a sphere with as many waves."""
+    """Radius (1/Å) of a sphere in k that holds `count` waves."""
     return (6 * pi**2 * count / volume) ** (1 / 3)
 
 
 def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
-    """Of smooth PME with the influence function of `pme`, on a grid in a cell (3, 3), rows the edges.
+    """Error of smooth PME with the influence function G of `mesh`, on a grid in a cell (3, 3), rows the edges.
 
-    A wave k of charge becomes waves k' = k + aliases of potential, each weakened by U(k) U(k'), times the influence G.
-    Wrong are k - k, where G U² is not g, and all k - k' else; they add up in the mean square, each with k'² for the
-    force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106).
+    A wave k of charge gives waves k' of potential, k and its aliases, with factors G U(k) U(k'). The error is the
+    difference of G U² from g for k' = k, and the whole wave for all other k'. They add up in the mean square, with k'²
+    each for the force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106).
     """
     grid = np.array(grid)
     volume = abs(np.linalg.det(cell))
@@ -115,7 +115,7 @@ def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int
         weakened = weakened + metric[d, d] * second[d] * every[o] * every[e]
         weakened = weakened + 2 * metric[d, o] * first[d] * first[o] * every[e]
     square = square * np.ones_like(weakened)
-    square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # the wave 0 is left out
+    square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # the wave 0 is excluded
     kept, whole = own[0] * own[1] * own[2], every[0] * every[1] * every[2]
     g = 4 * pi / square * np.exp(-square / (4 * alpha**2))
     influence = square * g * kept / (whole * weakened)
@@ -133,7 +133,7 @@ def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int
 
 
 def smooth_size(least: float) -> int:
-    """The least number of points, not below `least`, without prime factors above 7, as fast transforms like it."""
+    """The smallest number of points, at least `least`, without prime factors above 7: fast for FFTs."""
     n = max(8, int(np.ceil(least - 1e-9)))
     while True:
         left = n
@@ -153,9 +153,9 @@ def mesh_for(
     order: int | None = None,
     grid: tuple[int, int, int] | None = None,
 ) -> tuple[tuple[int, int, int], int] | None:
-    """The grid and order of splines that leave at most this error with the least work; None where none does.
+    """The grid and order of splines with the least work for at most this error; None if there are none.
 
-    order, grid : what is given already
+    order, grid : fixed, if given
     """
     edges = np.linalg.norm(cell, axis=1)
     grids = [tuple(smooth_size(edge / h) for edge in edges) for h in SPACINGS] if grid is None else [grid]
@@ -176,5 +176,5 @@ def mesh_for(
 
 
 def work_of(sites: int, grid: tuple[int, int, int], order: int) -> float:
-    """About how many ns a reciprocal part takes on one core; measured with 12288 sites, grids of 32³ to 48³."""
+    """Approximate time (ns) of the reciprocal part on one core; measured with 12288 sites, grids of 32³ to 48³."""
     return sites * (20 + 2.4 * order**2) + 8.0 * float(np.prod(grid))

@@ -1,132 +1,57 @@
-"""Ewald sums: charges in a periodic box and all their images, however far.
+"""Ewald sums: charges in a periodic box with all their images, and the sum over wave vectors one by one.
 
-    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r                          screened.ScreenedCoulomb
-      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²,  S(k) = sum q_i exp(i k r_i)   EwaldSum, or pme.Pme
-      - alpha/sqrt(pi) sum q_i²                                                             self_energy
-      - sum over pairs inside molecules q_i q_j erf(alpha r)/r                              intramolecular_energy
-      - pi/(2 V alpha²) (sum q_i)²                                                          Background
-      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                                                 SurfaceDipole
+    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r     screened.ScreenedCoulomb
+      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²           EwaldSum, or mesh.Pme
+      - alpha/sqrt(pi) sum q_i²                                       corrections.self_energy
+      - sum over pairs inside molecules q_i q_j erf(alpha r)/r        corrections.intramolecular_energy
+      - pi/(2 V alpha²) (sum q_i)²                                    corrections.Background
+      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                           corrections.SurfaceDipole
 
-(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with q in units where q²/r is an energy. The last term is
-that of a large sphere of boxes in a medium of permittivity eps; it is 0 for a conductor, "tin foil", the usual choice.
+(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with S(k) = sum q_i exp(i k r_i), and q in units where
+q²/r is an energy. The last term describes a large sphere of boxes in a medium of permittivity eps; it is 0 for a
+conductor ("tin foil"), the usual choice.
 
-The sum over k has the pairs inside molecules too. In a rigid body the force between such a pair has no net force and no
-torque, so all there is to take out is the constant energy. The cell may have any shape: k = 2 pi (n_x, n_y, n_z) of the
-reciprocal cell.
+The sum over k includes the pairs inside molecules. In a rigid body such a pair exerts no net force and no torque, so
+only its energy, a constant, has to be subtracted. The cell may have any shape: k is 2 pi (n_x, n_y, n_z) times the
+reciprocal edges.
 """
 
-from math import pi, sqrt
+from math import pi
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erf
 
-from rigidmd.compile import BLOCKS, PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.compile.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
-from rigidmd.forces.pairs.space import follow_cell, volume_of
+from rigidmd.forces.pairs.space import follow_cell
 from rigidmd.forces.terms import Setup
-from rigidmd.units import COULOMB
+from rigidmd.forces.waves.vectors import Waves
 
 WIDTH = lane_count(np.float64)
-#: The basis of a cell that stands as it was described.
-AS_GIVEN = np.eye(3, dtype=int)
-
-
-class Waves(NamedTuple):
-    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns of n_z; the others are their opposites."""
-
-    column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, where in the sum that one stands
-    count: np.ndarray  # (columns,) how many n_z there are
-    most: np.ndarray  # (3,) largest |n| of each axis
-    bounds: np.ndarray  # (blocks + 1,) columns of each block
-
-    @property
-    def total(self) -> int:
-        """How many vectors there are, with their opposites."""
-        return 2 * int(self.count.sum())
-
-
-def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = AS_GIVEN) -> Waves:
-    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` where it is given.
-
-    basis (3, 3) : integers; both bound n in another cell of the lattice, and this cell's edges are `basis` times those
-    """
-    square = np.inf if largest_square is None else largest_square
-
-    def inside(n: np.ndarray) -> np.ndarray:
-        other = _in_other(n, basis)
-        return (np.abs(other) <= most).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
-
-    return _waves(np.abs(basis) @ most, inside)
-
-
-def waves_within(
-    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = AS_GIVEN
-) -> Waves:
-    """All n != 0 whose k is no longer than `radius` (1/Å), with |n_x|, |n_y|, |n_z| up to `limit` where it is given.
-
-    reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
-    basis : of the limit, see `waves`
-    """
-    cell = 2 * pi * np.linalg.inv(reciprocal).T
-    most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
-
-    def inside(n: np.ndarray) -> np.ndarray:
-        short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
-        return short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
-
-    return _waves(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
-
-
-def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """The n (..., 3) of the same waves in the cell of which `basis` makes this one."""
-    return n @ np.rint(np.linalg.inv(basis)).astype(int).T
-
-
-def _waves(most, inside) -> Waves:
-    mx, my, mz = (int(m) for m in most)
-    z = np.arange(-mz, mz + 1)
-    columns, counts, start = [], [], 0
-    for x in range(mx + 1):
-        for y in range(-my if x else 0, my + 1):
-            n = np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=-1)
-            found = z[inside(n) & ((x > 0) | (y > 0) | (z > 0))]
-            if len(found):
-                columns.append((x, y, found[0], start))
-                counts.append(len(found))
-                start += len(found)
-    blocks = max(1, min(BLOCKS, len(columns)))
-    shares = np.searchsorted(np.cumsum(counts), np.linspace(0, start, blocks + 1)[1:-1]) if columns else []
-    return Waves(
-        np.array(columns, np.int64).reshape(-1, 4),
-        np.array(counts, np.int64),
-        np.array([mx, my, mz]),
-        np.array([0, *shares, len(columns)], np.int64),
-    )
 
 
 class WaveSums(NamedTuple):
-    """Where an Ewald sum is added up. Sites are filled up to whole vectors with charges 0."""
+    """Arrays of an Ewald sum. The sites are padded to whole vectors with charges of 0."""
 
-    cell: np.ndarray  # (3, 3) that the strengths are for
+    cell: np.ndarray  # (3, 3) the cell of the present strengths
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     charge: np.ndarray  # (slots,)
     cosine: np.ndarray  # (3, largest n + 1, slots) of 2 pi n times the fractional coordinate
     sine: np.ndarray
-    strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k² for either of n, -n, the energy of |S|² of both
-    real: np.ndarray  # (waves,) of S(k), then of strength S(k)
+    strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k²: times |S|², the energy of n and -n together
+    real: np.ndarray  # (waves,) real part of S(k), then of 2 strength S(k)
     imaginary: np.ndarray
-    push: np.ndarray  # (3, slots) forces, as vectors of sites
+    push: np.ndarray  # (3, slots) forces on the sites, by component
     tallies: np.ndarray  # (blocks, 10)
 
 
 class EwaldSum(NamedTuple):
-    """The sum over k vectors one by one."""
+    """The sum over wave vectors one by one."""
 
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
@@ -134,7 +59,7 @@ class EwaldSum(NamedTuple):
     waves: Waves
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
-        """Room for the sums; their arithmetic is double whatever the setup says."""
+        """Room for the sums, which are always in double precision."""
         s, over = len(self.charge), self.waves
         slots = -(-s // WIDTH) * WIDTH
         angles = (3, int(over.most.max()) + 1, slots)
@@ -177,7 +102,7 @@ class EwaldWorkspace(NamedTuple):
 
 @kernel
 def invert_cell(cell, reciprocal):
-    """Rows 2 pi times the reciprocal edges of a cell (3, 3) into `reciprocal`; the volume."""
+    """Write 2 pi times the reciprocal edges of a cell (3, 3) into the rows of `reciprocal`; returns the volume."""
     volume = 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -236,7 +161,7 @@ def _set_strengths(over, own, alpha, volume):
 
 @task(counted=False)
 def _turn(parcel, block):
-    """Cosines and sines of a share of the sites, by the angle sum: each power costs one complex product."""
+    """Cosines and sines for a share of the sites, by recurrence: one complex product for each multiple of the angle."""
     _alpha, over, own = opened(parcel)
     blocks, s = len(own.tallies), len(own.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
@@ -269,7 +194,7 @@ def _times(a, b):
 
 @task(fastmath=PAIR_FLAGS, counted=False)
 def _sum(parcel, block):
-    """S(k) of the columns of a block, its energy and virial; times the strength, for the forces."""
+    """S(k) of the columns of a block, with energy and virial; S(k) is then multiplied for the forces."""
     alpha, over, own = opened(parcel)
     width = width_of(own.charge)
     own.tallies[block] = 0.0
@@ -278,7 +203,7 @@ def _sum(parcel, block):
         for n in range(count):
             own.real[first + n] = 0.0
             own.imaginary[first + n] = 0.0
-        # sites in batches that stay in the first cache for all of a column
+        # sites are taken in batches that stay in the L1 cache for a whole column
         for batch in range(0, len(own.charge), 32 * width):
             end = min(batch + 32 * width, len(own.charge))
             for n in range(count):
@@ -315,8 +240,10 @@ def _count_wave(own, alpha, nx, ny, nz, wave, block):
 
 @kernel(inline=True)
 def add_wave_virial(tally, energy, k, slope):
-    """Virial of a wave whose energy is that of |S|² exp(-k²/4 alpha²)/(k² V): energy (1 - slope k k), slope = 2/k² +
-    1/(2 alpha²), with S of sites that move with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)."""
+    """Add the virial energy (1 - slope k k) of a wave with an energy proportional to |S|² exp(-k²/4 alpha²)/(k² V).
+
+    slope = 2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)
+    """
     for row in range(3):
         for column in range(3):
             unit = 1.0 if row == column else 0.0
@@ -357,7 +284,7 @@ def _push(parcel, block):
 def sum_of(
     charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, over: Waves
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3); for once, nothing compiled."""
+    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in NumPy: for single uses."""
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     turns = position @ reciprocal.T
     energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))
@@ -373,104 +300,3 @@ def sum_of(
         force += (2 * strength * (np.conj(total) * phase).imag) @ k
         virial += of.sum() * np.eye(3) - np.einsum("k,ki,kj->ij", of * (2 / k2 + 1 / (2 * alpha**2)), k, k)
     return float(energy), force, virial
-
-
-class Background(NamedTuple):
-    """The charge, spread evenly, that makes a charged box neutral."""
-
-    strength: float  # energy times the volume, u Å⁵/ps²
-
-
-def background(square: float, alpha: float) -> Background:
-    """The term for a net charge whose square is given, in units where q²/r is an energy in u Å²/ps²."""
-    return Background(-pi / (2 * alpha**2) * square)
-
-
-@implements(terms.add_forces)
-def _add_background(term, state, load, tally):
-    if not is_a(term, Background):
-        return None
-
-    def add_background(term, state, load, tally):
-        if tally is not None:
-            energy = term.strength / volume_of(state.cell)
-            for k in (0, 1, 5, 9):
-                tally[k] += energy
-        return OK
-
-    return add_background
-
-
-class SurfaceDipole(NamedTuple):
-    """The medium around a large sphere of boxes answers its dipole: 2 pi/((2 eps + 1) V) |sum q r|²."""
-
-    strength: float  # 2 pi/(2 eps + 1)
-    charge: np.ndarray  # (s,)
-    sites: BodySites | CentralSites
-
-    def workspace(self, setup: Setup) -> "SurfaceWorkspace":
-        """Room for positions and forces."""
-        return SurfaceWorkspace(*self, *np.zeros((2, len(self.charge), 3)))
-
-
-class SurfaceWorkspace(NamedTuple):
-    """Workspace of a `SurfaceDipole`."""
-
-    strength: float
-    charge: np.ndarray
-    sites: BodySites | CentralSites
-    position: np.ndarray  # (s, 3)
-    site_force: np.ndarray  # (s, 3) as last evaluated, lab frame, u Å/ps²
-
-
-def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | CentralSites) -> SurfaceDipole:
-    """The term for charges (s,) that sum to 0, in units where q²/r is an energy in u Å²/ps²."""
-    return SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
-
-
-@implements(terms.add_forces)
-def _add_surface_dipole(term, state, load, tally):
-    if not is_a(term, SurfaceWorkspace):
-        return None
-
-    def add_surface_dipole(term, state, load, tally):
-        place_sites(term.sites, state, term.position)
-        share = term.strength / volume_of(state.cell)
-        energy = 0.0
-        for k in range(3):
-            dipole = 0.0
-            for i in range(len(term.charge)):
-                dipole += term.charge[i] * term.position[i, k]
-            for i in range(len(term.charge)):
-                term.site_force[i, k] = -2 * share * term.charge[i] * dipole
-            energy += share * dipole * dipole
-        if tally is not None:
-            # at a fixed volume the energy follows the sites, f (x) x; it also falls with the volume
-            for k in (0, 1, 5, 9):
-                tally[k] += energy
-            for i in range(len(term.charge)):
-                for row in range(3):
-                    for k in range(3):
-                        tally[1 + 3 * row + k] += term.site_force[i, row] * term.position[i, k]
-            virial_of_offsets(term.sites, state, term.site_force, tally)
-        load_from_sites(term.sites, state, load, term.site_force)
-        return OK
-
-    return add_surface_dipole
-
-
-def self_energy(charge: np.ndarray, alpha: float) -> float:
-    """Energy of charges (s,), in units where q²/r is an energy in u Å²/ps², less that of their own images near them."""
-    return -alpha / sqrt(pi) * float(charge @ charge)
-
-
-def intramolecular_energy(charge: np.ndarray, position: np.ndarray, alpha: float) -> float:
-    """What the sum over k has of the pairs inside one molecule, taken out; position (s, 3) in Å. Constant."""
-    i, j = np.triu_indices(len(charge), 1)
-    r = np.linalg.norm(position[i] - position[j], axis=1)
-    return -float(np.sum(charge[i] * charge[j] * erf(alpha * r) / r))
-
-
-def in_energy_units(charge_e: np.ndarray) -> np.ndarray:
-    """Charges in e as charges whose product over a distance in Å is an energy in u Å²/ps²."""
-    return charge_e * sqrt(COULOMB)

@@ -1,19 +1,19 @@
 """Smooth particle mesh Ewald: the reciprocal part of an Ewald sum on a grid, by fast Fourier transforms.
 
-    charges -> grid -> waves, times what a wave does -> potential on the grid -> forces
+    charges -> grid -> Fourier transform, times the influence function -> potential on the grid -> forces
 
-Charges are spread over order³ grid points by B-splines, and forces are the exact gradient of the energy that the grid
-gives (Essmann et al. 1995, J. Chem. Phys. 103, 8577): a run keeps that energy. What a wave does is not their formula
-but the one with the least error in the forces (Hockney & Eastwood 1988, ch. 8; Ballenegger, Cerda & Holm 2012,
-J. Chem. Theory Comput. 8, 936, for forces by differentiation): the same work, smaller errors.
+Charges are spread over order³ grid points by B-splines, and forces are the exact gradient of the energy on the grid
+(Essmann et al. 1995, J. Chem. Phys. 103, 8577), so a run conserves that energy. The influence function is not that of
+Essmann et al. but the one with the smallest error of the forces (Hockney & Eastwood 1988, ch. 8; Ballenegger, Cerda &
+Holm 2012, J. Chem. Theory Comput. 8, 936, for forces by differentiation): the same work with smaller errors.
 
-Forces on the grid do not add up to zero, and pairs inside a rigid molecule act on it; both are parts of the error that
-`ewald_errors.mesh_error` estimates. Taking them out would leave forces that are no gradient.
+The forces from the grid do not sum to zero, and pairs inside a rigid molecule exert a force on it. Both are part of the
+error that `errors.mesh_error` estimates. Subtracting them would leave forces that are not a gradient.
 
-The work is cut into blocks: of planes, each written by one block from sites that are sorted by plane, of rows of waves,
-and of sites. Their number does not depend on that of threads, so neither does any bit of the result.
+The work is divided into blocks of planes, of rows of waves, and of sites. Sites are sorted by plane, and each plane is
+written by one block. The number of blocks does not depend on that of threads, so the bits of the result do not either.
 
-This file needs rocket-fft and is imported by scenes with PME only.
+This file needs rocket-fft; only scenes with PME import it.
 """
 
 from math import pi
@@ -32,15 +32,15 @@ from rigidmd.forces.terms import Setup
 from rigidmd.forces.waves.ewald import add_wave_virial, invert_cell
 from rigidmd.forces.waves.splines import aliases, weights
 
-SERIAL_POINTS = 16**3  # up to this many grid points there is one block, and no thread is started
+SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, and no thread is started
 
 
 class UpToFour(NamedTuple):
     """Splines of order 3 and 4: weights as vectors of four."""
 
-    nodes: tuple[int, ...]  # 0 ... order - 1; its length is known when compiled
+    nodes: tuple[int, ...]  # 0 ... order - 1; its length is a constant at compile time
     value: np.ndarray  # (4 order,) coefficients of the weights, see splines.weights
-    slope: np.ndarray  # (4 (order - 1),) of their derivatives
+    slope: np.ndarray  # (4 (order - 1),) coefficients of their derivatives
 
 
 class UpToEight(NamedTuple):
@@ -52,26 +52,26 @@ class UpToEight(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """The grid and what stands on it; a row of points is longer than the grid, so that no spline has to wrap around."""
+    """The grid and its arrays. Rows of points are longer than the grid, so that splines need not wrap around."""
 
-    points: np.ndarray  # (3,) along a, b, c
+    points: np.ndarray  # (3,) number along a, b, c
     bounds: np.ndarray  # (3, blocks + 1) of planes, rows of waves and sites
     cell: np.ndarray  # (3, 3)
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
-    corner: np.ndarray  # (s, 3) int32 first grid point that a site reaches
-    part: np.ndarray  # (s, 4) how far beyond it and half a cell the site is, in cells; its charge
+    corner: np.ndarray  # (s, 3) int32 first grid point to which a site is spread
+    part: np.ndarray  # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
     order: np.ndarray  # (s,) int32 sites sorted by the plane of their corner
-    first: np.ndarray  # (n_a + 1,) sites of plane p are order[first[p]] ... order[first[p + 1] - 1]
+    first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
     wave: np.ndarray  # (n_a, n_b, n_c//2 + 1)
-    influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) what a wave of charge is multiplied by
+    influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) factor from waves of charge to waves of potential
     alias: np.ndarray  # (3, 6, most points) splines.Aliases of the axes
-    axes: np.ndarray  # (3, 1) names of the axes
+    axes: np.ndarray  # (3, 1) numbers of the axes, for the transforms
     tallies: np.ndarray  # (blocks, 10)
-    lost: np.ndarray  # (blocks,) whether a position is no number
-    weight: np.ndarray  # (blocks, 64) the weights of one site, to be taken one by one
+    lost: np.ndarray  # (blocks,) whether a position is not finite
+    weight: np.ndarray  # (blocks, 64) the weights of one site, which are read one by one
 
 
 class Pme(NamedTuple):
@@ -184,7 +184,7 @@ def _add_pme(term, state, load, tally):
 
 @task(counted=False)
 def _weigh(parcel, block):
-    """What waves do, for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
+    """Influence function for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
     alpha, _charge, _spline, mesh = opened(parcel)
     b, of = mesh.reciprocal, mesh.alias
     volume = (
@@ -244,7 +244,7 @@ def _scale(parcel, block):
 
 @task(counted=False)
 def _sort(parcel, block):
-    """Sort sites by the plane of their corner; within a plane they keep their order."""
+    """Sort sites by the plane of their corner; the sort is stable."""
     _alpha, _charge, _spline, mesh = opened(parcel)
     first = mesh.first
     first[:] = 0
@@ -262,7 +262,7 @@ def _sort(parcel, block):
 
 
 def few(spline, array, index):
-    """Four or eight numbers of an array from an index on, as a vector: as many as the spline's weights."""
+    """Numbers of an array from an index on, as a vector of four or eight, like the spline's weights."""
     raise TypeError("compiled code only")
 
 
@@ -276,28 +276,28 @@ def _few(spline, array, index):
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def weights_at(spline, part):
     """Weights of the grid points from the corner on, as a vector."""
-    order = len(spline.nodes)
-    width = len(spline.value) // order
-    found = few(spline, spline.value, width * (order - 1))
-    for j in range(order - 2, -1, -1):
-        found = found * part + few(spline, spline.value, width * j)
-    return found
+    return _polynomials(spline, spline.value, len(spline.nodes), part)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def slopes_at(spline, part):
-    """Their derivatives, per cell."""
-    order = len(spline.nodes)
-    width = len(spline.value) // order
-    found = few(spline, spline.slope, width * (order - 2))
-    for j in range(order - 3, -1, -1):
-        found = found * part + few(spline, spline.slope, width * j)
+    """Derivatives of these weights, per grid cell."""
+    return _polynomials(spline, spline.slope, len(spline.nodes) - 1, part)
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+def _polynomials(spline, coefficients, terms, part):
+    """Polynomials in `part`, one in each lane; coefficients (terms width,) in ascending order."""
+    width = len(coefficients) // terms
+    found = few(spline, coefficients, width * (terms - 1))
+    for j in range(terms - 2, -1, -1):
+        found = found * part + few(spline, coefficients, width * j)
     return found
 
 
 @task(fastmath=PAIR_FLAGS, counted=False)
 def _spread(parcel, block):
-    """Charges on the planes of a block, and their waves within the planes."""
+    """Spread charges over the planes of a block, and transform them within the planes."""
     _alpha, _charge, spline, mesh = opened(parcel)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
@@ -333,33 +333,30 @@ def _spread(parcel, block):
 
 @task(counted=False)
 def _convolve(parcel, block):
-    """From waves of charge to waves of potential, for a block of rows."""
-    _alpha, _charge, _spline, mesh = opened(parcel)
-    low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
-    wave = mesh.wave
-    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
-    for x in range(wave.shape[0]):
-        for y in range(low, high):
-            for z in range(wave.shape[2]):
-                wave[x, y, z] *= mesh.influence[x, y, z]
-    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
+    alpha, _charge, _spline, mesh = opened(parcel)
+    convolve_block(alpha, mesh, None, block)
 
 
 @task(counted=False)
 def _convolve_and_count(parcel, block):
-    """The same, with energy and virial."""
     alpha, _charge, _spline, mesh = opened(parcel)
+    convolve_block(alpha, mesh, mesh.tallies, block)
+
+
+@kernel(inline=True, counted=False)
+def convolve_block(alpha, mesh, tallies, block):
+    """From waves of charge to waves of potential for a block of rows; energy and virial into `tallies` unless None."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
     wave, of, b = mesh.wave, mesh.alias, mesh.reciprocal
-    tally = mesh.tallies[block]
-    mesh.tallies[block] = 0.0
+    if tallies is not None:
+        tallies[block] = 0.0
     c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
     for x in range(wave.shape[0]):
         for y in range(low, high):
             for z in range(wave.shape[2]):
                 value, strength = wave[x, y, z], mesh.influence[x, y, z]
                 wave[x, y, z] = value * strength
-                if x + y + z > 0:
+                if tallies is not None and x + y + z > 0:
                     n = (of[0, 0, x], of[1, 0, y], of[2, 0, z])
                     k = (
                         n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
@@ -367,18 +364,18 @@ def _convolve_and_count(parcel, block):
                         n[0] * b[0, 2] + n[1] * b[1, 2] + n[2] * b[2, 2],
                     )
                     k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
-                    # waves with n_c and with -n_c are stored once, where they are two
+                    # waves with n_c and -n_c are stored once, unless they are the same
                     share = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
                     energy = share * strength * (real * real + imaginary * imaginary)
-                    tally[0] += energy
-                    add_wave_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+                    tallies[block, 0] += energy
+                    add_wave_virial(tallies[block], energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
     c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
 @task(counted=False)
 def _back(parcel, block):
-    """From waves within the planes of a block to the potential on them."""
+    """Transform the planes of a block back to the potential."""
     _alpha, _charge, spline, mesh = opened(parcel)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     nb, nc = mesh.points[1], mesh.points[2]
@@ -397,7 +394,7 @@ def _back(parcel, block):
 
 @task(fastmath=PAIR_FLAGS, counted=False)
 def _pull(parcel, block):
-    """Forces on a share of the sites: the gradient of the potential at each, times its charge."""
+    """Forces on a share of the sites: minus the gradient of the potential at each site, times its charge."""
     _alpha, charge, spline, mesh = opened(parcel)
     na = mesh.points[0]
     order = len(spline.nodes)

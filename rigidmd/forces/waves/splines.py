@@ -1,8 +1,8 @@
-"""Cardinal B-splines: how a charge is spread over the points of a grid, and what that does to its waves.
+"""Cardinal B-splines: the spreading of charges over the points of a grid, and its effect on waves.
 
-M_p, a polynomial of degree p - 1 between neighbouring points, is p points wide and p - 2 times differentiable (Essmann
-et al. 1995, J. Chem. Phys. 103, 8577, eq. 4.1). On a grid of K points a wave n looks like the waves n + m K, its
-aliases, which spreading weakens to U(n + m K) = sinc((n + m K)/K)^p.
+M_p is a polynomial of degree p - 1 between neighbouring points, p points wide and p - 2 times differentiable (Essmann
+et al. 1995, J. Chem. Phys. 103, 8577, eq. 4.1). On a grid of K points a wave n cannot be told from its aliases n + m K,
+which spreading multiplies by U(n + m K) = sinc((n + m K)/K)^p.
 """
 
 from math import factorial
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import BSpline
 
-ALIASES = 30  # |m| up to which they are summed; the last is 1e-7 of the first for order 3, less for others
+ALIASES = 30  # largest |m| in sums; its term is 1e-7 of the first for order 3, less for higher orders
 
 
 def weights(order: int) -> np.ndarray:
@@ -22,10 +22,10 @@ def weights(order: int) -> np.ndarray:
 
 
 class Aliases(NamedTuple):
-    """For each wave of one axis (points,) in the order of an FFT."""
+    """Sums over the aliases of each wave of one axis (points,), in the order of an FFT."""
 
     n: np.ndarray  # -K/2 < n <= K/2
-    odd: np.ndarray  # the same, but 0 where n and -n are one wave
+    odd: np.ndarray  # n, but 0 where n and -n are the same wave
     own: np.ndarray  # U(n)²
     all: np.ndarray  # sum over m of U(n + m K)²
     first: np.ndarray  # sum of (n + m K) U²
@@ -33,7 +33,7 @@ class Aliases(NamedTuple):
 
 
 def aliases(points: int, order: int) -> Aliases:
-    """Of a grid with so many points along the axis."""
+    """The sums for a grid with this number of points along the axis."""
     n = np.arange(points)
     n = np.where(2 * n > points, n - points, n)
     every = n[:, None] + points * np.arange(-ALIASES, ALIASES + 1)

@@ -1,0 +1,121 @@
+"""The Numba types of SIMD vectors and masks, and their operators; `lanes` has the functions.
+
+A value of these types is an LLVM vector. All code is portable LLVM and is compiled to AVX-512, AVX2, SSE or NEON.
+"""
+
+import operator
+
+from llvmlite import ir
+from numba import types
+from numba.extending import lower_builtin, models, register_model, type_callable
+
+from rigidmd.compile.kernels import PAIR_FLAGS
+from rigidmd.compile.machine import SIMD_BITS
+
+#: The fast-math flags of operations on vectors.
+FLAGS = tuple(sorted(PAIR_FLAGS))
+#: Lanes of a vector on this machine, by the type of its numbers.
+COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
+
+
+class Lanes(types.Type):
+    """Numba type of a vector of `count` numbers."""
+
+    def __init__(self, dtype, count):
+        self.dtype, self.count = dtype, count
+        super().__init__(f"lanes({count} x {dtype})")
+
+
+class Mask(types.Type):
+    """Numba type of a truth value for each of `count` lanes."""
+
+    def __init__(self, count):
+        self.count = count
+        super().__init__(f"mask({count})")
+
+
+@register_model(Lanes)
+class LanesModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(manager[kind.dtype].get_value_type(), kind.count))
+
+
+@register_model(Mask)
+class MaskModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.count))
+
+
+# --- operators -------------------------------------------------------------------------------------------------------
+
+
+def _common(a, b) -> Lanes | None:
+    """The vector type of two operands: one is a vector, the other the same type or a scalar; otherwise None."""
+    if isinstance(b, Lanes):
+        a, b = b, a
+    return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
+
+
+def filled(context, builder, value, kind, lanes):
+    """The value as a vector: itself, or a scalar in every lane."""
+    if kind == lanes:
+        return value
+    number = context.cast(builder, value, kind, lanes.dtype)
+    vector = ir.VectorType(number.type, lanes.count)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, ir.IntType(32)(0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), lanes.count), [0] * lanes.count)
+    return builder.shuffle_vector(first, first, order)
+
+
+def _operator(functions, emit, result=lambda lanes: lanes):
+    """Define a binary operator for Numba by emit(builder, left, right) of two vectors."""
+    for function in functions:
+
+        @type_callable(function)
+        def of_types(context):
+            def typer(a, b):
+                lanes = _common(a, b)
+                return result(lanes) if lanes is not None else None
+
+            return typer
+
+        def lower(context, builder, signature, arguments):
+            lanes = _common(*signature.args)
+            left, right = (
+                filled(context, builder, v, kind, lanes) for v, kind in zip(arguments, signature.args, strict=True)
+            )
+            return emit(builder, left, right)
+
+        for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+            lower_builtin(function, *kinds)(lower)
+
+
+_operator([operator.add, operator.iadd], lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
+_operator([operator.sub, operator.isub], lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
+_operator([operator.mul, operator.imul], lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
+_operator([operator.truediv, operator.itruediv], lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
+
+
+def _compare(function, sign):
+    def emit(builder, a, b):
+        if isinstance(a.type.element, ir.IntType):
+            return builder.icmp_signed(sign, a, b)
+        return builder.fcmp_ordered(sign, a, b)
+
+    _operator([function], emit, lambda lanes: Mask(lanes.count))
+
+
+for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.eq, "==")):
+    _compare(_function, _sign)
+
+
+def _logic(function, emit):
+    @type_callable(function)
+    def of_types(context):
+        return lambda a, b: a if isinstance(a, Mask) and a == b else None
+
+    lower_builtin(function, Mask, Mask)(lambda context, builder, signature, arguments: emit(builder, *arguments))
+
+
+_logic(operator.and_, lambda builder, a, b: builder.and_(a, b))
+_logic(operator.or_, lambda builder, a, b: builder.or_(a, b))

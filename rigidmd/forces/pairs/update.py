@@ -1,0 +1,170 @@
+"""Keeping a neighbour list: its sites are moved with the bodies, and the list is rebuilt when it is no longer valid."""
+
+from math import ceil, floor, inf
+
+from rigidmd.compile import Code, call, call_blocks, kernel, opened, packed, task
+from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, OK
+from rigidmd.forces.pairs.clusters import (
+    bin_block,
+    follow_block,
+    place_block,
+    settle_block,
+    sort_into_clusters,
+    wrap_block,
+)
+from rigidmd.forces.pairs.lists import (
+    BUILDS,
+    ENTRIES,
+    IMAGES_FOUND,
+    LONGEST_SKIN,
+    MASKED,
+    STATUS,
+    USABLE,
+    PairList,
+    farthest,
+    most_needed,
+)  # fmt: skip
+from rigidmd.forces.pairs.rows import fill_block
+from rigidmd.forces.pairs.sites import BodySites, CentralSites
+from rigidmd.forces.pairs.space import follow_cell
+from rigidmd.forces.pairs.tree import grow
+
+LOST = 1e9  # list radii from the origin; no radius is longer than a box, so 32 bits can count the boxes on the way
+
+
+def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
+    """The machine code of the tasks that keep a list."""
+    placed = (pairs, sites, EXAMPLE[0])
+    return Code(
+        place=(_place, placed),
+        follow=(_follow, pairs),
+        wrap=(_wrap, placed),
+        bin=(_bin, placed),
+        prepare=(_prepare, pairs),
+        settle=(_settle, placed),
+        grow=(_grow, pairs),
+        fill=(_fill, pairs),
+    )
+
+
+@kernel(counted=False)
+def update_list(pairs, code, sites, state):
+    """Move the clusters with the molecules, and rebuild the list if it is no longer valid; a status code."""
+    blocks = len(pairs.needed)
+    parcel = packed(pairs)
+    placed = packed((pairs, sites, state))
+    if follow_cell(state.cell, pairs.cell):
+        pairs.counters[USABLE] = 0
+    if pairs.counters[USABLE] == 1:
+        call_blocks(code, "place", placed, blocks)
+        call_blocks(code, "follow", parcel, blocks)
+        if farthest(pairs) < inf:
+            return OK
+    pairs.counters[USABLE] = 0
+    shortest = min(pairs.cell[0, 0], pairs.cell[1, 1], pairs.cell[2, 2])
+    if pairs.cutoff < inf and (2 * pairs.cutoff > shortest or pairs.skin > LONGEST_SKIN * shortest):
+        return CELL_CHANGED
+    call_blocks(code, "wrap", placed, blocks)
+    call_blocks(code, "bin", placed, blocks)
+    call(code, "prepare", parcel)
+    if pairs.counters[STATUS] != OK:
+        return pairs.counters[STATUS]
+    call_blocks(code, "settle", placed, blocks)
+    call(code, "grow", parcel)
+    call_blocks(code, "fill", parcel, blocks)
+    if most_needed(pairs, ENTRIES) > pairs.entries.shape[1] or most_needed(pairs, MASKED) > pairs.masked.shape[1]:
+        return LIST_FULL
+    pairs.counters[USABLE] = 1
+    pairs.counters[BUILDS] += 1
+    return OK
+
+
+@task(counted=False)
+def _place(parcel, block):
+    pairs, sites, state = opened(parcel)
+    place_block(pairs.clusters, pairs.cell, sites, state, block)
+
+
+@task(counted=False)
+def _follow(parcel, block):
+    pairs = opened(parcel)
+    follow_block(pairs.clusters, 0.5 * pairs.skin, block)
+
+
+@task(counted=False)
+def _wrap(parcel, block):
+    pairs, sites, state = opened(parcel)
+    wrap_block(pairs.clusters, pairs.cell, sites, state, LOST * (pairs.cutoff + pairs.skin), block)
+
+
+@task(counted=False)
+def _bin(parcel, block):
+    pairs, sites, state = opened(parcel)
+    bin_block(pairs.clusters, pairs.cell, sites, state, block)
+
+
+@task()
+def _prepare(parcel, block):
+    """Sort the sites for a new list; a status code into counters[STATUS]."""
+    pairs = opened(parcel)
+    pairs.counters[STATUS] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
+    pairs.counters[IMAGES_FOUND] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+
+
+@kernel
+def _find_images(cell, radius, shift):
+    """Shifts of the images of the brick (see `clusters`) within a radius of it, and their number. Shift 0 is the first.
+
+    Bricks are stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27
+    images in an orthorhombic box and up to 48 in a triclinic one.
+    """
+    found = 1
+    for n in range(3):
+        shift[n] = 0.0
+    for z in range(-1, 2):
+        if z != 0 and cell[2, 2] == inf:
+            continue
+        first, last = _images_along(cell, 1, z * cell[2, 1] if z != 0 else 0.0, radius)
+        for y in range(first, last + 1):
+            x0 = (z * cell[2, 0] if z != 0 else 0.0) + (y * cell[1, 0] if y != 0 else 0.0)
+            left, right = _images_along(cell, 0, x0, radius)
+            for x in range(left, right + 1):
+                if x == y == z == 0:
+                    continue
+                for k in range(3):
+                    total = 0.0
+                    for n, vector in ((x, 0), (y, 1), (z, 2)):
+                        if n != 0:
+                            total += n * cell[vector, k]
+                    shift[4 * found + k] = total
+                found += 1
+    return found
+
+
+@kernel
+def _images_along(cell, k, offset, radius):
+    """First and last multiple of edge k that brings a brick at an offset within a radius of the brick at 0."""
+    edge = cell[k, k]
+    if edge == inf:
+        return 0, 0
+    return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
+
+
+@task(counted=False)
+def _settle(parcel, block):
+    pairs, sites, state = opened(parcel)
+    settle_block(pairs.clusters, pairs.cell, sites, state, pairs.group, block)
+
+
+@task(counted=False)
+def _grow(parcel, block):
+    pairs = opened(parcel)
+    grow(pairs.tree, pairs.clusters)
+
+
+@task()
+def _fill(parcel, block):
+    pairs = opened(parcel)
+    room = 256
+    while room > 0:
+        room = fill_block(pairs, block, room)
