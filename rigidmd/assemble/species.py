@@ -78,8 +78,8 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site,
 
 def frozen_apart(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
-) -> tuple[list[Molecule], np.ndarray, np.ndarray]:
-    """Species, index (n,) into them, and which are frozen; one of which some molecules are frozen becomes two."""
+) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
+    """Species, index (n,) into them, which are frozen, and faults. A species that is frozen in part becomes two."""
     species, index, faults = list(species), index.copy(), []
     frozen = [entry.frozen is True for entry in scene.molecules]
     for k, entry in enumerate(scene.molecules):
@@ -98,6 +98,6 @@ def frozen_apart(
             index[chosen] = len(species)
             species.append(species[k])
             frozen.append(True)
-    if faults:
-        raise SceneError(scene.source, faults)
-    return species, index, np.array(frozen)
+    if frozen and all(frozen[k] for k in np.unique(index)):
+        faults.append("molecules: all are frozen; nothing would move")
+    return species, index, np.array(frozen), faults

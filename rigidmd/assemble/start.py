@@ -4,6 +4,7 @@ import numpy as np
 
 from rigidmd.assemble.lattice import lattice
 from rigidmd.assemble.momenta import draw_momenta, mobile, remove_momentum
+from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
 from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
@@ -81,8 +82,6 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: 
         state.angular_momentum_body[held[: len(state.rotation)]] = 0.0
         removed = remove_momentum(model, state.velocity)
         return ["the total momentum of the file's velocities was taken out"] if removed else []
-    temperature = scene.start.temperature_K
-    if temperature is None:
-        temperature = scene.stages[0].temperature_K
+    temperature = settled(scene.start.temperature_K)
     draw_momenta(model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))
     return []

@@ -3,29 +3,27 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.electrostatics import electrostatic_faults
 from rigidmd.assemble.momenta import Freedom, freedom_of
 from rigidmd.assemble.overlaps import overlaps
+from rigidmd.assemble.resolve import Facts, resolve
 from rigidmd.assemble.species import frozen_apart, species_of
 from rigidmd.assemble.start import arrange, residue_numbers, set_momenta
-from rigidmd.assemble.terms import left_out, terms_of
+from rigidmd.assemble.terms import interactions, left_out
 from rigidmd.core.state import State, state_of
 from rigidmd.core.state_file import Saved
 from rigidmd.dynamics.advance import Model
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.laws.lennard_jones import Tail
-from rigidmd.forces.pairs.space import Space, Triclinic, space_of, wrap
+from rigidmd.forces.pairs.space import Space, space_of, wrap
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import GRAM_PER_CM3
-
-DEFAULT_CUTOFF = 9.0  # Å
 
 
 class Sites(NamedTuple):
@@ -42,7 +40,7 @@ class Sites(NamedTuple):
 class System:
     """What a scene becomes. `state` is the start; nothing here changes during a run."""
 
-    scene: MolecularScene
+    scene: MolecularScene  # with all of its numbers, see `resolve`
     species: list[Molecule]
     model: Model
     space: Space
@@ -52,11 +50,9 @@ class System:
     constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
     constant_pressure: float  # u/(Å ps²), that no motion changes
     tail: Tail | None  # what is missing beyond the cut-off, where it is asked for
-    decided: dict[str, Any]  # keys of forces that the scene left open, with what they became
     sites: Sites
     residue_number: np.ndarray  # (n,) by which a scene may pick molecules: see Molecules.frozen
     from_lattice: bool
-    cutoff: float  # Å
     left_out: list[str]
     force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: list[str] = field(default_factory=list)
@@ -65,6 +61,11 @@ class System:
     def density(self) -> float:
         """g/cm³; 0 without a box."""
         return float(self.model.mass[self.model.species].sum()) / self.space.volume / GRAM_PER_CM3
+
+    @property
+    def cutoff(self) -> float:
+        """Cut-off between sites, Å; inf for none."""
+        return self.scene.forces.cutoff_A or inf
 
     @property
     def smallest_diameter(self) -> float:
@@ -116,39 +117,36 @@ def build(scene: MolecularScene) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
     species = species_of(scene)
     arrangement = arrange(scene, species)
-    space = space_of(arrangement.cell)
-    cutoff = _cutoff(scene, space, species)
-    number = residue_numbers(arrangement)
-    species, index, frozen = frozen_apart(scene, species, arrangement.species, number)
-    if frozen[index].all():
-        raise SceneError(scene.source, ["molecules: all are frozen; nothing would move"])
+    space, number = space_of(arrangement.cell), residue_numbers(arrangement)
+    species, index, frozen, faults = frozen_apart(scene, species, arrangement.species, number)
+    counts = np.bincount(index, minlength=len(species))
+    resolved = resolve(scene, Facts(species, counts, space, arrangement.basis))
+    if faults := [*faults, *resolved.faults]:
+        raise SceneError(scene.source, faults)
+    scene = resolved.scene
     model = _model(species, index, frozen)
     turning = any(m.inertia.any() for m in species)
     state = state_of(
         position=arrangement.position, rotation=arrangement.rotation if turning else None, cell=arrangement.cell
     )
-    terms, constants, pressure, beyond, decided, charges = terms_of(
-        scene, species, model, space, cutoff, state, arrangement.basis
-    )
+    acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
     system = System(
         scene=scene,
         species=species,
         model=model,
         space=space,
         state=state,
-        terms=terms,
+        terms=acting.terms,
         freedom=freedom_of(model),
-        constants=constants,
-        constant_pressure=pressure,
-        tail=beyond,
-        decided=decided,
+        constants=acting.constants,
+        constant_pressure=acting.pressure,
+        tail=acting.tail,
         sites=_sites(species, index),
         residue_number=number,
         from_lattice=scene.structure is None,
-        cutoff=cutoff,
-        left_out=left_out(scene, terms, model, space),
-        force_error=charges.force_error if charges else None,
-        notes=list(charges.notes) if charges else [],
+        left_out=left_out(scene, acting.terms, model, space),
+        force_error=acting.force_error,
+        notes=list(acting.notes),
     )
     system.notes.extend(set_momenta(scene, model, state, arrangement))
     system.notes.extend(
@@ -167,35 +165,6 @@ def build(scene: MolecularScene) -> System:
     else:
         system.notes.extend(f"box: {note}" for note in arrangement.notes)
     return system
-
-
-def _cutoff(scene: MolecularScene, space: Space, species: list[Molecule]) -> float:
-    forces = scene.forces
-    cutoff = forces.cutoff_A or (DEFAULT_CUTOFF if space.volume < inf else inf)
-    faults = []
-    half = min(space.edges) / 2
-    least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
-    if cutoff > half:
-        given = "" if forces.cutoff_A else " (the default)"
-        faults.append(
-            f"forces.cutoff_A = {cutoff:g}{given} is longer than half {least} of the box, {half:.3f} Å: "
-            "a site would meet two images of another. Take a larger box or a shorter cut-off"
-        )
-    for m in species:
-        extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
-        if extent > half:
-            faults.append(
-                f"a molecule of {m.name} is {extent:.2f} Å long, more than half {least} of the box, {half:.3f} Å"
-            )
-    start = forces.switch_start_A
-    if start is not None and start >= cutoff:
-        faults.append(f"forces.switch_start_A = {start:g} is not below the cut-off of {cutoff:g} Å")
-    if forces.tail_correction and space.volume == inf:
-        faults.append("forces.tail_correction needs a periodic box: without one there is no liquid beyond the cut-off")
-    faults += electrostatic_faults(scene, space, cutoff)
-    if faults:
-        raise SceneError(scene.source, faults)
-    return cutoff
 
 
 def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:

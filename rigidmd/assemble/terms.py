@@ -1,15 +1,15 @@
 """The forces of a scene of molecules become terms, constants and what is beyond the cut-off."""
 
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.electrostatics import Charged, Electrostatics, electrostatics
+from rigidmd.assemble.electrostatics import Charged, electrostatics
 from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
 from rigidmd.errors import SceneError
-from rigidmd.forces.laws.lennard_jones import Tail, lennard_jones, tail
+from rigidmd.forces.laws.lennard_jones import LennardJones, Tail, lennard_jones, tail
 from rigidmd.forces.pairs.loop import pair_forces
 from rigidmd.forces.pairs.sites import BodySites, CentralSites
 from rigidmd.forces.pairs.space import Space
@@ -17,6 +17,17 @@ from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import KJ_PER_MOL
+
+
+class Interactions(NamedTuple):
+    """What acts between molecules."""
+
+    terms: dict[str, NamedTuple]
+    constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
+    pressure: float = 0.0  # u/(Å ps²), that no motion changes
+    tail: Tail | None = None  # what is missing beyond the cut-off, where it is asked for
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    notes: tuple[str, ...] = ()
 
 
 def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
@@ -62,61 +73,69 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
     return found
 
 
-def terms_of(
+def interactions(
     scene: MolecularScene,
     species: list[Molecule],
     model: Model,
     space: Space,
-    cutoff: float,
     state: State,
     basis: np.ndarray,
-) -> tuple[dict[str, NamedTuple], dict[str, float], float, Tail | None, dict[str, Any], Electrostatics | None]:
-    """Terms and constant energies by name, constant pressure, what is beyond the cut-off, what was decided, charges."""
-    forces = scene.forces
-    index = model.species
-    usual = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
-    start = forces.switch_start_A or usual
-    decided = {} if cutoff == inf else {"cutoff_A": cutoff}
-    if cutoff < inf and "switch" in forces.truncation:
-        decided["switch_start_A"] = start
-    terms, constants, pressure, beyond = {}, {}, 0.0, None
+    pme_grid: tuple[int, int, int] | None,
+) -> Interactions:
+    """What acts between the molecules of a resolved scene. Raises SceneError.
+
+    basis, pme_grid : see `electrostatics`
+    """
+    found, index = Interactions({}, {}), model.species
+    frozen = (model.inverse_mass == 0)[index]
     named = _named_pairs(scene, species)
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
-    frozen = model.inverse_mass == 0
     if any(len(c) for c in chosen):
-        pairs = [
-            [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
-            for k, (m, c) in enumerate(zip(species, chosen, strict=True))
-        ]
-        kinds = sorted({pair for of_species in pairs for pair in of_species})
-        of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
-        kind = np.concatenate([of_species[k] for k in index])
-        sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
-        special = {
-            (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
-            for n, entry in enumerate(forces.pairs)
-            for i, (_, _, one) in enumerate(kinds)
-            for j, (_, _, other) in enumerate(kinds)
-            if one[2 * n] and other[2 * n + 1]
-        }
-        law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
-        if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
-            raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
+        law = _lennard_jones(scene, species, index, named, chosen)
         sites = _taking_part(species, index, chosen)
-        terms["lennard_jones"] = pair_forces(law, sites, _groups(sites, frozen[index]))
-        if forces.tail_correction:
-            beyond = tail(law)
-    found = None
+        found.terms["lennard_jones"] = pair_forces(law, sites, _groups(sites, frozen))
+        if scene.forces.tail_correction:
+            found = found._replace(tail=tail(law))
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
-    if forces.electrostatics != "none" and any(len(c) for c in chosen):
-        sites = _taking_part(species, index, chosen)
-        charged = Charged(species, index, frozen[index], chosen, sites, _groups(sites, frozen[index]))
-        found = electrostatics(scene, charged, space, cutoff, start, state, basis)
-        terms |= found.terms
-        constants |= found.constants
-        pressure += found.pressure
-        decided |= found.decided or {}
-    return terms, constants, pressure, beyond, decided, found
+    if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
+        return found
+    sites = _taking_part(species, index, chosen)
+    charged = Charged(species, index, frozen, chosen, sites, _groups(sites, frozen))
+    added = electrostatics(scene, charged, space, state, basis, pme_grid)
+    return Interactions(
+        found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error, added.notes
+    )
+
+
+def _lennard_jones(
+    scene: MolecularScene,
+    species: list[Molecule],
+    index: np.ndarray,
+    named: list[np.ndarray],
+    chosen: list[np.ndarray],
+) -> LennardJones:
+    """The law of the sites `chosen` of each species. Raises SceneError."""
+    forces, cutoff = scene.forces, scene.forces.cutoff_A or inf
+    pairs = [
+        [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
+        for k, (m, c) in enumerate(zip(species, chosen, strict=True))
+    ]
+    kinds = sorted({pair for of_species in pairs for pair in of_species})
+    of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
+    kind = np.concatenate([of_species[k] for k in index])
+    sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
+    special = {
+        (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
+        for n, entry in enumerate(forces.pairs)
+        for i, (_, _, one) in enumerate(kinds)
+        for j, (_, _, other) in enumerate(kinds)
+        if one[2 * n] and other[2 * n + 1]
+    }
+    start = forces.switch_start_A or cutoff
+    law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
+    if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
+        raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
+    return law
 
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
