@@ -67,9 +67,7 @@ def test_a_dispatcher_opens_its_cache_only_to_compile():
 
 def test_an_inner_kernel_has_no_wrapper_and_says_so():
     assert type(_twice) is Inner
-    with pytest.raises(
-        TypeError, match=r"_twice is for compiled code only; for Python, use kernel\(outer=True\)"
-    ):
+    with pytest.raises(TypeError, match=r"_twice is for compiled code only; for Python, use kernel\(outer=True\)"):
         _twice(2.0)
     doubled(1.0)
     _twice.compile((types.float64,))

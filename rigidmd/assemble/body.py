@@ -16,8 +16,9 @@ from rigidmd.assemble.body_parts import (
     rotor_of,
     terms_of,
 )
+from rigidmd.assemble.resolve import FORMULATION, resolve_body, settled
 from rigidmd.assemble.system import Sites
-from rigidmd.core.schemes import SCHEMES, SOLVERS, Scheme, Solver
+from rigidmd.core.schemes import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.engines.cpu import Engine
@@ -33,8 +34,6 @@ from rigidmd.mechanics.inertia import Kind, kind_of_body
 from rigidmd.mechanics.rotor import DrivenRotor, NoRotor
 from rigidmd.scene import BodyScene
 
-DEFAULT_TOLERANCE = 1e-10
-TRAJECTORY_RADIUS = 10.0  # Å
 LARGEST_IN_GRO = 9e4  # Å: eight columns in nm
 
 
@@ -99,8 +98,12 @@ class BodySystem:
             return SCHEMES["velocity_verlet"]
         if run.integrator in SCHEMES:
             return SCHEMES[run.integrator].with_rotor(run.rotor)
-        tolerances = (run.relative_tolerance or DEFAULT_TOLERANCE, run.absolute_tolerance or DEFAULT_TOLERANCE)
-        return Solver(run.integrator, run.formulation or "matrix", run.duration_s, *tolerances)
+        found = Solver(run.integrator, run.formulation or FORMULATION, run.duration_s)
+        if run.integrator == RK4:
+            return found
+        return found._replace(
+            relative_tolerance=settled(run.relative_tolerance), absolute_tolerance=settled(run.absolute_tolerance)
+        )
 
     def engine(self) -> Engine:
         """A new engine for it at time 0, which calls the Python functions that apply forces."""
@@ -183,8 +186,7 @@ class BodySystem:
     @property
     def scale(self) -> float:
         """Å in the trajectory for a metre."""
-        radius = np.linalg.norm(self.points, axis=1).max()
-        return self.scene.output.trajectory_A_per_m or (TRAJECTORY_RADIUS / radius if radius > 0 else 1.0)
+        return settled(self.scene.output.trajectory_A_per_m)
 
     @property
     def sites(self) -> Sites:
@@ -244,6 +246,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     if faults:
         raise SceneError(scene.source, faults)
 
+    scene = resolve_body(scene, turning, float(np.linalg.norm(points, axis=1).max()))
     rotor = rotor_of(scene, moments, added_inertia, axes) if turning else NoRotor()
     frame = frame_of(scene)
     if scene.body.pinned:

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.assemble.body import BodySystem, build_body
 from rigidmd.assemble.cells import angles_deg, right_angled
+from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.forces.pairs.loop import PairForces
@@ -61,7 +62,7 @@ def _body(system: BodySystem) -> str:
     lines += [f"  {reason}" for reason in system.left_out]
     how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
     lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
-    every = max(1, round(scene.interval / run.timestep_s))
+    every = max(1, round(settled(scene.output.interval_s) / run.timestep_s))
     lines.append(f"a sample every {every * run.timestep_s:g} s")
     return "\n".join(lines)
 
@@ -95,7 +96,7 @@ def _molecules(system: System) -> str:
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if any(stage.ensemble == "nvt" for stage in scene.stages):
         lines.append("  thermostat: velocity rescaling, in the nvt stages only")
-    if (interval := scene.removes_momentum_every) is not None:
+    if interval := scene.run.remove_momentum_interval_ps:
         lines.append(f"  total momentum: taken out every {interval:g} ps")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]

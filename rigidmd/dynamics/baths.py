@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.state import EXAMPLE, HEAT, NOW
 from rigidmd.dynamics.noise import Key, chi_square, fill_words, normal_of, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present

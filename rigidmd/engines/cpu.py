@@ -108,9 +108,7 @@ class Engine:
         moved = (model, self._codes[kind], state, self.load)
         flows, room = row_of(scheme), self._room if scheme.box is not None else None
         cursor = np.array([0, not self._stale, 0], np.int64)
-        while status := advance(
-            *moved, self._workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor
-        ):
+        while status := advance(*moved, self._workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor):
             self._answer(status, state)
         self._stale = cursor[1] == 0  # also where there was no step, and nobody has evaluated forces
 

@@ -41,7 +41,7 @@ def _of_reaction_field(system: System) -> dict[str, str]:
 def _of_ewald(system: System) -> dict[str, str]:
     """Of what depends on whether energies of real space are shifted."""
     real, own = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
-    if not system.scene.forces.shifts_ewald:
+    if system.scene.forces.ewald_truncation == "plain":
         return {"coulomb_real": f"{real}, plain at the cut-off", "coulomb_self": own}
     charged = any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species)
     more = (

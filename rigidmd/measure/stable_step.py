@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.body import BodySystem
-from rigidmd.assemble.system import System, species_of
+from rigidmd.assemble.species import species_of
+from rigidmd.assemble.system import System
 from rigidmd.core.schemes import DRIFT, KICK, RK4, Scheme, Solver
 from rigidmd.core.state import Load, State
 from rigidmd.forces.body.fields import SteadyForce

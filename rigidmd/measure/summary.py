@@ -79,10 +79,10 @@ def summarise(
 
 def _removed(scene: MolecularScene, state: State) -> dict | None:
     """What removals of the total momentum took out in the whole run; None where there are none."""
-    if scene.removes_momentum_every is None:
+    if not scene.run.remove_momentum_interval_ps:
         return None
     return {
-        "interval_ps": scene.removes_momentum_every,
+        "interval_ps": scene.run.remove_momentum_interval_ps,
         "energy_kJ_mol": -float(state.books[TAKEN]) / KJ_PER_MOL,
     }
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.overlaps import OVERLAP, close_pairs
+from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
@@ -265,8 +266,8 @@ class BodyCheck:
     def finding(self, state: State, dt: float) -> Finding | None:
         """What is wrong with a state of the run."""
         system, limits = self.system, self.limits
-        largest = limits.orthogonality or (0.1 if isinstance(system.method, Solver) else 1e-9)
-        if limits.orthogonality is not False and not (worst := orthogonality_error(state.rotation)) <= largest:
+        largest = settled(limits.orthogonality)
+        if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
             seen = f"Q is no rotation any more: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
             return Finding(seen, unturned=True)
         if system.turns and limits.turn_rad:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
+from rigidmd.assemble.resolve import settled
 from rigidmd.core.state import NOW
 from rigidmd.errors import SimulationError
 from rigidmd.measure.body_summary import summarise_body
@@ -14,7 +15,7 @@ from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.stable_step import body_rate, stable_angle
 from rigidmd.measure.subjects import decided_for_body
 from rigidmd.output.report import body_summary_text
-from rigidmd.output.scene_file import write_body_scene
+from rigidmd.output.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
 from rigidmd.run.loop import Costs, Simulation, Stretch
 from rigidmd.run.moment import Moment
@@ -50,6 +51,7 @@ class BodySimulation(Simulation):
             self._say("choosing integrator and step by pilot runs")
             self.scene, self._choice = decided_for_body(scene, applied)
         self.system = build_body(self.scene, applied)
+        self.scene = self.system.scene
         self.threads = 1
         self._reset()
 
@@ -100,7 +102,7 @@ class BodySimulation(Simulation):
         return self.system.pose(moment.time, moment.state)
 
     def _own_observers(self) -> list[Observer]:
-        output, interval = self.scene.output, self.scene.interval
+        output, interval = self.scene.output, settled(self.scene.output.interval_s)
         self._sampler, self._watch = Sampler(interval), BodyWatch(self)
         files: list[Observer] = []
         if output.trajectory:
@@ -128,7 +130,7 @@ class BodySimulation(Simulation):
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it is run."""
-        write_body_scene(folder, self.scene, self.system)
+        write_scene(folder, self.scene)
 
     def introduction(self) -> str:
         """One line, before the run."""

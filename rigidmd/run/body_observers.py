@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.assemble.resolve import settled
 from rigidmd.forces.body.frame import Inertial
 from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
 from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
@@ -41,7 +42,7 @@ class BodyWatch(Observer):
 
     def __init__(self, run: "BodySimulation"):
         self.check = BodyCheck(run.system, run.scene.watch)
-        every = max(1, round(run.scene.interval / run.scene.run.timestep_s))
+        every = max(1, round(settled(run.scene.output.interval_s) / run.scene.run.timestep_s))
         # half a second of computing or less, and LOOKS samples
         self.steps = min(BODY_PATIENCE // getattr(run.system.method, "force_evaluations", 1), LOOKS * every)
         self._run = run

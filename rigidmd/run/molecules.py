@@ -31,7 +31,6 @@ from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.relief import Relief, relieve
 from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.molecules import WITH_VELOCITIES
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
 
 
@@ -80,7 +79,7 @@ class MolecularSimulation(Simulation):
         relief = None
         if self.system.from_lattice:
             radius = np.array([m.radius for m in self.system.species])
-            temperature = self.scene.start.temperature_K or first.temperature_K or 0.0
+            temperature = self.scene.start.temperature_K or 0.0
             # At 0 K the scale is the deepest well between two sites.
             thermal = BOLTZMANN * temperature or max((m.epsilon.max() for m in self.system.species), default=0.0)
             if thermal > 0:
@@ -120,7 +119,7 @@ class MolecularSimulation(Simulation):
                     key_of(self.scene.seed, BATH, k),
                 )
             )
-        if (interval := self.scene.removes_momentum_every) is not None:
+        if interval := self.scene.run.remove_momentum_interval_ps:
             row = row.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
         return row
 
@@ -213,7 +212,7 @@ class MolecularSimulation(Simulation):
         observers: list[Observer] = [self._sampler, self._watch, StepWatch(self, self._watch)]
         files: list[Observer] = []
         if output.trajectory:
-            velocities = output.trajectory.endswith(WITH_VELOCITIES) if output.velocities is None else output.velocities
+            velocities = bool(output.velocities)
             wrapped = output.positions == "wrapped"
             files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
         if self.folder is not None:
@@ -240,7 +239,7 @@ class MolecularSimulation(Simulation):
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it is run, with copies of the files that it reads."""
-        write_scene(folder, self.scene, self.system)
+        write_scene(folder, self.scene)
 
     def introduction(self) -> str:
         """What is about to run."""

@@ -365,10 +365,14 @@ class BodyScene(Scene):
         pinned = ", pinned" if self.body.pinned else ""
         return f"{self.name}: one body{pinned}; {run.duration_s:g} s{how}, {run.integrator}"
 
-    @property
-    def interval(self) -> float:
-        """Time between samples, s."""
-        return self.output.interval_s or self.run.duration_s / 2000
+    def resolved(self) -> "BodyScene":
+        """The same scene with every number that a run of it uses; it runs to the same bits.
+
+        An integrator that is "auto" stays so until a run has chosen one. Raises SceneError.
+        """
+        from rigidmd.assemble.body import build_body
+
+        return build_body(self).scene
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:

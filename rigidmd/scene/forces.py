@@ -63,8 +63,9 @@ class Forces(Section):
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Of damped_shifted_force; 0 for none"""
-    ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] = 1e-5
-    """Of ewald and pme: rms error of the force on a site, over that between two charges e at 1 Å; sets what follows"""
+    ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
+    """Of ewald and pme: rms error of the force on a site, over that between two charges e at 1 Å; sets what follows.
+    1e-5 when not given"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
@@ -100,15 +101,9 @@ class Forces(Section):
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
             raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
         settled = self.gives_waves or (self.pme_grid is not None and self.pme_order is not None)
-        if settled and self.ewald_alpha_per_A is not None and "ewald_accuracy" in self.model_fields_set:
+        if settled and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             raise ValueError("ewald_accuracy would do nothing: alpha and what goes with it are all given")
         return self
-
-    @property
-    def shifts_ewald(self) -> bool:
-        """Whether the real-space energy of an Ewald sum is shifted to 0 at the cut-off."""
-        usual = "plain" if self.truncation == "plain" else "shift"
-        return (self.ewald_truncation or usual) == "shift"
 
     @property
     def gives_waves(self) -> bool:

@@ -17,8 +17,6 @@ TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
-REMOVE_MOMENTUM_EVERY = 1.0  # ps, with pme: in it 216 waters at an accuracy of 1e-4 gained 26 u Å/ps; thermal were 980
-
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 
 
@@ -90,14 +88,14 @@ class MolecularScene(Scene):
     output: Output = Output()
     watch: Watch = Watch()
 
-    @property
-    def removes_momentum_every(self) -> float | None:
-        """Time between removals of the total momentum, ps; None for never."""
-        asked = self.run.remove_momentum_interval_ps
-        if asked is not None:
-            return asked or None
-        held = any(species.frozen for species in self.molecules)
-        return REMOVE_MOMENTUM_EVERY if self.forces.electrostatics == "pme" and not held else None
+    def resolved(self) -> "MolecularScene":
+        """The same scene with every number that a run of it uses; it runs to the same bits.
+
+        An integrator that is "auto" stays so until a run has chosen one. Raises what building the system raises.
+        """
+        from rigidmd.assemble.system import build
+
+        return build(self).scene
 
     @property
     def in_short(self) -> str:

@@ -173,9 +173,9 @@ class Stage(Section):
         several = len(given) if isinstance(given, tuple) else 1
         if self.integrator == AUTO:
             faults.append("integrator = 'auto' chooses for a constant volume: name one for a stage with a pressure")
-        if several == 3 and coupling in ("isotropic", "semi_isotropic"):
-            if coupling == "isotropic" or given[0] != given[1]:
-                faults.append(f"pressure_bar: three pressures need pressure_coupling = 'anisotropic', not {coupling!r}")
+        apart = coupling == "semi_isotropic" and several == 3 and given[0] != given[1]
+        if apart or (coupling == "isotropic" and several == 3):
+            faults.append(f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}")
         if several == 6 and coupling != "flexible":
             faults.append(f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}")
         if self.ensemble == "nph" and (coupling != "isotropic" or several > 2):

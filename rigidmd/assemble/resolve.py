@@ -1,0 +1,246 @@
+"""Every default of a scene is decided here. Systems are built from resolved scenes only, in which they are filled in.
+
+A resolved scene runs to the same bits as the scene that it came from. Three things stay open in it: an integrator that
+is "auto", which a pilot run chooses; the number of threads, on which results do not depend; and the grid of PME where
+the cell of the scene leans so much that another cell of the same lattice stands for it (see `Resolved.pme_grid`).
+"""
+
+from math import inf, pi, sqrt
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from rigidmd.assemble.cells import basis_in_words, edges_in_words
+from rigidmd.core.schemes import RK4, SOLVERS
+from rigidmd.forces.pairs.space import Space, Triclinic, cell_of
+from rigidmd.forces.waves.errors import FAREST, Charges, alpha_for, charges_of, mesh_for, wave_radius_for
+from rigidmd.forces.waves.vectors import AS_GIVEN
+from rigidmd.molecules import Molecule
+from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.forces import Forces
+from rigidmd.scene.molecules import WITH_VELOCITIES, Output, Throughout
+
+CUTOFF = 9.0  # Å, in a periodic box
+ACCURACY = 1e-5  # of Ewald sums
+#: ps, with PME, whose forces do not add up to zero exactly: in it 216 waters at an accuracy of 1e-4 gained 26 u Å/ps;
+#: thermal were 980.
+REMOVE_MOMENTUM_INTERVAL = 1.0
+#: Along an edge, as forces.ewald_k_max has it: more would take all memory.
+MOST_WAVES = 1000
+
+SAMPLES = 2000  # of the motion of a body
+TOLERANCE = 1e-10  # of DOP853 and RADAU
+FORMULATION = "matrix"
+TRAJECTORY_RADIUS = 10.0  # Å, of a body
+#: Largest entry of abs(QᵀQ - 1) of a body: under schemes, which keep it, and under general solvers, which do not.
+ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
+
+T = TypeVar("T")
+
+
+def settled(value: T | None) -> T:
+    """A value of a resolved scene that is never open where it is used."""
+    assert value is not None, "the scene is not resolved"
+    return value
+
+
+class Facts(NamedTuple):
+    """What the defaults of a scene of molecules depend on, besides the scene."""
+
+    species: list[Molecule]
+    counts: np.ndarray  # (k,) molecules of each species
+    space: Space
+    basis: np.ndarray  # (3, 3) integers: the edges of the box in those of the cell that was described
+
+    @property
+    def charges(self) -> Charges:
+        """The charges of all molecules."""
+        sites = [m.charges != 0 for m in self.species]
+        return charges_of(
+            [
+                (int(count), m.charges[own], m.positions_body[own])
+                for count, m, own in zip(self.counts, self.species, sites, strict=True)
+            ]
+        )
+
+    @property
+    def reciprocal(self) -> np.ndarray:
+        """Reciprocal cell (3, 3), rows, 1/Å."""
+        return 2 * pi * np.linalg.inv(cell_of(self.space)).T
+
+    @property
+    def is_as_described(self) -> bool:
+        """Whether the box has the edges of the cell that was described."""
+        return np.array_equal(self.basis, AS_GIVEN)
+
+
+class Resolved(NamedTuple):
+    """A scene with its defaults filled in, and what is wrong with its numbers. With faults some may still be open."""
+
+    scene: MolecularScene
+    faults: list[str]
+    #: Grid points along the edges of the box. The scene says the same, unless the box has other edges than the cell
+    #: that was described: forces.pme_grid counts along those.
+    pme_grid: tuple[int, int, int] | None
+
+
+def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
+    """A scene of molecules with every number that a run of it uses."""
+    numbers, faults = _range_of_forces(scene.forces, facts)
+    grid = None
+    if not faults and scene.forces.electrostatics in ("ewald", "pme"):
+        found, faults, grid = _ewald(scene.forces, facts, numbers["cutoff_A"])
+        numbers |= found
+    tables = {
+        "forces": scene.forces.model_copy(update=numbers),
+        "run": _throughout(scene),
+        "output": _output(scene.output),
+    }
+    reads_velocities = scene.structure is not None and scene.structure.velocities
+    if scene.start.temperature_K is None and not reads_velocities:
+        tables["start"] = scene.start.model_copy(update={"temperature_K": scene.stages[0].temperature_K})
+    return Resolved(scene.model_copy(update=tables), faults, grid)
+
+
+def _throughout(scene: MolecularScene) -> Throughout:
+    interval = scene.run.remove_momentum_interval_ps
+    if interval is None:
+        held = any(species.frozen for species in scene.molecules)
+        interval = REMOVE_MOMENTUM_INTERVAL if scene.forces.electrostatics == "pme" and not held else False
+    return scene.run.model_copy(update={"remove_momentum_interval_ps": interval})
+
+
+def _output(output: Output) -> Output:
+    if output.velocities is not None:
+        return output
+    holds = bool(output.trajectory) and output.trajectory.endswith(WITH_VELOCITIES)
+    return output.model_copy(update={"velocities": holds})
+
+
+def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list[str]]:
+    """Cut-off and start of a switch as keys of [forces], and faults."""
+    space = facts.space
+    given = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
+    cutoff, start, faults = given or inf, forces.switch_start_A, []
+    half = min(space.edges) / 2
+    least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
+    if cutoff > half:
+        faults.append(
+            f"forces.cutoff_A = {cutoff:g}{_default(forces.cutoff_A)} is longer than half {least} of the box, "
+            f"{half:.3f} Å: a site would meet two images of another. Take a larger box or a shorter cut-off"
+        )
+    for m in facts.species:
+        extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
+        if extent > half:
+            faults.append(
+                f"a molecule of {m.name} is {extent:.2f} Å long, more than half {least} of the box, {half:.3f} Å"
+            )
+    if start is not None and start >= cutoff:
+        faults.append(f"forces.switch_start_A = {start:g} is not below the cut-off of {cutoff:g} Å")
+    if forces.tail_correction and space.volume == inf:
+        faults.append("forces.tail_correction needs a periodic box: without one there is no liquid beyond the cut-off")
+    faults += _electrostatic_faults(forces, space, cutoff)
+    if start is None and cutoff < inf and "switch" in forces.truncation:
+        start = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
+    return {"cutoff_A": given, "switch_start_A": start}, faults
+
+
+def _default(given: object) -> str:
+    """How a message marks a value that was not given."""
+    return "" if given else " (the default)"
+
+
+def _electrostatic_faults(forces: Forces, space: Space, cutoff: float) -> list[str]:
+    """What is wrong with the electrostatics in this box."""
+    method = forces.electrostatics
+    if method in ("ewald", "pme") and space.volume == inf:
+        return [
+            f"forces.electrostatics = {method!r} sums over the images of a periodic box, and there is none; "
+            "use reaction_field, which without a box is Coulomb's plain law"
+        ]
+    if method == "damped_shifted_force" and cutoff == inf:
+        return ["forces.electrostatics = 'damped_shifted_force' ends at a cut-off; give forces.cutoff_A"]
+    screening = {"damped_shifted_force": "damping_per_A", "ewald": "ewald_alpha_per_A", "pme": "ewald_alpha_per_A"}
+    if (key := screening.get(method)) and (getattr(forces, key) or 0.0) * cutoff > FAREST:
+        return [
+            f"forces.{key} = {getattr(forces, key):g} with a cut-off of {cutoff:g} Å screens charges there by "
+            f"erfc({getattr(forces, key) * cutoff:.3g}), far below rounding; at most {FAREST / cutoff:.3g} is of use"
+        ]
+    return []
+
+
+def _ewald(
+    forces: Forces, facts: Facts, cutoff: float
+) -> tuple[dict[str, Any], list[str], tuple[int, int, int] | None]:
+    """Numbers of an Ewald sum as keys of [forces], faults, and the grid of PME along the edges of the box.
+
+    The accuracy goes once all that follows from it is there: beside those numbers it would do nothing.
+    """
+    usual = "plain" if forces.truncation == "plain" else "shift"
+    numbers: dict[str, Any] = {"ewald_truncation": forces.ewald_truncation or usual}
+    charges = facts.charges
+    if charges.count == 0:
+        return numbers, [], None
+    accuracy = forces.ewald_accuracy or ACCURACY
+    share = accuracy / sqrt(2)  # for either part
+    asked = f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be had"
+    alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, facts.space.volume, share))
+    if alpha * cutoff > FAREST:
+        return numbers, [f"{asked} with a cut-off of {cutoff:g} Å; take a longer one"], None
+    numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
+    if forces.electrostatics == "ewald":
+        radius = forces.ewald_k_radius_per_A
+        if not forces.gives_waves:
+            radius = float(wave_radius_for(charges, alpha, facts.reciprocal, share))
+        longest = np.linalg.norm(cell_of(facts.space), axis=1).max()
+        if radius is not None and forces.ewald_k_max is None and radius * longest > 2 * pi * MOST_WAVES:
+            fault = (
+                f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)} is more than "
+                f"{MOST_WAVES} waves along an edge of the box"
+            )
+            return numbers, [fault], None
+        return numbers | {"ewald_k_radius_per_A": radius}, [], None
+    grid, order, cell = forces.pme_grid, forces.pme_order, cell_of(facts.space)
+    if grid is not None and len(set(grid)) > 1 and not facts.is_as_described:
+        fault = (
+            f"forces.pme_grid = {list(grid)} counts points along edges of a cell that leans too much; the box is that "
+            f"with {edges_in_words(cell)}, {basis_in_words(facts.basis)}, and has its own edges. Describe the box by "
+            "that cell, or give three equal numbers, or leave pme_grid out"
+        )
+        return numbers, [fault], None
+    if grid is None or order is None:
+        found = mesh_for(charges, alpha, cell, share, order, grid)
+        if found is None:
+            given = " with the forces.pme_order or pme_grid that is given" if order or grid else ""
+            fault = f"{asked}{given} at alpha = {alpha:.3g} 1/Å; ask for less, or take a longer cut-off"
+            return numbers, [fault], None
+        grid, order = found
+    numbers["pme_order"] = order
+    if facts.is_as_described or forces.pme_grid is not None:
+        numbers["pme_grid"] = grid
+    else:
+        numbers["ewald_accuracy"] = accuracy
+    return numbers, [], grid
+
+
+def resolve_body(scene: BodyScene, turns: bool, radius: float) -> BodyScene:
+    """A scene of a single body with every number that a run of it uses.
+
+    turns : whether the body has an orientation. radius : of the points that its trajectory shows, m
+    """
+    run, watch = scene.run, scene.watch
+    solver = run.integrator in SOLVERS
+    if solver:
+        numbers: dict[str, Any] = {"formulation": (run.formulation or FORMULATION) if turns else None}
+        if run.integrator != RK4:
+            numbers["relative_tolerance"] = run.relative_tolerance or TOLERANCE
+            numbers["absolute_tolerance"] = run.absolute_tolerance or TOLERANCE
+        run = run.model_copy(update=numbers)
+    scale = TRAJECTORY_RADIUS / radius if radius > 0 else 1.0
+    output = {
+        "interval_s": scene.output.interval_s or run.duration_s / SAMPLES,
+        "trajectory_A_per_m": scene.output.trajectory_A_per_m or scale,
+    }
+    if watch.orthogonality is None:
+        watch = watch.model_copy(update={"orthogonality": ORTHOGONALITY_OF_SOLVERS if solver else ORTHOGONALITY})
+    return scene.model_copy(update={"run": run, "output": scene.output.model_copy(update=output), "watch": watch})

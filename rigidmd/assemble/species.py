@@ -1,0 +1,103 @@
+"""The molecules that a scene names, and which of them are frozen."""
+
+import numpy as np
+
+from rigidmd.assemble.structure_files import read_geometry
+from rigidmd.errors import Faults, SceneError, StructureError
+from rigidmd.molecules import (
+    Molecule,
+    Site,
+    find_site,
+    load_model,
+    molecule,
+    read_molecule,
+    read_parameters,
+    with_masses,
+    with_parameters,
+)
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.species import Molecules
+
+
+def species_of(scene: MolecularScene) -> list[Molecule]:
+    """The molecules that a scene names, in its order. Raises SceneError with every fault."""
+    found, faults = [], []
+    for k, entry in enumerate(scene.molecules):
+        try:
+            found.append(_one_species(scene, entry))
+        except Faults as error:
+            faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.faults]
+    names = [m.name for m in found]
+    faults += [
+        f"molecules: {name} stands there twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1
+    ]
+    if faults:
+        raise SceneError(scene.source, faults)
+    return found
+
+
+def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
+    if entry.model is not None:
+        found = load_model(entry.model)
+    elif entry.file is not None and entry.file.endswith(".toml"):
+        found = read_molecule(scene.path(entry.file))
+    else:
+        table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters))
+        sites = entry.sites if entry.file is None else _sites_from_file(scene, entry, table)
+        found = molecule(entry.name or scene.path(entry.file).stem, with_parameters(sites, table))
+    if entry.masses_u is not None:
+        found = with_masses(found, entry.masses_u)
+    changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
+    return Molecule(**{**vars(found), **changed})
+
+
+def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
+    """Geometry from the file, everything else from the scene's sites and the table, by atom name or else by element."""
+    path = scene.path(entry.file)
+    own = entry.sites or ()
+    faults = []
+    sites = []
+    used = set()
+    for name, element, mass, position in zip(*read_geometry(path), strict=True):
+        match, shared = find_site(own, name, element), find_site(table, name, element)
+        if match is None and shared is None:
+            where = " or of parameters" if entry.parameters is not None else ""
+            faults.append(f"atom {name}: no entry of sites{where} has this name or is called {element}")
+            continue
+        used.add(match.name if match else "")
+        entries = [s for s in (match, shared) if s is not None]
+        given = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
+        element = next((s.element for s in entries if s.element != "X"), element)
+        known = {"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
+        sites.append(match.model_copy(update=known) if match else Site(**known))
+    faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]
+    if faults:
+        raise StructureError(str(path), faults)
+    return tuple(sites)
+
+
+def frozen_apart(
+    scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
+) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
+    """Species, index (n,) into them, which are frozen, and faults. A species that is frozen in part becomes two."""
+    species, index, faults = list(species), index.copy(), []
+    frozen = [entry.frozen is True for entry in scene.molecules]
+    for k, entry in enumerate(scene.molecules):
+        own = index == k
+        chosen = np.zeros(len(index), bool)
+        for first, last in entry.frozen_spans:
+            here = own & (first <= number) & (number <= last)
+            if not here.any() or last > number[own].max():
+                there = f"they have {number[own].min()} to {number[own].max()}" if own.any() else "there are none"
+                asked = f"{first}" if first == last else f"{first}-{last}"
+                faults.append(f"molecules.{k}.frozen: no {species[k].name} has the number {asked}; {there}")
+            chosen |= here
+        if chosen.any() and (chosen == own).all():
+            frozen[k] = True
+        elif chosen.any():
+            index[chosen] = len(species)
+            species.append(species[k])
+            frozen.append(True)
+    if frozen and all(frozen[k] for k in np.unique(index)):
+        faults.append("molecules: all are frozen; nothing would move")
+    return species, index, np.array(frozen), faults

@@ -1,0 +1,87 @@
+"""The start of a scene of molecules: where they are, and their momenta."""
+
+import numpy as np
+
+from rigidmd.assemble.lattice import lattice
+from rigidmd.assemble.momenta import draw_momenta, mobile, remove_momentum
+from rigidmd.assemble.resolve import settled
+from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
+from rigidmd.core.state import State
+from rigidmd.dynamics.advance import Model
+from rigidmd.dynamics.noise import LATTICE, MOMENTA
+from rigidmd.errors import StructureError
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.molecules import Molecule
+from rigidmd.scene import MolecularScene
+from rigidmd.units import GRAM_PER_CM3
+
+
+def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
+    if scene.structure is not None:
+        path = scene.path(scene.structure.file)
+        start = scene.structure
+        found = read_structure(
+            path,
+            species,
+            scene.box.cell,
+            scene.box.periodic,
+            start.tolerance,
+            start.frame,
+            start.repeat,
+            start.atom_types,
+        )
+        faults = []
+        for k, entry in enumerate(scene.molecules):
+            present = int((found.species == k).sum())
+            if entry.count is not None and entry.count != present:
+                faults.append(f"holds {present} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
+        if scene.structure.velocities and found.velocity is None:
+            told = "".join(f"; {note}" for note in found.notes if "velocit" in note)
+            faults.append(f"holds no velocities for all atoms{told}. Leave out structure.velocities = true")
+        if faults:
+            raise StructureError(str(path), faults)
+        return found
+    counts = [entry.count for entry in scene.molecules]
+    mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
+    cell = scene.box.cell
+    if cell is None:
+        cell = np.eye(3) * np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))
+    rng = np.random.default_rng([scene.seed, LATTICE])
+    n = sum(counts)
+    found = Arrangement(
+        species=np.repeat(np.arange(len(species)), counts),
+        position=lattice(n, np.diag(cell), rng),
+        rotation=random_rotations(rng, n),
+        velocity=None,
+        angular_momentum_body=None,
+        cell=cell if scene.box.periodic else None,
+        residual_rms=0.0,
+        residual_max=0.0,
+    )
+    return leaning_less(found, "its", may_turn=False)
+
+
+def residue_numbers(arrangement: Arrangement) -> np.ndarray:
+    """Numbers (n,) of residues, or else 1, 2, ... among the molecules of each species."""
+    if arrangement.number is not None:
+        return arrangement.number
+    found = np.zeros(len(arrangement.species), int)
+    for k in np.unique(arrangement.species):
+        own = arrangement.species == k
+        found[own] = np.arange(1, own.sum() + 1)
+    return found
+
+
+def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: Arrangement) -> list[str]:
+    """Give a state its momenta, in place: those of the structure file, or drawn at a temperature. Returns notes."""
+    if scene.structure is not None and scene.structure.velocities:
+        state.velocity[:] = arrangement.velocity
+        state.angular_momentum_body[:] = arrangement.angular_momentum_body[: len(state.angular_momentum_body)]
+        held = ~mobile(model)
+        state.velocity[held] = 0.0
+        state.angular_momentum_body[held[: len(state.rotation)]] = 0.0
+        removed = remove_momentum(model, state.velocity)
+        return ["the total momentum of the file's velocities was taken out"] if removed else []
+    temperature = settled(scene.start.temperature_K)
+    draw_momenta(model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))
+    return []

@@ -1,0 +1,164 @@
+"""The forces of a scene of molecules become terms, constants and what is beyond the cut-off."""
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.electrostatics import Charged, electrostatics
+from rigidmd.core.state import State
+from rigidmd.dynamics.advance import Model
+from rigidmd.errors import SceneError
+from rigidmd.forces.laws.lennard_jones import LennardJones, Tail, lennard_jones, tail
+from rigidmd.forces.pairs.loop import pair_forces
+from rigidmd.forces.pairs.sites import BodySites, CentralSites
+from rigidmd.forces.pairs.space import Space
+from rigidmd.mechanics.rotor import NoRotor
+from rigidmd.molecules import Molecule
+from rigidmd.scene import MolecularScene
+from rigidmd.units import KJ_PER_MOL
+
+
+class Interactions(NamedTuple):
+    """What acts between molecules."""
+
+    terms: dict[str, NamedTuple]
+    constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
+    pressure: float = 0.0  # u/(Å ps²), that no motion changes
+    tail: Tail | None = None  # what is missing beyond the cut-off, where it is asked for
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    notes: tuple[str, ...] = ()
+
+
+def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
+    """Sites of a law: chosen[k] lists the sites of species k that take part."""
+    counts = np.array([len(c) for c in chosen])
+    first = np.concatenate([[0], np.cumsum(counts[index])]).astype(np.int32)
+    member = np.repeat(np.arange(len(index), dtype=np.int32), counts[index])
+    offset = np.concatenate([m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
+    if not offset.any():
+        return CentralSites(first, member)
+    kind = (np.cumsum(counts) - counts)[index].astype(np.int32)
+    return BodySites(first, member, kind, np.ascontiguousarray(offset))
+
+
+def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
+    """Sites (s,) by what they do not act on: their own molecule, and frozen ones on all that is frozen."""
+    if not frozen.any():
+        return sites.molecule
+    return np.where(frozen[sites.molecule], len(frozen), sites.molecule).astype(np.int32)
+
+
+def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
+    """For each species (pairs, 2, sites): whether an entry of forces.pairs means the site by its first, second name.
+
+    Raises SceneError.
+    """
+    found = [np.zeros((len(scene.forces.pairs), 2, len(m.site_names)), bool) for m in species]
+    faults = []
+    for n, entry in enumerate(scene.forces.pairs):
+        for side, text in enumerate(entry.sites):
+            owner, _, name = text.rpartition(".")
+            of = [k for k, m in enumerate(species) if owner in ("", m.name)]
+            for names in ("site_names", "elements"):
+                for k in of:
+                    found[k][n, side] = [own == name for own in getattr(species[k], names)]
+                if any(found[k][n, side].any() for k in of):
+                    break
+            else:
+                known = dict.fromkeys(f"{m.name}.{own}" for m in species for own in m.site_names)
+                faults.append(f"forces.pairs.{n}.sites: no site is {text!r}; there are {', '.join(known)}")
+    if faults:
+        raise SceneError(scene.source, faults)
+    return found
+
+
+def interactions(
+    scene: MolecularScene,
+    species: list[Molecule],
+    model: Model,
+    space: Space,
+    state: State,
+    basis: np.ndarray,
+    pme_grid: tuple[int, int, int] | None,
+) -> Interactions:
+    """What acts between the molecules of a resolved scene. Raises SceneError.
+
+    basis, pme_grid : see `electrostatics`
+    """
+    found, index = Interactions({}, {}), model.species
+    frozen = (model.inverse_mass == 0)[index]
+    named = _named_pairs(scene, species)
+    chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
+    if any(len(c) for c in chosen):
+        law = _lennard_jones(scene, species, index, named, chosen)
+        sites = _taking_part(species, index, chosen)
+        found.terms["lennard_jones"] = pair_forces(law, sites, _groups(sites, frozen))
+        if scene.forces.tail_correction:
+            found = found._replace(tail=tail(law))
+    chosen = [np.flatnonzero(m.charges != 0) for m in species]
+    if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
+        return found
+    sites = _taking_part(species, index, chosen)
+    charged = Charged(species, index, frozen, chosen, sites, _groups(sites, frozen))
+    added = electrostatics(scene, charged, space, state, basis, pme_grid)
+    return Interactions(
+        found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error, added.notes
+    )
+
+
+def _lennard_jones(
+    scene: MolecularScene,
+    species: list[Molecule],
+    index: np.ndarray,
+    named: list[np.ndarray],
+    chosen: list[np.ndarray],
+) -> LennardJones:
+    """The law of the sites `chosen` of each species. Raises SceneError."""
+    forces, cutoff = scene.forces, scene.forces.cutoff_A or inf
+    pairs = [
+        [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
+        for k, (m, c) in enumerate(zip(species, chosen, strict=True))
+    ]
+    kinds = sorted({pair for of_species in pairs for pair in of_species})
+    of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
+    kind = np.concatenate([of_species[k] for k in index])
+    sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
+    special = {
+        (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
+        for n, entry in enumerate(forces.pairs)
+        for i, (_, _, one) in enumerate(kinds)
+        for j, (_, _, other) in enumerate(kinds)
+        if one[2 * n] and other[2 * n + 1]
+    }
+    start = forces.switch_start_A or cutoff
+    law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
+    if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
+        raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
+    return law
+
+
+def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
+    """What is not compiled, and why."""
+    out = []
+    if "lennard_jones" not in terms:
+        out.append("Lennard-Jones: no site has it")
+    if not any(name.startswith("coulomb") for name in terms):
+        out.append(
+            "charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one")
+        )
+    elif "coulomb_reciprocal" not in terms:
+        out.append(f"sums over periodic images, Fourier transforms: electrostatics is {scene.forces.electrostatics}")
+    elif scene.forces.electrostatics == "ewald":
+        out.append("Fourier transforms: electrostatics is ewald, wave by wave")
+    if isinstance(model.rotor, NoRotor):
+        out.append("rotation and torques: every molecule is a point")
+    if space.volume == inf:
+        out.append("periodic images: there is no box")
+    if all(stage.ensemble == "nve" for stage in scene.stages):
+        out.append("thermostat: every stage is nve")
+    if scene.run.remove_momentum_interval_ps is False:
+        out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
+    if not scene.forces.tail_correction:
+        out.append("tail correction: not asked for")
+    return out
