@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.assemble.electrostatics import Charged, Electrostatics, electrostatic_faults, electrostatics
-from rigidmd.assemble.lattice import lattice
-from rigidmd.assemble.momenta import Freedom, draw_momenta, freedom_of, mobile, remove_momentum
+from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_terms, fields_left_out, start_lattice
+from rigidmd.assemble.momenta import Freedom, draw_momenta, freedom_of, kept_momentum, mobile, remove_momentum
 from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
 from rigidmd.assemble.structure_files import read_geometry
@@ -21,7 +21,7 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.errors import Faults, SceneError, StructureError
 from rigidmd.forces.laws.lennard_jones import Tail, lennard_jones, tail
 from rigidmd.forces.pairs.loop import pair_forces
-from rigidmd.forces.pairs.sites import BodySites, CentralSites
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, sites_of
 from rigidmd.forces.pairs.space import Space, Triclinic, space_of, wrap
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
@@ -82,6 +82,16 @@ class System:
         return float(self.model.mass[self.model.species].sum()) / self.space.volume / GRAM_PER_CM3
 
     @property
+    def external(self) -> list[str]:
+        """Names of the terms that act from outside, and so may change the total momentum."""
+        return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
+
+    @property
+    def removes_momentum_every(self) -> float | None:
+        """Time between removals of the total momentum, ps; None for never, or where nothing of it is conserved."""
+        return self.scene.removes_momentum_every if self.model.keeps_momentum.any() else None
+
+    @property
     def smallest_diameter(self) -> float:
         """Smallest Lennard-Jones diameter, or the smallest radius where there is none, Å."""
         sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
@@ -140,11 +150,15 @@ def build(scene: MolecularScene) -> System:
     model = _model(species, index, frozen)
     turning = any(m.inertia.any() for m in species)
     state = state_of(
-        position=arrangement.position, rotation=arrangement.rotation if turning else None, cell=arrangement.cell
+        position=between_walls(scene, space, arrangement.position),
+        rotation=arrangement.rotation if turning else None,
+        cell=arrangement.cell,
     )
     terms, constants, pressure, beyond, decided, charges = _terms(
         scene, species, model, space, cutoff, state, arrangement.basis
     )
+    terms |= field_terms(scene, Parts(species, model, space, cutoff, state, number))
+    model = model._replace(keeps_momentum=kept_momentum(model, terms))
     system = System(
         scene=scene,
         species=species,
@@ -163,7 +177,7 @@ def build(scene: MolecularScene) -> System:
         cutoff=cutoff,
         left_out=_left_out(scene, terms, model, space),
         force_error=charges.force_error if charges else None,
-        notes=list(charges.notes) if charges else [],
+        notes=[*(charges.notes if charges else []), *field_notes(scene)],
     )
     _set_momenta(system, arrangement)
     system.notes.extend(
@@ -275,7 +289,7 @@ def _arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     n = sum(counts)
     found = Arrangement(
         species=np.repeat(np.arange(len(species)), counts),
-        position=lattice(n, np.diag(cell), rng),
+        position=start_lattice(scene, species, n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
         velocity=None,
         angular_momentum_body=None,
@@ -384,14 +398,7 @@ def _sites(species: list[Molecule], index: np.ndarray) -> Sites:
 
 def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
     """Sites of a law: chosen[k] lists the sites of species k that take part."""
-    counts = np.array([len(c) for c in chosen])
-    first = np.concatenate([[0], np.cumsum(counts[index])]).astype(np.int32)
-    member = np.repeat(np.arange(len(index), dtype=np.int32), counts[index])
-    offset = np.concatenate([m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
-    if not offset.any():
-        return CentralSites(first, member)
-    kind = (np.cumsum(counts) - counts)[index].astype(np.int32)
-    return BodySites(first, member, kind, np.ascontiguousarray(offset))
+    return sites_of(index, [m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
 
 
 def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
@@ -505,7 +512,7 @@ def _left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) ->
         out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
     if not scene.forces.tail_correction:
         out.append("tail correction: not asked for")
-    return out
+    return out + fields_left_out(terms)
 
 
 def _set_momenta(system: System, arrangement: Arrangement) -> None:

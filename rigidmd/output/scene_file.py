@@ -28,7 +28,7 @@ def resolved(scene: MolecularScene, system: System) -> dict[str, Any]:
     data["forces"] |= system.decided
     if scene.forces.gives_waves or {"pme_grid", "ewald_k_radius_per_A"} & set(system.decided):
         data["forces"].pop("ewald_accuracy")  # what follows from it is said
-    data["run"]["remove_momentum_interval_ps"] = scene.removes_momentum_every or False
+    data["run"]["remove_momentum_interval_ps"] = system.removes_momentum_every or False
     if scene.structure is None or not scene.structure.velocities:
         data["start"].setdefault("temperature_K", scene.stages[0].temperature_K)
     return data

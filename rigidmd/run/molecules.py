@@ -120,7 +120,7 @@ class MolecularSimulation(Simulation):
                     key_of(self.scene.seed, BATH, k),
                 )
             )
-        if (interval := self.scene.removes_momentum_every) is not None:
+        if (interval := self.system.removes_momentum_every) is not None:
             row = row.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
         return row
 
