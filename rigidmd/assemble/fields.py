@@ -257,9 +257,7 @@ def fields_left_out(terms: dict[str, NamedTuple]) -> list[str]:
     """Kinds of fields that are not compiled."""
     kinds = {"electric_field": "electric field", "gravity": "gravity", "walls": "walls", "restraints": "restraints"}
     missing = [words for name, words in kinds.items() if not any(term.startswith(name) for term in terms)]
-    return (
-        [f"{', '.join(missing)}: [fields] does not ask for {'it' if len(missing) == 1 else 'them'}"] if missing else []
-    )
+    return [f"{', '.join(missing)}: not asked for in [fields]"] if missing else []
 
 
 def field_notes(scene: MolecularScene) -> list[str]:
