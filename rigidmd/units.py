@@ -30,3 +30,6 @@ ENERGY_UNITS = {
     "eV": ELEMENTARY_CHARGE * AVOGADRO * 1e-3 * KJ_PER_MOL,
     "K": BOLTZMANN,
 }
+
+VOLT_PER_NM = ENERGY_UNITS["eV"] / 10  # u Å/ps² on a charge e
+METRE_PER_S2 = 1e-14  # Å/ps²

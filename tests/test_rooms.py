@@ -35,7 +35,7 @@ LIBRARIES = {
         "output/figure.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py",
     },
-    "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
+    "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
     "numba": {
         "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lane_types.py", "compile/lanes.py",
         "compile/machine.py",

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.assemble.body import BodySystem, build_body
 from rigidmd.assemble.cells import angles_deg, right_angled
+from rigidmd.assemble.fields import fields_in_words
 from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme, Solver
@@ -90,14 +91,19 @@ def _molecules(system: System) -> str:
         lines.append("  no box")
     lines += [f"  {note}" for note in system.notes]
     lines.append("\ncompiled in:")
+    words = fields_in_words(scene, system.terms)
     for name, term in system.terms.items():
-        lines.append(f"  {name.replace('_', ' ')}: {_term(system, name, term)}")
+        lines.append(f"  {name.replace('_', ' ')}: {words.get(name) or _term(system, name, term)}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if any(stage.ensemble == "nvt" for stage in scene.stages):
         lines.append("  thermostat: velocity rescaling, in the nvt stages only")
-    if interval := scene.run.remove_momentum_interval_ps:
-        lines.append(f"  total momentum: taken out every {interval:g} ps")
+    kept = [axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps]
+    if (interval := system.removes_momentum_every) is not None:
+        part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
+        lines.append(f"  total momentum: taken out{part} every {interval:g} ps")
+    if system.external and len(kept) < 3:
+        lines.append(f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")

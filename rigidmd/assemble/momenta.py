@@ -1,5 +1,6 @@
 """Momenta at a temperature, and the degrees of freedom that share it."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +14,7 @@ AT_REST = 1e-9
 
 
 class Freedom(NamedTuple):
-    """Degrees of freedom; the three of the total momentum, which is zero and is kept so, are not counted.
-
-    Among frozen molecules the total momentum is not kept, and all count.
-    """
+    """Degrees of freedom; components of the total momentum that are conserved are zero, and are not counted."""
 
     translation: int
     rotation: int
@@ -30,9 +28,20 @@ class Freedom(NamedTuple):
 def freedom_of(model: Model) -> Freedom:
     """Degrees of freedom of all molecules together."""
     turning = (model.inertia > 0).sum(axis=1)
-    moving = int(mobile(model).sum())
-    free = 3 * moving - (3 if moving == len(model.species) else 0)
+    free = 3 * int(mobile(model).sum()) - int(model.keeps_momentum.sum())
     return Freedom(free, int(turning[model.species].sum()))
+
+
+def kept_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
+    """Which components (3,) of the total momentum are conserved: none among frozen molecules, which hold the others;
+    else those that no term says to change (`changes_momentum`).
+
+    `Model.keeps_momentum` is this, and what counts degrees of freedom and takes momentum out goes by it.
+    """
+    kept = np.full(3, bool(mobile(model).all()))
+    for term in terms.values():
+        kept &= ~getattr(term, "changes_momentum", np.zeros(3, bool))
+    return kept
 
 
 def mobile(model: Model) -> np.ndarray:
@@ -41,16 +50,13 @@ def mobile(model: Model) -> np.ndarray:
 
 
 def remove_momentum(model: Model, velocity: np.ndarray) -> float:
-    """Give every molecule the same push so that the total momentum is zero, in place.
+    """Give every molecule the same push so that what is conserved of the total momentum is zero, in place.
 
-    Returns the kinetic energy that this takes, u Å²/ps²; 0 if the momentum was zero already. Frozen molecules hold the
-    others: then there is nothing to remove.
+    Returns the kinetic energy that this takes, u Å²/ps²; 0 if the momentum was zero already.
     """
-    if not mobile(model).all():
-        return 0.0
     mass = model.mass[model.species]
     each = mass[:, None] * velocity
-    momentum = each.sum(axis=0)
+    momentum = np.where(model.keeps_momentum, each.sum(axis=0), 0.0)
     if np.abs(momentum).max() <= AT_REST * np.abs(each).sum():
         return 0.0
     velocity -= momentum / mass.sum()
@@ -58,7 +64,7 @@ def remove_momentum(model: Model, velocity: np.ndarray) -> float:
 
 
 def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:
-    """Maxwell-Boltzmann momenta, in place: zero total momentum where nothing is frozen; T_trans and T_rot exactly
+    """Maxwell-Boltzmann momenta, in place: zero total momentum as far as it is conserved; T_trans and T_rot exactly
     `temperature` (K)."""
     thermal = BOLTZMANN * temperature
     mass = model.mass[model.species]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rigidmd.assemble.lattice import lattice
+from rigidmd.assemble.fields import start_lattice
 from rigidmd.assemble.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
@@ -50,7 +50,7 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     n = sum(counts)
     found = Arrangement(
         species=np.repeat(np.arange(len(species)), counts),
-        position=lattice(n, np.diag(cell), rng),
+        position=start_lattice(scene, species, n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
         velocity=None,
         angular_momentum_body=None,

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.momenta import Freedom, freedom_of
+from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_terms, fields_left_out
+from rigidmd.assemble.momenta import Freedom, freedom_of, kept_momentum, mobile
 from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.resolve import Facts, resolve
 from rigidmd.assemble.species import frozen_apart, species_of
@@ -66,6 +67,22 @@ class System:
     def cutoff(self) -> float:
         """Cut-off between sites, Å; inf for none."""
         return self.scene.forces.cutoff_A or inf
+
+    @property
+    def external(self) -> list[str]:
+        """Names of the terms that act from outside, and so may change the total momentum."""
+        return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
+
+    @property
+    def removes_momentum_every(self) -> float | None:
+        """Time between removals of the total momentum, ps; None for never."""
+        return self.scene.run.remove_momentum_interval_ps or None
+
+    def freedom_in(self, k: int) -> Freedom:
+        """Degrees of freedom in stage k: with the total momentum where its thermostat changes that."""
+        if self.scene.stages[k].keeps_momentum:
+            return self.freedom
+        return self.freedom._replace(translation=3 * int(mobile(self.model).sum()))
 
     @property
     def smallest_diameter(self) -> float:
@@ -127,9 +144,16 @@ def build(scene: MolecularScene) -> System:
     model = _model(species, index, frozen)
     turning = any(m.inertia.any() for m in species)
     state = state_of(
-        position=arrangement.position, rotation=arrangement.rotation if turning else None, cell=arrangement.cell
+        position=between_walls(scene, space, arrangement.position),
+        rotation=arrangement.rotation if turning else None,
+        cell=arrangement.cell,
     )
     acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
+    acting.terms.update(field_terms(scene, Parts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
+    model = model._replace(keeps_momentum=kept_momentum(model, acting.terms))
+    if not model.keeps_momentum.any():
+        never = scene.run.model_copy(update={"remove_momentum_interval_ps": False})
+        scene = scene.model_copy(update={"run": never})
     system = System(
         scene=scene,
         species=species,
@@ -144,9 +168,9 @@ def build(scene: MolecularScene) -> System:
         sites=_sites(species, index),
         residue_number=number,
         from_lattice=scene.structure is None,
-        left_out=left_out(scene, acting.terms, model, space),
+        left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
         force_error=acting.force_error,
-        notes=list(acting.notes),
+        notes=[*acting.notes, *field_notes(scene)],
     )
     system.notes.extend(set_momenta(scene, model, state, arrangement))
     system.notes.extend(

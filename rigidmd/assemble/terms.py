@@ -11,7 +11,7 @@ from rigidmd.dynamics.advance import Model
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.lennard_jones import LennardJones, Tail, lennard_jones, tail
 from rigidmd.forces.pairs.loop import pair_forces
-from rigidmd.forces.pairs.sites import BodySites, CentralSites
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, sites_of
 from rigidmd.forces.pairs.space import Space
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.molecules import Molecule
@@ -32,14 +32,7 @@ class Interactions(NamedTuple):
 
 def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
     """Sites of a law: chosen[k] lists the sites of species k that take part."""
-    counts = np.array([len(c) for c in chosen])
-    first = np.concatenate([[0], np.cumsum(counts[index])]).astype(np.int32)
-    member = np.repeat(np.arange(len(index), dtype=np.int32), counts[index])
-    offset = np.concatenate([m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
-    if not offset.any():
-        return CentralSites(first, member)
-    kind = (np.cumsum(counts) - counts)[index].astype(np.int32)
-    return BodySites(first, member, kind, np.ascontiguousarray(offset))
+    return sites_of(index, [m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
 
 
 def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ OK = 0
 ASK = 1  # a Python function has to be asked for its force: ask it and call again
 LIST_FULL = 2  # a neighbour list needs more room: enlarge it and call again
 CELL_CHANGED = 3  # the cell is now too small for the skin of a list: fit the list and call again
-NOT_FINITE = 4  # a position is not a number, or so large that it says nothing any more
+BEHIND_WALL = 4  # a site is on a wall that it cannot pass, or behind it
+NOT_FINITE = 5  # a position is not a number, or so large that it says nothing any more
 
 #: Columns of `State.books`, energies put in so far: heat of baths, work of what drives or brakes, and what goes (below
 #: zero) with total momentum that is taken out.

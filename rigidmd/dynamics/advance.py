@@ -6,11 +6,12 @@ import numpy as np
 
 from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.schemes import BATH, BOX, DRIFT, KICK, STRETCH, Scheme
-from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN
+from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN, WORK
 from rigidmd.dynamics.baths import apply, bath_code
 from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import SERIAL
+from rigidmd.forces.terms import total_energy_rate
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
@@ -27,6 +28,7 @@ class Model(NamedTuple):
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
+    keeps_momentum: np.ndarray = np.ones(3, bool)  # (3,) components of the total momentum that nothing changes
 
 
 def code_of(model: NamedTuple, bath: NamedTuple) -> Code | None:
@@ -125,12 +127,14 @@ def drift(model, code, state, h):
 
 
 def pay(model, terms, state, h):
-    """Add to the books what driving terms do at the present velocity over h; half before a kick, half after."""
+    """Add to the books what driving terms do over h; half before a kick, half after. On a body by their power at the
+    present velocity; on molecules by the rate at which their energy changes where nothing moves."""
     raise TypeError("compiled code only")
 
 
 def rest(model, state):
-    """Take the total momentum out, in place: the same velocity from all molecules; its energy goes into the books."""
+    """Take out the components of the total momentum that nothing changes, in place: the same velocity from all
+    molecules; its energy goes into the books."""
     raise TypeError("compiled code only")
 
 
@@ -147,6 +151,8 @@ def _rest_molecules(model, state):
             px += own * state.velocity[m, 0]
             py += own * state.velocity[m, 1]
             pz += own * state.velocity[m, 2]
+        kept = model.keeps_momentum
+        px, py, pz = kept[0] * px, kept[1] * py, kept[2] * pz
         for m in range(len(state.velocity)):
             state.velocity[m, 0] -= px / mass
             state.velocity[m, 1] -= py / mass
@@ -212,9 +218,16 @@ def _add_gyration_of_molecules(model, load, tau, gain):
 
 
 @implements(pay)
-def _pay_nothing(model, terms, state, h):
-    if is_a(model, Model):
+def _pay_for_molecules(model, terms, state, h):
+    if not is_a(model, Model):
+        return None
+    if not any(getattr(term.instance_class, "drives", False) for term in terms.types):
         return lambda model, terms, state, h: None
+
+    def pay_for_molecules(model, terms, state, h):
+        state.books[WORK] += h * total_energy_rate(terms, state)
+
+    return pay_for_molecules
 
 
 @kernel

@@ -9,6 +9,7 @@ import numpy as np
 from rigidmd.core.schemes import Scheme
 from rigidmd.core.state import (
     ASK,
+    BEHIND_WALL,
     CELL_CHANGED,
     EXAMPLE,
     LIST_FULL,
@@ -28,6 +29,7 @@ from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import answer
+from rigidmd.forces.external.walls import Behind
 from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room, workspace_of
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
@@ -158,6 +160,9 @@ class Engine:
             self._workspaces = tuple(with_room(workspace, state.cell) for workspace in self._workspaces)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
+        elif status == BEHIND_WALL:
+            found = [workspace.behind(state) for workspace in self._workspaces if hasattr(workspace, "behind")]
+            raise BehindWallError(next(behind for behind in found if behind is not None))
         elif status == ASK:
             for name, function in self._applied.items():
                 answer(self.workspaces[name], function, state)
@@ -194,3 +199,12 @@ class NotFiniteError(SimulationError):
             self.molecule = int(size.argmax())
             self.fault = "its position or momentum is no finite number"
         super().__init__(f"molecule {self.molecule + 1} is nowhere: {self.fault}")
+
+
+class BehindWallError(SimulationError):
+    """A site is behind a wall that it cannot pass."""
+
+    def __init__(self, behind: Behind):
+        self.molecule = behind.molecule
+        self.fault = str(behind)
+        super().__init__(f"molecule {self.molecule + 1} {self.fault}")

@@ -58,6 +58,17 @@ def _no_power(term, state, velocity, omega):
         return lambda term, state, velocity, omega: 0.0
 
 
+def energy_rate(term, state):
+    """dU/dt of a term of molecules whose class says `drives = True` while nothing moves; 0 of any other."""
+    raise TypeError("compiled code only")
+
+
+@implements(energy_rate)
+def _no_energy_rate(term, state):
+    if not getattr(term.instance_class, "drives", False):
+        return lambda term, state: 0.0
+
+
 class NoForce(NamedTuple):
     """Replaces an empty tuple of terms, over which Numba cannot loop: free flight."""
 
@@ -96,4 +107,13 @@ def total_power(terms, state, velocity, omega):
     total = 0.0
     for term in literal_unroll(terms):
         total += power(term, state, velocity, omega)
+    return total
+
+
+@kernel
+def total_energy_rate(terms, state):
+    """`energy_rate` of all terms."""
+    total = 0.0
+    for term in literal_unroll(terms):
+        total += energy_rate(term, state)
     return total

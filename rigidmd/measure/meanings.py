@@ -55,6 +55,8 @@ def _of_ewald(system: System) -> dict[str, str]:
 def _of_pressure(system: System) -> dict[str, str]:
     """Which of the two has what no motion changes."""
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
+    if system.external:
+        virial += ", of their forces on one another: fields, walls and restraints act from outside and add nothing"
     if system.tail is not None:
         virial += ", without the tail correction"
         pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"

@@ -10,7 +10,6 @@ from math import inf, sqrt
 import numpy as np
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
-from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import FORMULATIONS, SCHEMES, SOLVERS, Scheme
 from rigidmd.core.state import State
@@ -71,15 +70,16 @@ def molecular_subject(system: System, start: State, rotor: str | None, span: flo
     thermal = 2 * kinetic / freedom
     mass = system.model.mass[system.model.species]
     boxed = system.space.volume < inf
-    held = not mobile(system.model).all()
+    conserved = system.model.keeps_momentum
 
     def kept(now: State) -> dict[str, float]:
-        """Total momentum and, without a box, total angular momentum, relative to the sums of their sizes."""
-        if held:
-            return {}
-        impulse = mass[:, None] * now.velocity
-        errors = {"momentum": _change(mass[:, None] * state.velocity, impulse)}
-        if not boxed:
+        """What is conserved of the total momentum and, with neither box nor fields, the total angular momentum; both
+        relative to the sums of their sizes."""
+        errors = {}
+        if conserved.any():
+            before, after = (mass[:, None] * velocity[:, conserved] for velocity in (state.velocity, now.velocity))
+            errors["momentum"] = _change(before, after)
+        if conserved.all() and not (boxed or system.external):
             errors["L"] = _change(_angular_momenta(state, mass), _angular_momenta(now, mass))
         return errors
 
@@ -87,7 +87,7 @@ def molecular_subject(system: System, start: State, rotor: str | None, span: flo
         name=system.scene.name,
         state=state,
         methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
-        energy=lambda engine, now: observe(system, engine, now).energy,
+        energy=lambda engine, now: observe(system, engine, now).energy - float(now.books.sum()),
         energy_unit="kT per degree of freedom",
         energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
         energy_size=freedom * thermal or 1.0,

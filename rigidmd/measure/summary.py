@@ -8,12 +8,10 @@ from math import isnan, sqrt
 import numba
 import numpy as np
 
-from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System
 from rigidmd.core.state import TAKEN, State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.samples import Sample, Samples
-from rigidmd.scene import MolecularScene
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Share of the translational temperature that a drift of all molecules may have unsaid.
@@ -71,32 +69,35 @@ def summarise(
         "largest_orthogonality_error": max(sample.orthogonality for sample in samples.rows),
         "momentum_u_A_ps": momentum,
         "momentum_relative": _relative_momentum(system, state, momentum),
-        "momentum_removed": _removed(scene, state),
+        "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
+        "momentum_removed": _removed(system, state),
         "stages": stages,
-        "notes": [*system.notes, *_drifting(system, samples.rows[-1]), *warnings],
+        "notes": [*system.notes, *_drifting(system, state, samples.rows[-1]), *warnings],
     }
 
 
-def _removed(scene: MolecularScene, state: State) -> dict | None:
+def _removed(system: System, state: State) -> dict | None:
     """What removals of the total momentum took out in the whole run; None where there are none."""
-    if not scene.run.remove_momentum_interval_ps:
+    if system.removes_momentum_every is None:
         return None
     return {
-        "interval_ps": scene.run.remove_momentum_interval_ps,
+        "interval_ps": system.removes_momentum_every,
         "energy_kJ_mol": -float(state.books[TAKEN]) / KJ_PER_MOL,
     }
 
 
-def _drifting(system: System, last: Sample) -> list[str]:
-    """A note where the total momentum, whose degrees of freedom are not counted, has energy that temperatures show."""
-    if not mobile(system.model).all() or not system.freedom.translation or not last.temperature_translation > 0:
+def _drifting(system: System, state: State, last: Sample) -> list[str]:
+    """A note where what is conserved of the total momentum, whose degrees of freedom are not counted, has energy that
+    temperatures show."""
+    if not system.freedom.translation or not last.temperature_translation > 0:
         return []
-    mass = float(system.model.mass[system.model.species].sum())
-    gain = last.momentum**2 / (mass * BOLTZMANN * system.freedom.translation)
+    mass = system.model.mass[system.model.species]
+    momentum = float(np.linalg.norm((mass @ state.velocity)[system.model.keeps_momentum]))
+    gain = momentum**2 / (float(mass.sum()) * BOLTZMANN * system.freedom.translation)
     if gain <= SHOWS * last.temperature_translation:
         return []
     return [
-        f"the molecules drift together with |P| = {last.momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
+        f"the molecules drift together with |P| = {momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
         "run.remove_momentum_interval_ps takes the total momentum out"
     ]
 

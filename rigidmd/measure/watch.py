@@ -15,7 +15,7 @@ from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.engines.cpu import NotFiniteError
+from rigidmd.engines.cpu import BehindWallError, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import SteadyForce
 from rigidmd.measure.kicks import kicks
@@ -190,6 +190,8 @@ def explained(
     if isinstance(error, NotFiniteError):
         seen = f"{named(system, error.molecule)} is nowhere: {error.fault}"
         finding = Finding(seen, error.molecule)
+    elif isinstance(error, BehindWallError):
+        finding = Finding(f"{named(system, error.molecule)} {error.fault}", error.molecule)
     elif not isinstance(error, Finding):
         return str(error)
     text, pair = str(finding), None

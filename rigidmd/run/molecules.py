@@ -119,7 +119,7 @@ class MolecularSimulation(Simulation):
                     key_of(self.scene.seed, BATH, k),
                 )
             )
-        if interval := self.scene.run.remove_momentum_interval_ps:
+        if (interval := self.system.removes_momentum_every) is not None:
             row = row.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
         return row
 

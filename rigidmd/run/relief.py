@@ -1,12 +1,13 @@
 """Overlap relief: molecules that a lattice put too close are moved apart before the first step."""
 
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.assemble.momenta import mobile
 from rigidmd.core.state import State
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu import BehindWallError, Engine
 from rigidmd.measure.kicks import kicks
 from rigidmd.mechanics.rotation import from_vector
 
@@ -48,8 +49,11 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
         state.position[:] += push * share[:, None]
         if len(turn):
             state.rotation[:] = state.rotation @ from_vector(turn * share[: len(turn), None] / arm)
-        new_load, tallies = engine.evaluate(state)
-        new_energy = sum(tally.energy for tally in tallies.values())
+        try:
+            new_load, tallies = engine.evaluate(state)
+            new_energy = sum(tally.energy for tally in tallies.values())
+        except BehindWallError:
+            new_load, new_energy = load, inf
         if new_energy < energy:
             load, energy, length = new_load, new_energy, min(1.2 * length, LONGEST_MOVE * scale)
             left = float(kicks(engine.model, load, thermal, dt).max())

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.place import Box, Start, Structure
 from rigidmd.scene.species import SPECIES_FILES, Molecules
@@ -82,6 +83,7 @@ class MolecularScene(Scene):
     box: Box = Box()
     molecules: tuple[Molecules, ...] = Field(min_length=1)
     forces: Forces = Forces()
+    fields: Fields = Fields()
     start: Start = Start()
     stages: tuple[Stage, ...] = Field(min_length=1)
     run: Throughout = Throughout()
@@ -148,6 +150,7 @@ class MolecularScene(Scene):
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")
+        faults += field_faults(self)
         faults += self._uneven_frames()
         if faults:
             raise ValueError("; ".join(faults))

@@ -43,21 +43,12 @@ class Molecules(Section):
     @field_validator("frozen")
     @classmethod
     def _are_numbers(cls, frozen: bool | tuple[int, ...] | str):
-        if frozen == ():
-            raise ValueError("is empty: list the numbers of molecules, or leave it out")
-        if isinstance(frozen, str):
-            if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", frozen):
-                raise ValueError(f"is {frozen!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
-            if turned := [f"{first}-{last}" for first, last in _spans(frozen) if first > last]:
-                raise ValueError(f"is {frozen!r}: {', '.join(turned)} ends before it begins")
-        return frozen
+        return frozen if isinstance(frozen, bool) else checked_numbers(frozen)
 
     @property
     def frozen_spans(self) -> list[tuple[int, int]]:
         """First and last of the numbers of frozen molecules; none where all or none are."""
-        if isinstance(self.frozen, bool):
-            return []
-        return _spans(self.frozen) if isinstance(self.frozen, str) else [(number, number) for number in self.frozen]
+        return [] if isinstance(self.frozen, bool) else spans(self.frozen)
 
     @field_validator("model")
     @classmethod
@@ -91,7 +82,21 @@ class Molecules(Section):
         return self.name or self.model or Path(self.file or "").stem
 
 
-def _spans(text: str) -> list[tuple[int, int]]:
-    """First and last number of each part of "1-10, 15"."""
-    ends = [[int(number) for number in part.split("-")] for part in text.split(",")]
-    return [(numbers[0], numbers[-1]) for numbers in ends]
+def checked_numbers(numbers: tuple[int, ...] | str) -> tuple[int, ...] | str:
+    """Numbers of molecules, [1, 2, 5] or "1-10, 15", as they are. Raises ValueError."""
+    if numbers == ():
+        raise ValueError("is empty: list the numbers of molecules, or leave it out")
+    if isinstance(numbers, str):
+        if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", numbers):
+            raise ValueError(f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
+        if turned := [f"{first}-{last}" for first, last in spans(numbers) if first > last]:
+            raise ValueError(f"is {numbers!r}: {', '.join(turned)} ends before it begins")
+    return numbers
+
+
+def spans(numbers: tuple[int, ...] | str) -> list[tuple[int, int]]:
+    """First and last number of each part of "1-10, 15"; of a list, each number as both."""
+    if not isinstance(numbers, str):
+        return [(number, number) for number in numbers]
+    ends = [[int(number) for number in part.split("-")] for part in numbers.split(",")]
+    return [(of_part[0], of_part[-1]) for of_part in ends]

@@ -41,6 +41,18 @@ class CentralSites(NamedTuple):
         return np.zeros((len(self.molecule), 3))
 
 
+def sites_of(species: np.ndarray, offsets: list[np.ndarray]) -> BodySites | CentralSites:
+    """The sites of molecules whose species (n,) are given, with offsets[k] (own, 3) in species k, body frame, Å."""
+    counts = np.array([len(own) for own in offsets])
+    first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
+    molecule = np.repeat(np.arange(len(species), dtype=np.int32), counts[species])
+    offset = np.concatenate(offsets)
+    if not offset.any():
+        return CentralSites(first, molecule)
+    kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
+    return BodySites(first, molecule, kind, np.ascontiguousarray(offset))
+
+
 class InSlots(NamedTuple):
     """Vectors (x, y, z) of sites in the order of the slots of `clusters`."""
 

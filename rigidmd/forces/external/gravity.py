@@ -1,0 +1,39 @@
+"""A uniform gravitational field on molecules."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a
+from rigidmd.core.state import OK
+from rigidmd.forces.terms import add_forces
+
+
+class Weight(NamedTuple):
+    """U = -sum m g . R: the force m g at each centre of mass R, which is never wrapped."""
+
+    species: np.ndarray  # (n,) int32
+    mass: np.ndarray  # (species,) u; 0 of what is frozen
+    acceleration: np.ndarray  # (3,) lab frame, Å/ps²
+
+    @property
+    def changes_momentum(self) -> np.ndarray:
+        """Components (3,) of the total momentum that it changes."""
+        return self.acceleration != 0
+
+
+@implements(add_forces)
+def _add_weight(term, state, load, tally):
+    if not is_a(term, Weight):
+        return None
+
+    def add_weight(term, state, load, tally):
+        for m in range(len(state.position)):
+            mass = term.mass[term.species[m]]
+            for k in range(3):
+                load.force[m, k] += mass * term.acceleration[k]
+                if tally is not None:
+                    tally[0] -= mass * term.acceleration[k] * state.position[m, k]
+        return OK
+
+    return add_weight

@@ -1,0 +1,43 @@
+"""Springs that hold the centres of mass of some molecules at places in the lab."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a
+from rigidmd.core.state import OK
+from rigidmd.forces.terms import add_forces
+
+
+class Restraints(NamedTuple):
+    """U = sum over some molecules and over axes of stiffness/2 (R - place)².
+
+    R is never wrapped: a molecule is held at its place, not at images of it.
+    """
+
+    molecule: np.ndarray  # (r,) int64, each once
+    place: np.ndarray  # (r, 3) lab frame, Å
+    stiffness: np.ndarray  # (3,) along x, y, z, u/ps²
+
+    @property
+    def changes_momentum(self) -> np.ndarray:
+        """Components (3,) of the total momentum that they change."""
+        return self.stiffness != 0
+
+
+@implements(add_forces)
+def _add_restraints(term, state, load, tally):
+    if not is_a(term, Restraints):
+        return None
+
+    def add_restraints(term, state, load, tally):
+        for r in range(len(term.molecule)):
+            m = term.molecule[r]
+            for k in range(3):
+                away = state.position[m, k] - term.place[r, k]
+                load.force[m, k] -= term.stiffness[k] * away
+                if tally is not None:
+                    tally[0] += 0.5 * term.stiffness[k] * away * away
+        return OK
+
+    return add_restraints
