@@ -237,6 +237,15 @@ def test_an_editor_knows_the_types(tmp_path):
     assert {at for severity, at, _ in found if severity == "error"} == {lines, lines + 1}  # it does look
 
 
+def test_a_simulation_that_lacks_a_hook_is_not_made():
+    class Half(Simulation):
+        def introduction(self):
+            return "half"
+
+    with pytest.raises(TypeError, match="abstract class Half"):
+        Half(Scene.read(TOP, SHORT))
+
+
 def test_the_package_says_that_it_has_types():
     import tomllib
 

@@ -23,6 +23,7 @@ from rigidmd.measure.motion import energies, is_balanced
 from rigidmd.measure.samples import Sample
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.molecules import Molecule
+from rigidmd.scene.stage import Stage
 from rigidmd.scene.watch import BodyWatch, Watch
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
@@ -108,6 +109,26 @@ def step_finding(
             seen = f"{named(system, m)} turns by {angle[m]:.3g} rad from force to force"
             return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
     return None
+
+
+class StepCheck:
+    """Looks at the next step of a run of molecules now and then.
+
+    The scale of momenta is that of the last good sample, so that has to be remembered.
+    """
+
+    def __init__(self, system: System, limits: Watch):
+        self._system, self._limits = system, limits
+        self.thermal = 0.0  # u Å²/ps²; 0 before the first sample
+
+    def rescale(self, kinetic: float) -> None:
+        """Take the scale of momenta from a kinetic energy, u Å²/ps²."""
+        self.thermal = thermal_energy(self._system, kinetic)
+
+    def finding(self, state: State, load: Load, stage: Stage) -> Finding | None:
+        """What is wrong with the next step of a state in a stage; load : see `step_finding`."""
+        dt = stage.timestep_fs * FEMTOSECOND
+        return step_finding(self._system, self._limits, state, load, stage.scheme, dt, self.thermal)
 
 
 def axis_distances(molecule: Molecule) -> np.ndarray:

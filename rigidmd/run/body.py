@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 from math import ceil, inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
 from rigidmd.assemble.resolve import settled
 from rigidmd.core.state import NOW
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.measure.body_summary import summarise_body
 from rigidmd.measure.motion import Motion, Snapshot, motion
@@ -17,7 +18,7 @@ from rigidmd.measure.subjects import decided_for_body
 from rigidmd.output.report import body_summary_text
 from rigidmd.output.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
-from rigidmd.run.loop import Costs, Simulation, Stretch
+from rigidmd.run.loop import Costs, Options, Simulation, Stretch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.results import Results
@@ -36,15 +37,18 @@ class BodySimulation(Simulation):
 
     scene: BodyScene
     system: BodySystem
+    engine: Engine
 
     def __init__(
         self,
         scene: BodyScene,
-        *arguments: Any,
+        folder: str | Path | None = None,
+        force: bool = False,
+        *,
         applied: Mapping[str, Callable[[Pose], tuple]] | None = None,
-        **options: Any,
+        **options: Unpack[Options],
     ):
-        super().__init__(scene, *arguments, **options)
+        super().__init__(scene, folder, force, **options)
         self._choice = None
         applied = dict(applied or {})
         if scene.run.is_open:

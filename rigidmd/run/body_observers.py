@@ -65,16 +65,16 @@ class MotionFiles(Observer):
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
         """Write them."""
-        write_csv(run.folder / MOTION, results.samples.columns)
-        results.files.append(run.folder / MOTION)
+        write_csv(run.path(MOTION), results.samples.columns)
+        results.files.append(run.path(MOTION))
         if self._npz:
-            write_npz(run.folder / MOTION_NPZ, results.samples.columns)
-            results.files.append(run.folder / MOTION_NPZ)
+            write_npz(run.path(MOTION_NPZ), results.samples.columns)
+            results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "BodySimulation") -> str:
         """Save the motion so far."""
-        write_csv(run.folder / MOTION, motion(run.system, self._sampler.snapshots).columns)
-        return f". The motion so far: {run.folder / MOTION}"
+        write_csv(run.path(MOTION), motion(run.system, self._sampler.snapshots).columns)
+        return f". The motion so far: {run.path(MOTION)}"
 
 
 class Figures(Observer):

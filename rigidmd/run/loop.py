@@ -6,10 +6,11 @@ import sys
 import threading
 import time as clock
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -31,6 +32,11 @@ if TYPE_CHECKING:
     from rigidmd.assemble.system import System
     from rigidmd.run.body import BodySimulation
     from rigidmd.run.molecules import MolecularSimulation
+
+    # a type checker lets nobody call an abstract class, but `Simulation(scene)` makes one of its complete subclasses
+    Base = object
+else:
+    Base = ABC
 
 
 def _as_warning(sentence: str) -> None:
@@ -58,7 +64,21 @@ class Costs(NamedTuple):
     computing: list[float]  # steps of each stretch
 
 
-class Simulation:
+class Options(TypedDict, total=False):
+    """Keywords of a `Simulation`."""
+
+    observers: Every | Sequence[Every]
+    say: Callable[[str], object]
+    warn: Callable[[str], object]
+
+
+class BodyOptions(Options, total=False):
+    """Keywords of a `BodySimulation`."""
+
+    applied: "Mapping[str, Callable[[Pose], tuple]] | None"
+
+
+class Simulation(Base):
     """A scene, ready to run: a `MolecularSimulation` or a `BodySimulation`, as the scene is.
 
     Parameters
@@ -77,50 +97,29 @@ class Simulation:
 
     @overload
     def __new__(
-        cls,
-        scene: MolecularScene,
-        folder: str | Path | None = None,
-        force: bool = False,
-        observers: Every | Sequence[Every] = (),
-        say: Callable[[str], object] = ...,
-        warn: Callable[[str], object] = ...,
+        cls, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, **options: Unpack[Options]
     ) -> "MolecularSimulation": ...
     @overload
     def __new__(
-        cls,
-        scene: BodyScene,
-        folder: str | Path | None = None,
-        force: bool = False,
-        observers: Every | Sequence[Every] = (),
-        say: Callable[[str], object] = ...,
-        warn: Callable[[str], object] = ...,
-        *,
-        applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
+        cls, scene: BodyScene, folder: str | Path | None = None, force: bool = False, **options: Unpack[BodyOptions]
     ) -> "BodySimulation": ...
     @overload
     def __new__(
-        cls,
-        scene: Scene,
-        folder: str | Path | None = None,
-        force: bool = False,
-        observers: Every | Sequence[Every] = (),
-        say: Callable[[str], object] = ...,
-        warn: Callable[[str], object] = ...,
-        *,
-        applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
+        cls, scene: Scene, folder: str | Path | None = None, force: bool = False, **options: Unpack[BodyOptions]
     ) -> "MolecularSimulation | BodySimulation": ...
     def __new__(cls, scene: Scene, *arguments: Any, **options: Any) -> Any:
-        if cls is Simulation:
-            from rigidmd.run import BodySimulation, MolecularSimulation
+        if cls is not Simulation:
+            return super().__new__(cls)
+        from rigidmd.run import BodySimulation, MolecularSimulation
 
-            cls = BodySimulation if isinstance(scene, BodyScene) else MolecularSimulation
-        return super().__new__(cls)
+        return object.__new__(BodySimulation if isinstance(scene, BodyScene) else MolecularSimulation)
 
     def __init__(
         self,
         scene: Scene,
         folder: str | Path | None = None,
         force: bool = False,
+        *,
         observers: Every | Sequence[Every] = (),
         say: Callable[[str], object] = lambda sentence: None,
         warn: Callable[[str], object] = _as_warning,
@@ -140,6 +139,12 @@ class Simulation:
 
     def _repr_html_(self) -> str:
         return escape(self._told)
+
+    def path(self, file: str) -> Path:
+        """A file in the folder of the run. Raises ValueError if it has none."""
+        if self.folder is None:
+            raise ValueError(f"this run has no folder for {file}")
+        return self.folder / file
 
     @property
     def _told(self) -> str:
@@ -183,9 +188,9 @@ class Simulation:
             for observer in observers:
                 observer.end(self, results)
             if self.folder is not None:
-                results.files.append(self.folder / SUMMARY)
+                results.files.append(self.path(SUMMARY))
                 results.summary["files"] = [str(path) for path in results.files]
-                write_summary(self.folder / SUMMARY, results.summary)
+                write_summary(self.path(SUMMARY), results.summary)
         return results
 
     # What molecules and bodies have of their own.
@@ -195,53 +200,53 @@ class Simulation:
     stretch: Stretch  # the present one
     time_unit = ""
 
+    @abstractmethod
     def introduction(self) -> str:
         """What is about to run, in a line or a few."""
-        raise NotImplementedError
 
+    @abstractmethod
     def conclusion(self, results: Results) -> str:
         """The summary as a person reads it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _reset(self) -> None:
         """Back to the start, so that every run of a simulation is the same run: sets `engine` and `state`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _prepare(self) -> None:
         """Everything before the first step, compiling included."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _durations(self) -> list[float]:
         """How long the stretches of the run are, ps or s."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _enter(self, k: int) -> Stretch:
         """Make ready for stretch k, and say how it is walked."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _look(self, moment: Moment) -> Any:
         """What there is to see at a moment, in internal units; what has a `reading` shows that to observers."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _own_observers(self) -> list[Observer]:
         """What samples, watches and writes."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _samples(self) -> Any:
         """What has been sampled."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _summary(self, samples: Any, costs: Costs) -> dict[str, Any]:
         """The figures by which the run is judged."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _explain(self, error: SimulationError) -> str:
         """What was seen, why, what to try."""
-        raise NotImplementedError
 
+    @abstractmethod
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it is run, with copies of the files that it reads."""
-        raise NotImplementedError
 
     def note(self, warning: str) -> None:
         """Tell a sentence that whoever runs this should know before it is done; the summary has it too."""

@@ -1,35 +1,20 @@
-"""What observes molecules: samples and their log, the watch, the last state, a figure."""
+"""What observes molecules: samples, their limits and their log, the last state, a figure."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from rigidmd.core.state import Load, State
+from rigidmd.core.state import State
 from rigidmd.core.state_file import write_state
 from rigidmd.measure import watch
-from rigidmd.measure.samples import Sample, Samples
+from rigidmd.measure.samples import Samples
 from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.output.log import Log
 from rigidmd.output.report import draw_energy
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
-from rigidmd.units import FEMTOSECOND
 
 if TYPE_CHECKING:
     from rigidmd.run.molecules import MolecularSimulation
     from rigidmd.run.results import Results
-
-
-class Sampler(Observer):
-    """Keeps samples in memory."""
-
-    ends = True
-
-    def __init__(self, interval: float):
-        self.interval = interval
-        self.samples = Samples()
-
-    def see(self, moment: Moment) -> None:
-        """One more."""
-        self.samples.rows.append(moment.sample)
 
 
 class LogFile(Observer):
@@ -47,15 +32,16 @@ class LogFile(Observer):
 
     def begin(self, run: "MolecularSimulation") -> None:
         """Open it."""
-        self._log = Log(run.folder / LOG)
+        self._log = Log(run.path(LOG))
 
     def see(self, moment: Moment) -> None:
         """A line."""
-        self._log.write(moment.sample)
+        if self._log is not None:
+            self._log.write(moment.sample)
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
         """Name it."""
-        results.files.append(run.folder / LOG)
+        results.files.append(run.path(LOG))
 
     def close(self) -> None:
         """Close it."""
@@ -71,17 +57,16 @@ class Good(NamedTuple):
     state: State
 
 
-class Watch(Observer):
-    """Holds every sample against the limits of the scene, and keeps the last state that was good."""
+class Sampler(Observer):
+    """Keeps samples, checks each against the limits of the scene, and keeps the last state that was good."""
 
     ends = True
 
-    def __init__(self, run: "MolecularSimulation", interval: float):
+    def __init__(self, run: "MolecularSimulation", interval: float, check: watch.StepCheck):
         self.interval = interval
+        self.samples = Samples()
         self.last_good: Good | None = None
-        self.thermal = 0.0  # scale of momenta, u Å²/ps²
-        self._run = run
-        self._rows: list[Sample] = []
+        self._run, self._check = run, check
         self._begins: dict[int, int] = {}  # of each stage, the row of the sample at which it began
 
     def files(self) -> list[str]:
@@ -90,7 +75,7 @@ class Watch(Observer):
 
     def see(self, moment: Moment) -> None:
         """Raise a `Finding` if the sample, or the step ahead of it, cannot be what the scene means."""
-        run, now, rows = self._run, moment.sample, self._rows
+        run, now, rows = self._run, moment.sample, self.samples.rows
         since = self._begins.setdefault(now.stage, max(0, len(rows) - 1))
         rows.append(now)
         stage = run.scene.stages[now.stage]
@@ -98,42 +83,41 @@ class Watch(Observer):
             begin, since = since, len(rows) - 1
             while since > begin and rows[since].time > now.time - stage.thermostat_time_ps:
                 since -= 1
-        kinetic = moment._seen.kinetic
-        self.thermal = self.thermal or watch.thermal_energy(run.system, kinetic)
-        self.check_step(moment.stage, moment._seen.load)
+        seen = moment._seen
+        if not self._check.thermal:
+            self._check.rescale(seen.kinetic)
+        if finding := self._check.finding(run.state, seen.load, stage):
+            raise finding
         if finding := watch.sample_finding(run.system, run.scene.watch, rows[since], now):
             raise finding
-        self.thermal = watch.thermal_energy(run.system, kinetic)
+        self._check.rescale(seen.kinetic)
         self.last_good = Good(moment.step, moment.time, run.state.copy())
-
-    def check_step(self, k: int, load: Load) -> None:
-        """Raise a `Finding` if the next step of a stage would take a molecule too far."""
-        run, stage = self._run, self._run.scene.stages[k]
-        dt = stage.timestep_fs * FEMTOSECOND
-        if finding := watch.step_finding(run.system, run.scene.watch, run.state, load, stage.scheme, dt, self.thermal):
-            raise finding
 
     def failed(self, run: "MolecularSimulation") -> str:
         """Save the last good state."""
         if run.folder is None or self.last_good is None:
             return ""
-        path = run.folder / LAST_GOOD
+        path = run.path(LAST_GOOD)
         write_state(path, run.system.saved(self.last_good.state))
         return f". Last good state, of step {self.last_good.step} ({self.last_good.time:g} ps): {path}"
 
 
 class StepWatch(Observer):
-    """Looks at the step ahead however seldom samples are taken; it costs no evaluation of forces."""
+    """Checks the next step however seldom samples are taken; it costs no evaluation of forces."""
 
     ends = True
 
-    def __init__(self, run: "MolecularSimulation", of: Watch):
+    def __init__(self, run: "MolecularSimulation", check: watch.StepCheck):
         self.steps = watch.patience(run.system)
-        self._run, self._watch = run, of
+        self._run, self._check = run, check
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if it would take a molecule too far."""
-        self._watch.check_step(moment.stage, self._run.engine.load)
+        """Raise a `Finding` if the step would take a molecule too far."""
+        run, load = self._run, self._run.engine.load
+        if load is None:
+            return  # no force has been evaluated yet
+        if finding := self._check.finding(run.state, load, run.scene.stages[moment.stage]):
+            raise finding
 
 
 class FinalState(Observer):
@@ -145,15 +129,12 @@ class FinalState(Observer):
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
         """Write it."""
-        write_state(run.folder / FINAL, run.system.saved(run.state))
-        results.files.append(run.folder / FINAL)
+        write_state(run.path(FINAL), run.system.saved(run.state))
+        results.files.append(run.path(FINAL))
 
 
 class EnergyFigure(Observer):
     """energy.png: drift, energies and temperatures."""
-
-    def __init__(self, sampler: Sampler):
-        self._sampler = sampler
 
     def files(self) -> list[str]:
         """One."""
@@ -161,6 +142,7 @@ class EnergyFigure(Observer):
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
         """Draw it, if there is anything to see."""
-        if len(self._sampler.samples.rows) > 1:
-            draw_energy(run.folder / ENERGY, run.system, self._sampler.samples, results.summary)
-            results.files.append(run.folder / ENERGY)
+        samples = results.samples
+        if isinstance(samples, Samples) and len(samples) > 1:
+            draw_energy(run.path(ENERGY), run.system, samples, results.summary)
+            results.files.append(run.path(ENERGY))

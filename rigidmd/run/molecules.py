@@ -3,7 +3,7 @@
 from dataclasses import replace
 from math import nan
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numba
 import numpy as np
@@ -13,6 +13,7 @@ from rigidmd.core.schemes import Scheme
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
@@ -24,8 +25,8 @@ from rigidmd.measure.subjects import choose_for_molecules
 from rigidmd.measure.summary import summarise
 from rigidmd.output.report import summary_text
 from rigidmd.output.scene_file import input_names, write_scene
-from rigidmd.run.loop import Costs, Simulation, Stretch
-from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, Sampler, StepWatch, Watch
+from rigidmd.run.loop import Costs, Options, Simulation, Stretch
+from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, Sampler, StepWatch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.relief import Relief, relieve
@@ -41,9 +42,12 @@ class MolecularSimulation(Simulation):
 
     scene: MolecularScene
     system: System
+    engine: Engine
 
-    def __init__(self, scene: MolecularScene, *arguments: Any, **options: Any):
-        super().__init__(scene, *arguments, **options)
+    def __init__(
+        self, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, **options: Unpack[Options]
+    ):
+        super().__init__(scene, folder, force, **options)
         self._built = build(scene)
         self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
         self._reset()
@@ -103,6 +107,7 @@ class MolecularSimulation(Simulation):
         self._choices: dict[int, str] = {}
         self._stable: dict[int, float] = {}
         self._origins: dict[int, float] = {}
+        self._stage = 0
         self._conserved: float | None = None
 
     def _row(self, k: int) -> Scheme:
@@ -127,6 +132,7 @@ class MolecularSimulation(Simulation):
         return [stage.duration_ps for stage in self.scene.stages]
 
     def _enter(self, k: int) -> Stretch:
+        self._stage = k
         if self.scene.stages[k].is_open:
             self._choose(k)
         self._estimate(k)
@@ -208,17 +214,18 @@ class MolecularSimulation(Simulation):
     def _own_observers(self) -> list[Observer]:
         output = self.scene.output
         interval = output.log_interval_ps
-        self._sampler, self._watch = Sampler(interval), Watch(self, interval)
-        observers: list[Observer] = [self._sampler, self._watch, StepWatch(self, self._watch)]
+        check = watch.StepCheck(self.system, self.scene.watch)
+        self._sampler = Sampler(self, interval, check)
+        observers: list[Observer] = [self._sampler, StepWatch(self, check)]
         files: list[Observer] = []
         if output.trajectory:
             velocities = bool(output.velocities)
             wrapped = output.positions == "wrapped"
             files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
         if self.folder is not None:
-            names = input_names(self.scene).values()
-            files = [SceneFile(names), *files, LogFile(interval), FinalState()]
-            files += [EnergyFigure(self._sampler)] if output.figure else []
+            names = input_names(self.scene)
+            files = [SceneFile(names.values()), *files, LogFile(interval), FinalState()]
+            files += [EnergyFigure()] if output.figure else []
         return [*files, *observers]
 
     def _samples(self) -> Samples:
@@ -232,10 +239,9 @@ class MolecularSimulation(Simulation):
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:
-        good = self._watch.last_good
+        good = self._sampler.last_good
         states = [("", self.state), *([(f"at step {good.step}, ", good.state)] if good else [])]
-        stable = self._stable.get(len(self._origins) - 1)
-        return watch.explained(self.system, error, states, self.stretch.dt, stable)
+        return watch.explained(self.system, error, states, self.stretch.dt, self._stable.get(self._stage))
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it is run, with copies of the files that it reads."""

@@ -1,7 +1,7 @@
 """A moment of a run, as observers are shown it."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from rigidmd.core.state import State
 if TYPE_CHECKING:
     from rigidmd.measure.samples import Sample
     from rigidmd.run.loop import Simulation
+    from rigidmd.run.molecules import MolecularSimulation
 
 
 class Moment:
@@ -34,7 +35,7 @@ class Moment:
     @cached_property
     def sample(self) -> "Sample":
         """The line of the log of this moment; of molecules."""
-        return self._run.sample_of(self)
+        return cast("MolecularSimulation", self._run).sample_of(self)
 
     @property
     def observation(self) -> Any:

@@ -6,7 +6,7 @@ rarely results are wanted; and, if it is one that `ends`, the last moment of eve
 or behind another: what several of them need, a moment or the run has.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from rigidmd.output.frame import Frame
 from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
+    from rigidmd.output.trajectory import TrajectoryFile
     from rigidmd.run.loop import Simulation
     from rigidmd.run.results import Results
 
@@ -63,7 +64,7 @@ class Every(Observer):
 class SceneFile(Observer):
     """scene.toml: the scene as it was run, with copies of the files that it reads."""
 
-    def __init__(self, names: Sequence[str] = ()):
+    def __init__(self, names: Iterable[str] = ()):
         self._copies = list(names)
 
     def files(self) -> list[str]:
@@ -72,11 +73,12 @@ class SceneFile(Observer):
 
     def begin(self, run: "Simulation") -> None:
         """Write it; a run writes it once more where a stage has decided what the scene left open."""
-        run.write_scene(run.folder)
+        if run.folder is not None:
+            run.write_scene(run.folder)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         """Name it."""
-        results.files.append(run.folder / SCENE)
+        results.files.append(run.path(SCENE))
 
 
 class Frames(Observer):
@@ -85,11 +87,11 @@ class Frames(Observer):
     def __init__(
         self, interval: float, topology: str, trajectory: str, velocities: bool = False, wrapped: bool = False
     ):
-        self.interval = interval
+        self.interval: float = interval
         self._names = [topology, trajectory]
         self._velocities, self._wrapped = velocities, wrapped
         self._frames: list[Frame] = []
-        self._file = None
+        self._file: TrajectoryFile | None = None
 
     def files(self) -> list[str]:
         """Both."""
@@ -101,7 +103,7 @@ class Frames(Observer):
         if run.folder is not None:
             from rigidmd.output.trajectory import TrajectoryFile, write_topology  # MDAnalysis is slow to import
 
-            topology, trajectory = (run.folder / name for name in self._names)
+            topology, trajectory = (run.path(name) for name in self._names)
             write_topology(topology, run.system, run.state, self._wrapped)
             self._file = TrajectoryFile(trajectory, run.system, self.interval, self._velocities, self._wrapped)
 
@@ -118,7 +120,7 @@ class Frames(Observer):
         """Hand over what was seen."""
         results._frames = self._frames
         if self._file is not None:
-            results.files += [run.folder / name for name in self._names]
+            results.files += [run.path(name) for name in self._names]
 
     def close(self) -> None:
         """Finish the file."""
