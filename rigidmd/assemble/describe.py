@@ -10,6 +10,7 @@ from rigidmd.assemble.body import BodySystem, build_body
 from rigidmd.assemble.cells import angles_deg, right_angled
 from rigidmd.assemble.fields import fields_in_words
 from rigidmd.assemble.resolve import settled
+from rigidmd.assemble.stage_words import stage_in_words
 from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.forces.pairs.loop import PairForces
@@ -17,8 +18,6 @@ from rigidmd.forces.pairs.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, Scene
-from rigidmd.scene.stage import Stage
-from rigidmd.units import FEMTOSECOND
 
 
 def describe(scene: Scene) -> str:
@@ -96,8 +95,11 @@ def _molecules(system: System) -> str:
         lines.append(f"  {name.replace('_', ' ')}: {words.get(name) or _term(system, name, term)}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
-    if any(stage.ensemble == "nvt" for stage in scene.stages):
-        lines.append("  thermostat: velocity rescaling, in the nvt stages only")
+    for what in ("thermostat", "barostat"):
+        kinds = dict.fromkeys(getattr(stage, f"{what}_kind") for stage in scene.stages)
+        lines += [f"  {what}: {kind.replace('_', ' ')}" for kind in kinds if kind]
+    if any(stage.ensemble == "nph" for stage in scene.stages):
+        lines.append("  barostat: piston, in the nph stages only")
     kept = [axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps]
     if (interval := system.removes_momentum_every) is not None:
         part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
@@ -107,7 +109,9 @@ def _molecules(system: System) -> str:
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")
-    lines += [f"  {k}: {_stage(stage)}" for k, stage in enumerate(scene.stages)]
+    for k, stage in enumerate(scene.stages):
+        how, law = stage_in_words(stage)
+        lines += [f"  {k}: {how}", f"     {law}"]
     lines.append(f"\nmemory: about {array_bytes(system) / 1e6:.1f} MB for state, forces and neighbour lists")
     return "\n".join(lines)
 
@@ -119,19 +123,6 @@ def _term(system: System, name: str, term: NamedTuple) -> str:
     if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
         reach += f", {system.scene.forces.truncation}"
     return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
-
-
-def _stage(stage: Stage) -> str:
-    rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
-    text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
-    if stage.is_open:
-        asked = f"{stage.energy_error_kT:g} kT" if stage.energy_error_kT else f"{stage.trajectory_error:g} of Q or X"
-        text = (
-            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {asked}"
-        )
-    if stage.ensemble == "nvt":
-        text += f", {stage.temperature_K:g} K by {stage.thermostat.replace('_', ' ')}, {stage.thermostat_time_ps:g} ps"
-    return text
 
 
 def array_bytes(value) -> int:

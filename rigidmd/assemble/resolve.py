@@ -95,10 +95,11 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
         "forces": scene.forces.model_copy(update=numbers),
         "run": _throughout(scene),
         "output": _output(scene.output),
+        "stages": tuple(stage.resolved for stage in scene.stages),
     }
     reads_velocities = scene.structure is not None and scene.structure.velocities
     if scene.start.temperature_K is None and not reads_velocities:
-        tables["start"] = scene.start.model_copy(update={"temperature_K": scene.stages[0].temperature_K})
+        tables["start"] = scene.start.model_copy(update={"temperature_K": scene.stages[0].temperatures[0]})
     return Resolved(scene.model_copy(update=tables), faults, grid)
 
 

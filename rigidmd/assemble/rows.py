@@ -34,7 +34,7 @@ def row(system: System, k: int) -> Scheme:
         found = found.with_box(box_of(system, k), every)
     elif stage.ensemble == "nph":
         found = found.with_piston(box_of(system, k))
-    if stage.keeps_momentum and (interval := scene.removes_momentum_every) is not None:
+    if stage.keeps_momentum and (interval := system.removes_momentum_every) is not None:
         found = found.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
     return found
 

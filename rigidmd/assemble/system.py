@@ -12,6 +12,7 @@ from rigidmd.assemble.momenta import Freedom, freedom_of, kept_momentum, mobile
 from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.resolve import Facts, resolve
 from rigidmd.assemble.species import frozen_apart, species_of
+from rigidmd.assemble.stage_words import stage_notes
 from rigidmd.assemble.start import arrange, residue_numbers, set_momenta
 from rigidmd.assemble.terms import interactions, left_out
 from rigidmd.core.state import State, state_of
@@ -170,7 +171,7 @@ def build(scene: MolecularScene) -> System:
         from_lattice=scene.structure is None,
         left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
         force_error=acting.force_error,
-        notes=[*acting.notes, *field_notes(scene)],
+        notes=[*acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )
     system.notes.extend(set_momenta(scene, model, state, arrangement))
     system.notes.extend(

@@ -148,8 +148,10 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> 
         out.append("rotation and torques: every molecule is a point")
     if space.volume == inf:
         out.append("periodic images: there is no box")
-    if all(stage.ensemble == "nve" for stage in scene.stages):
-        out.append("thermostat: every stage is nve")
+    if not any(stage.has_thermostat for stage in scene.stages):
+        out.append("thermostat: no stage has a temperature to keep")
+    if not any(stage.has_barostat for stage in scene.stages):
+        out.append("barostat: no stage has a pressure to keep")
     if scene.run.remove_momentum_interval_ps is False:
         out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
     if not scene.forces.tail_correction:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.momenta import Freedom
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
 from rigidmd.engines.cpu import Engine
@@ -27,6 +28,7 @@ class Reading(NamedTuple):
     temperature_translation_unbiased: float  # see `observe`; NaN with any integrator but velocity Verlet
     temperature_rotation_unbiased: float
     pressure_bar: float  # molecular, tail correction included; NaN without a box
+    pressure_tensor_bar: np.ndarray  # (3, 3) the same by components, the symmetric part; NaN without a box
     virial: np.ndarray  # (3, 3) molecular, without the tail correction, kJ/mol
     momentum: np.ndarray  # (3,) u Å/ps
     force: np.ndarray  # (n, 3) on each molecule, lab frame, kJ/mol/Å
@@ -46,7 +48,7 @@ class Observation(NamedTuple):
     temperature: float
     temperature_translation_unbiased: float  # see `observe`; NaN with any integrator but velocity Verlet
     temperature_rotation_unbiased: float
-    pressure: float  # u/(Å ps²); NaN without a box
+    pressure_tensor: np.ndarray  # (3, 3) symmetric, u/(Å ps²); NaN without a box
     momentum: np.ndarray  # (3,)
     orthogonality: float
     load: Load
@@ -67,9 +69,14 @@ class Observation(NamedTuple):
         return self.potential + self.kinetic
 
     @property
+    def pressure_tensor_bar(self) -> np.ndarray:
+        """Molecular pressure tensor (3, 3) in bar; NaN without a box."""
+        return self.pressure_tensor / BAR
+
+    @property
     def pressure_bar(self) -> float:
         """Molecular pressure in bar; NaN without a box."""
-        return self.pressure / BAR
+        return float(self.pressure_tensor.trace()) / (3 * BAR)
 
     @property
     def reading(self) -> Reading:
@@ -93,15 +100,20 @@ class Observation(NamedTuple):
         return float(size.max()), int(size.argmax())
 
 
-def observe(system: System, engine: Engine, state: State, verlet_step: float = nan) -> Observation:
+def observe(
+    system: System, engine: Engine, state: State, verlet_step: float = nan, freedom: Freedom | None = None
+) -> Observation:
     """Everything at once; one evaluation of forces and energies.
+
+    freedom : degrees of freedom that temperatures count; those of a conserved total momentum when not given
 
     verlet_step : time step (ps) of the velocity Verlet that led here. Between its kicks the kinetic energy is higher
     than at its steps by dt²/8 [sum F²/m + sum n . I^-1 n] on average: for a mode of frequency w the first is too high
     by x/12 and the second too low by x/6, x = (w dt)². Twice the one and once the other, over three, is right to
     O(x²) (Eastwood et al. 2010, J. Chem. Theory Comput. 6, 2045): the unbiased temperatures.
 
-    Pressure is the molecular one, (sum m V² + sum F·R) / 3 V over centres of mass (Allen & Tildesley 2017, 2.7.2).
+    Pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
+    tensor is the symmetric part: the rest is the rate at which orientations take angular momentum up, 0 on average.
     """
     load, tallies = engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
@@ -121,10 +133,11 @@ def observe(system: System, engine: Engine, state: State, verlet_step: float = n
     rotation_unbiased = rotation
     if len(load.torque_body):
         rotation_unbiased += slant * float((load.torque_body**2 * model.inverse_inertia[model.species]).sum())
-    freedom = system.freedom
-    pressure = nan
+    freedom = freedom or system.freedom
+    pressure = np.full((3, 3), nan)
     if volume < inf:
-        pressure = (2 * translation + virial.trace()) / (3 * volume) + system.constant_pressure + beyond
+        flow = (mass * state.velocity.T) @ state.velocity
+        pressure = (flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * np.eye(3)
     return Observation(
         components=components,
         virial=virial,
@@ -135,7 +148,7 @@ def observe(system: System, engine: Engine, state: State, verlet_step: float = n
         temperature=_temperature(translation + rotation, freedom.total),
         temperature_translation_unbiased=_temperature(translation_unbiased, freedom.translation),
         temperature_rotation_unbiased=_temperature(rotation_unbiased, freedom.rotation),
-        pressure=float(pressure),
+        pressure_tensor=pressure,
         momentum=mass @ state.velocity,
         orthogonality=orthogonality_error(state.rotation),
         load=load,

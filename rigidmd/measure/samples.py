@@ -32,8 +32,22 @@ class Sample(NamedTuple):
     drift: Annotated[float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")]
     momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]
     orthogonality: Annotated[float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")]
+    a: Annotated[float, Column("a (A)", "Å", "length of the box's edge a")]
+    b: Annotated[float, Column("b (A)", "Å", "length of the box's edge b")]
+    c: Annotated[float, Column("c (A)", "Å", "length of the box's edge c")]
+    alpha: Annotated[float, Column("alpha (deg)", "°", "angle between b and c")]
+    beta: Annotated[float, Column("beta (deg)", "°", "angle between c and a")]
+    gamma: Annotated[float, Column("gamma (deg)", "°", "angle between a and b")]
+    heat: Annotated[float, Column("Heat (kJ/mole)", "kJ/mol", "what thermostats have put in since the start")]
+    work: Annotated[float, Column("Work (kJ/mole)", "kJ/mol", "what boxes and drives have put in since the start")]
+    pressure_xx: Annotated[float, Column("Pressure xx (bar)", "bar", "molecular pressure tensor, symmetric part")]
+    pressure_yy: Annotated[float, Column("Pressure yy (bar)", "bar", "the same, yy")]
+    pressure_zz: Annotated[float, Column("Pressure zz (bar)", "bar", "the same, zz")]
+    pressure_xy: Annotated[float, Column("Pressure xy (bar)", "bar", "the same, xy")]
+    pressure_xz: Annotated[float, Column("Pressure xz (bar)", "bar", "the same, xz")]
+    pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
     conserved: Annotated[
-        float, Column("", "kJ/mol", "energy less what thermostat, drive and removal of momentum have put in")
+        float, Column("", "kJ/mol", "energy less heat, work and what removals of momentum have put in")
     ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
 

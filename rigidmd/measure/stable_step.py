@@ -123,7 +123,7 @@ def long_steps(scene: MolecularScene) -> list[str]:
     species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
     temperature = scene.start.temperature_K
     for k, stage in enumerate(scene.stages):
-        temperature = stage.temperature_K or temperature
+        temperature = max(stage.temperatures) or temperature
         if stage.is_open or not (species and temperature and scene.watch.stable_step):
             continue
         swings = [swing for m in species for swing in _swings(m, BOLTZMANN * temperature)]

@@ -30,17 +30,19 @@ def summarise(
     interrupted: bool,
     choices: dict[int, str],
     stable: dict[int, float],
+    moves: dict[int, tuple[int, int]],
     warnings: list[str],
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
 
     choices : of stages that left their integrator open, what was chosen and why
     stable : the longest stable step (ps) of stages, as estimated at their start
+    moves : of stages with a box that moves, how many moves were tried and accepted
     """
     scene = system.scene
     momentum = samples.rows[-1].momentum
     stages = [
-        _stage(system, samples.rows, k, computing[k])
+        _stage(system, samples.rows, k, computing[k], moves.get(k, (0, 0)))
         | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
         for k in range(len(computing))
         if any(sample.stage == k for sample in samples.rows)
@@ -109,7 +111,7 @@ def _relative_momentum(system: System, state: State, momentum: float) -> float:
     return momentum / total if total else 0.0
 
 
-def _stage(system: System, samples: list[Sample], k: int, computing: float) -> dict:
+def _stage(system: System, samples: list[Sample], k: int, computing: float, moves: tuple[int, int]) -> dict:
     """Figures of one stage. It begins with the last sample before it, from which its drift is counted."""
     own = [sample for sample in samples if sample.stage == k]
     before = [sample for sample in samples if sample.stage == k - 1][-1:]
@@ -122,7 +124,7 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
     kinetic = np.array([s.kinetic for s in own])
     spread = float(kinetic.std())
     per_molecule = line.value * 1000 / n
-    thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom.total
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom_in(k).total
     per_kt = line.value * 1000 / thermal if thermal > 0 else None
     error_kt = line.error * 1000 / thermal if thermal > 0 else None
     return {
@@ -144,6 +146,9 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
         "potential_kJ_mol_per_molecule": float(np.mean([s.potential for s in own])) / n,
         "pressure_bar": mean([s.pressure_bar for s in own])[0],
         "pressure_error_bar": mean([s.pressure_bar for s in own])[1],
+        **(_of_box(own) if stage.has_barostat else {}),
+        "moves_tried": moves[0],
+        "moves_accepted": moves[1],
         "drift_kJ_mol_ns_per_molecule": _known(per_molecule),
         "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / n),
         "drift_kT_ns_per_degree_of_freedom": per_kt and _known(per_kt),
@@ -153,6 +158,15 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float) -> d
         else None,
         "energy_rms_kJ_mol_per_molecule": _known(line.rms / n),
     }
+
+
+def _of_box(own: list[Sample]) -> dict:
+    """Means of what a barostat changes, with their errors."""
+    found = {}
+    for name, key in (("density", "density{}_g_cm3"), ("a", "a{}_A"), ("b", "b{}_A"), ("c", "c{}_A")):
+        value, error = mean([getattr(sample, name) for sample in own])
+        found |= {key.format(""): value, key.format("_error"): error}
+    return found
 
 
 def _known(value: float) -> float | None:

@@ -46,11 +46,19 @@ class Finding(SimulationError):
     stay within the limit, where one can tell; unturned : whether it is Q that is wrong
     """
 
-    def __init__(self, seen: str, molecule: int | None = None, shorter: float | None = None, unturned: bool = False):
+    def __init__(
+        self,
+        seen: str,
+        molecule: int | None = None,
+        shorter: float | None = None,
+        unturned: bool = False,
+        boiled: bool = False,
+    ):
         super().__init__(seen)
         self.molecule = molecule
         self.shorter = shorter
         self.unturned = unturned
+        self.boiled = boiled
 
 
 class Cause(NamedTuple):
@@ -146,13 +154,17 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     if limits.orthogonality and not now.orthogonality <= limits.orthogonality:
         seen = f"|QᵀQ - 1| is {now.orthogonality:.2g} (watch.orthogonality = {limits.orthogonality:g})"
         return Finding(f"a matrix Q is no rotation any more: {seen}", unturned=True)
+    grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
+    if limits.volume and grown > limits.volume:
+        seen = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
+        return Finding(f"{seen}, {now.density:.3g} g/cm³", boiled=True)
     if not limits.energy:
         return None
     stage, share = system.scene.stages[now.stage], 1.0
     kinetic = since.kinetic
-    if stage.ensemble == "nvt":
-        kinetic = max(kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * stage.temperature_K * system.freedom.total)
-        share = min(1.0, stage.thermostat_time_ps / (now.time - since.time)) if now.time > since.time else 1.0
+    if stage.has_thermostat:
+        kinetic = max(kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom.total)
+        share = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
     if abs(drift) * share <= limits.energy * scale:
@@ -259,6 +271,12 @@ def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stabl
                 f"{share.min():.1g} of what its mass would have as far out as its sites are: torques turn it at once",
                 f"more of its mass on the outer sites, or {shorter}",
             )
+    if finding.boiled:
+        return Cause(
+            "at this temperature and pressure the liquid boils, or it starts far from its density under great pressure",
+            "a higher pressure_bar or a lower temperature_K, an nvt stage before the barostat, or watch.volume = false "
+            "for what is a gas",
+        )
     if finding.unturned:
         return Cause(
             "Q was no rotation at the start or was changed from outside: the run itself only multiplies rotations",

@@ -95,6 +95,13 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
     if stage["pressure_bar"] is not None:
         rows.append(("pressure", f"{stage['pressure_bar']:.0f} ± {stage['pressure_error_bar']:.0f} bar"))
+    if stage.get("density_g_cm3") is not None:
+        rows.append(("density", f"{stage['density_g_cm3']:.4f} ± {stage['density_error_g_cm3']:.4f} g/cm³"))
+        edges = (f"{edge} {stage[f'{edge}_A']:.3f} ± {stage[f'{edge}_error_A']:.3f}" for edge in "abc")
+        rows.append(("box", f"{', '.join(edges)} Å"))
+    if stage["moves_tried"]:
+        share = stage["moves_accepted"] / stage["moves_tried"]
+        rows.append(("box moves", f"{stage['moves_tried']}, {100 * share:.0f} % accepted"))
     if stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
         value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]

@@ -22,8 +22,8 @@ class LogFile(Observer):
 
     ends = True
 
-    def __init__(self, interval: float):
-        self.interval = interval
+    def __init__(self, interval: float, tensor: bool):
+        self.interval, self._tensor = interval, tensor
         self._log: Log | None = None
 
     def files(self) -> list[str]:
@@ -32,7 +32,7 @@ class LogFile(Observer):
 
     def begin(self, run: "MolecularSimulation") -> None:
         """Open it."""
-        self._log = Log(run.path(LOG))
+        self._log = Log(run.path(LOG), self._tensor)
 
     def see(self, moment: Moment) -> None:
         """A line."""
@@ -79,9 +79,9 @@ class Sampler(Observer):
         since = self._begins.setdefault(now.stage, max(0, len(rows) - 1))
         rows.append(now)
         stage = run.scene.stages[now.stage]
-        if stage.ensemble == "nvt":
+        if stage.has_thermostat:
             begin, since = since, len(rows) - 1
-            while since > begin and rows[since].time > now.time - stage.thermostat_time_ps:
+            while since > begin and rows[since].time > now.time - stage.thermostat_time:
                 since -= 1
         seen = moment._seen
         if not self._check.thermal:

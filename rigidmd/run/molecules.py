@@ -1,4 +1,4 @@
-"""Molecules: relief of overlaps, stages with thermostats, what is sampled of them."""
+"""Molecules: relief of overlaps, stages of all ensembles, samples."""
 
 from dataclasses import replace
 from math import nan
@@ -8,11 +8,11 @@ from typing import Any, Unpack
 import numba
 import numpy as np
 
+from rigidmd.assemble.cells import angles_deg
+from rigidmd.assemble.momenta import remove_momentum
+from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
-from rigidmd.core.schemes import Scheme
-from rigidmd.core.state import State, state_of
-from rigidmd.dynamics.baths import VelocityRescaling
-from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.core.state import HEAT, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
@@ -101,48 +101,36 @@ class MolecularSimulation(Simulation):
                     )
         for k in range(len(self.scene.stages)):
             if not self.scene.stages[k].is_open:
-                self.engine.advance(self.state, self._row(k), 0.0, 0)
+                row = row_of_stage(self.system, k)
+                self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
         self.engine.forget()
         self._relief = relief
         self._choices: dict[int, str] = {}
         self._stable: dict[int, float] = {}
+        self._moves: dict[int, tuple[int, int]] = {}
         self._origins: dict[int, float] = {}
         self._stage = 0
         self._conserved: float | None = None
-
-    def _row(self, k: int) -> Scheme:
-        """The scheme of a stage, with its thermostat and the removal of total momentum."""
-        stage, row = self.scene.stages[k], self.scene.stages[k].scheme
-        if any(stage.ensemble == "nvt" for stage in self.scene.stages):
-            # a stage without a thermostat among others with one has one that rests: all then run the same machine code
-            idle = stage.ensemble == "nve"
-            row = row.with_bath(
-                VelocityRescaling(
-                    0.0 if idle else BOLTZMANN * stage.temperature_K,
-                    np.inf if idle else stage.thermostat_time_ps,
-                    self.system.freedom.total,
-                    key_of(self.scene.seed, BATH, k),
-                )
-            )
-        if (interval := self.system.removes_momentum_every) is not None:
-            row = row.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
-        return row
 
     def _durations(self) -> list[float]:
         return [stage.duration_ps for stage in self.scene.stages]
 
     def _enter(self, k: int) -> Stretch:
+        self._moves[self._stage] = self.engine.moves
         self._stage = k
         if self.scene.stages[k].is_open:
             self._choose(k)
         self._estimate(k)
         # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
         self.engine = self.system.engine()
+        row, stage = row_of_stage(self.system, k), self.scene.stages[k]
+        self.state = self.engine.begin(self.state, row)
         self.state.begin_stretch()
+        if k > 0 and stage.keeps_momentum and not self.scene.stages[k - 1].keeps_momentum:
+            self.state.books[TAKEN] -= remove_momentum(self.system.model, self.state.velocity)
         if self._conserved is not None:
             self._origins[k] = self._conserved
-        stage = self.scene.stages[k]
-        return Stretch(self._row(k), stage.timestep_fs * FEMTOSECOND, stage.steps)
+        return Stretch(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
 
     def _estimate(self, k: int) -> None:
         """Longest stable step (ps) of stage k from where it starts, and a warning where its own is longer."""
@@ -179,7 +167,7 @@ class MolecularSimulation(Simulation):
     def _look(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]
         step = stage.timestep_fs * FEMTOSECOND if stage.integrator == "velocity_verlet" else nan
-        return observe(self.system, self.engine, self.state, step)
+        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage))
 
     def sample_of(self, moment: Moment) -> Sample:
         """A line of the log. Its drift is counted from the last sample before its stage."""
@@ -188,6 +176,10 @@ class MolecularSimulation(Simulation):
         self._conserved = conserved
         volume = self.state.volume
         boxed = volume < np.inf
+        cell, books = self.state.cell, self.state.books / KJ_PER_MOL
+        edges = np.linalg.norm(cell, axis=1) if boxed else np.full(3, nan)
+        angles = angles_deg(cell) if boxed else np.full(3, nan)
+        tensor = seen.pressure_tensor_bar
         mass = float(self.system.model.mass[self.system.model.species].sum())
         return Sample(
             step=moment.step,
@@ -207,6 +199,20 @@ class MolecularSimulation(Simulation):
             drift=conserved - self._origins.setdefault(moment.stage, conserved),
             momentum=float(np.linalg.norm(seen.momentum)),
             orthogonality=seen.orthogonality,
+            a=float(edges[0]),
+            b=float(edges[1]),
+            c=float(edges[2]),
+            alpha=float(angles[0]),
+            beta=float(angles[1]),
+            gamma=float(angles[2]),
+            heat=float(books[HEAT]),
+            work=float(books[WORK]),
+            pressure_xx=float(tensor[0, 0]),
+            pressure_yy=float(tensor[1, 1]),
+            pressure_zz=float(tensor[2, 2]),
+            pressure_xy=float(tensor[0, 1]),
+            pressure_xz=float(tensor[0, 2]),
+            pressure_yz=float(tensor[1, 2]),
             conserved=conserved,
             stage=moment.stage,
         )
@@ -224,7 +230,7 @@ class MolecularSimulation(Simulation):
             files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
         if self.folder is not None:
             names = input_names(self.scene)
-            files = [SceneFile(names.values()), *files, LogFile(interval), FinalState()]
+            files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
             files += [EnergyFigure()] if output.figure else []
         return [*files, *observers]
 
@@ -233,9 +239,10 @@ class MolecularSimulation(Simulation):
 
     def _summary(self, samples: Samples, costs: Costs) -> dict[str, Any]:
         relief_steps = self._relief.steps if self._relief else 0
+        self._moves[self._stage] = self.engine.moves
         return summarise(
             self.system, samples, self.state, relief_steps, self.threads, costs.preparing, costs.wall,
-            costs.computing, self._interrupted, self._choices, self._stable, self.notes,
+            costs.computing, self._interrupted, self._choices, self._stable, self._moves, self.notes,
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:

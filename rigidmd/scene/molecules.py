@@ -34,6 +34,8 @@ class Output(Section):
 
     log_interval_ps: Interval = 0.05
     """Time between lines of log.csv"""
+    pressure_tensor: Flag = False
+    """Write the six components of the pressure into log.csv"""
     trajectory: str | Literal[False] = "trajectory.xtc"
     """Trajectory file; the ending chooses the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
     trajectory_interval_ps: Interval = 0.5
@@ -138,8 +140,9 @@ class MolecularScene(Scene):
                 faults.append("start.temperature_K is missing: the first stage is nve and no velocities are read")
         if self.start.temperature_K is not None and self.structure is not None and self.structure.velocities:
             faults.append("start.temperature_K would do nothing: the velocities are read from the structure file")
-        if self.start.temperature_K == 0 and self.stages[0].ensemble == "nvt":
+        if self.start.temperature_K == 0 and self.stages[0].thermostat_kind in ("velocity_rescaling", "nose_hoover"):
             faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot warm what is at rest")
+        faults += self._barostat_faults()
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             faults.append("forces.tail_correction is that of a liquid all around; with frozen molecules leave it out")
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
@@ -155,6 +158,23 @@ class MolecularScene(Scene):
         if faults:
             raise ValueError("; ".join(faults))
         return self
+
+    def _barostat_faults(self) -> list[str]:
+        """What cannot be with a pressure that is kept."""
+        faults = []
+        for k, stage in enumerate(self.stages):
+            if not stage.has_barostat:
+                continue
+            where = f"stages.{k}: {stage.ensemble} changes the box,"
+            if not self.box.periodic:
+                faults.append(f"{where} and box.periodic is false")
+            if any(species.frozen for species in self.molecules):
+                faults.append(f"{where} and frozen molecules hold it: make them move, or keep the volume")
+            if self.fields.walls:
+                faults.append(f"{where} and fields.walls stand where they are: keep the volume")
+            if self.fields.restraints:
+                faults.append(f"{where} and fields.restraints hold molecules where they are: keep the volume")
+        return faults
 
     def _uneven_frames(self) -> list[str]:
         """DCD stores one interval for all frames: stages that would make them uneven."""

@@ -19,6 +19,8 @@ class Watch(Section):
     energy: Limit = 0.5
     """Most that the conserved energy may change by, in kinetic energies: in an nve stage, and within each
     thermostat_time_ps of an nvt stage"""
+    volume: Limit = 8.0
+    """Most that a box may grow to under a barostat, in volumes of the start"""
     orthogonality: Limit = 1e-9
     """Largest entry of abs(QᵀQ - 1)"""
     stable_step: Flag = True

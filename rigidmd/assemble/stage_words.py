@@ -1,0 +1,92 @@
+"""Stages in words: how they move, what they keep, which distribution they sample."""
+
+from rigidmd.scene.stage import COMPRESSIBILITY, Stage
+from rigidmd.units import FEMTOSECOND
+
+#: Compressibilities (1/bar) of matter: diamond, a gas at 0.01 bar.
+STIFFEST, SOFTEST = 2e-7, 100.0
+
+
+def stage_in_words(stage: Stage) -> list[str]:
+    """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved."""
+    rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
+    text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
+    if stage.is_open:
+        asked = f"{stage.energy_error_kT:g} kT" if stage.energy_error_kT else f"{stage.trajectory_error:g} of Q or X"
+        text = (
+            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {asked}"
+        )
+    if stage.has_thermostat:
+        text += f", {_thermostat(stage)}"
+    if stage.has_barostat:
+        text += f", {_barostat(stage)}"
+    return [text, f"samples {_sampled(stage)}; conserves {_conserved(stage)}"]
+
+
+def _thermostat(stage: Stage) -> str:
+    text = f"{_ramp(stage.temperatures)} K by {stage.thermostat_kind.replace('_', ' ')}"
+    if stage.thermostat_kind != "langevin":
+        return f"{text}, {stage.thermostat_time:g} ps"
+    translation, rotation = stage.frictions
+    return f"{text}, friction {translation:g}/ps" + (
+        f" ({rotation:g}/ps of rotation)" if rotation != translation else ""
+    )
+
+
+def _barostat(stage: Stage) -> str:
+    first, last = stage.pressures
+    if len(set(first[:3])) == 1 and not any(first[3:]):
+        pressure = _ramp((first[0], last[0]))
+    else:
+        pressure = ", ".join(f"{value:g}" for value in (first if any(first[3:]) else first[:3]))
+    own = stage.barostat_kind.replace("_", " ") or "a piston"
+    text = f"{pressure} bar by {own}, {stage.pressure_coupling.replace('_', '-')}"
+    if stage.barostat_kind != "monte_carlo":
+        text += f", {stage.barostat_time:g} ps"
+    if stage.barostat_kind:
+        every = max(1, round(stage.barostat_interval / (stage.timestep_fs * FEMTOSECOND)))
+        text += f", a move every {every} steps" if every > 1 else ", a move every step"
+    water = ", that of water" if stage.compressibility == COMPRESSIBILITY else ""
+    return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
+
+
+def _ramp(ends: tuple[float, float]) -> str:
+    return f"{ends[0]:g}" if ends[0] == ends[1] else f"{ends[0]:g} to {ends[1]:g}"
+
+
+def _sampled(stage: Stage) -> str:
+    """The distribution, up to the error of the step."""
+    law = {
+        "nve": "the microcanonical distribution",
+        "nph": "the isoenthalpic distribution",
+        "nvt": "the canonical distribution, exp(-H/kT)",
+        "npt": "the isothermal-isobaric distribution, exp(-(H + p V)/kT)",
+    }[stage.ensemble]
+    if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
+        law += ", with the invariant measure of the shape"
+    first, last = stage.pressures if stage.has_barostat else (0, 0)
+    if (stage.has_thermostat and len(set(stage.temperatures)) > 1) or first != last:
+        law += " that temperature and pressure have at each moment"
+    return law
+
+
+def _conserved(stage: Stage) -> str:
+    """What the step leaves as it is, up to its error."""
+    kept = {
+        "nve": "energy",
+        "nph": "enthalpy with the energy of the piston",
+        "nvt": "energy less heat",
+        "npt": "energy less heat and less the work of the box",
+    }[stage.ensemble]
+    return f"{kept}, total momentum" if stage.keeps_momentum else f"{kept}, not the total momentum"
+
+
+def stage_notes(stages: tuple[Stage, ...]) -> list[str]:
+    """What whoever runs these stages should know."""
+    return [
+        f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is that of no matter (diamond has "
+        f"{STIFFEST:g}, water {COMPRESSIBILITY:g}, a gas at 1 bar 1): is it in another unit? The box will "
+        f"{'hardly move' if stage.compressibility < STIFFEST else 'try moves that are too long'}"
+        for k, stage in enumerate(stages)
+        if stage.has_barostat and not STIFFEST / 10 <= stage.compressibility <= SOFTEST
+    ]
