@@ -17,7 +17,7 @@ SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems"
 DOCS = PACKAGE / "docs"
 
 #: In the order in which they are listed.
-CHAPTERS = ("top", "water", "molecule", "extending", "manual", "benchmarks", "validation", "changelog")
+CHAPTERS = ("top", "water", "molecule", "ensembles", "extending", "manual", "benchmarks", "validation", "changelog")
 
 
 class Example(NamedTuple):

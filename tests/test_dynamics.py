@@ -12,6 +12,7 @@ from rigidmd.core.state import HEAT, State, state_of
 from rigidmd.dynamics import baths
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.dynamics.ramps import steady
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.measure.drift import slope
@@ -222,7 +223,7 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
     # free flight, so the kinetic energy has nothing but the thermostat: mean and variance of a Gamma distribution
     system = build(small_scene({"nitrogen": 6}, 40.0))  # linear: its free rotation is exact
     freedom, thermal = system.freedom.total, 300 * BOLTZMANN
-    row = VERLET.with_bath(VelocityRescaling(thermal, 0.01, freedom, key_of(1, BATH)))
+    row = VERLET.with_bath(VelocityRescaling(steady(thermal), 0.01, freedom, key_of(1, BATH)))
     state = system.state.copy()
     engine = Engine(system.model, {})
     samples, heat = [], []
@@ -239,7 +240,7 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
 def test_a_thermostat_that_rests_changes_no_bit():
     """A stage at constant energy after one with a thermostat: the same machine code, and yet constant energy."""
     system = build(small_scene({"spce": 8}, 20.0))
-    resting = VelocityRescaling(0.0, np.inf, system.freedom.total, key_of(1, BATH))
+    resting = VelocityRescaling(steady(0.0), np.inf, system.freedom.total, key_of(1, BATH))
     found = []
     for row in (VERLET, VERLET.with_bath(resting)):
         state = system.state.copy()

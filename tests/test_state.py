@@ -10,6 +10,7 @@ from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
 from rigidmd.core.state_file import read_state, write_state
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.dynamics.ramps import steady
 from rigidmd.errors import StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -24,7 +25,7 @@ def same_bits(a, b):
 
 def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
     system, engine, state = built({"spce": 5, "argon": 2}, 20.0, 1)
-    row = VERLET.with_bath(VelocityRescaling(BOLTZMANN * 300, 0.1, system.freedom.total, key_of(1, BATH)))
+    row = VERLET.with_bath(VelocityRescaling(steady(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, BATH)))
     move(engine, state, row, 0.001, 7)
     assert state.books[HEAT] != 0
     write_state(tmp_path / "s.npz", system.saved(state))
@@ -38,7 +39,7 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
 def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
     """Time, heat and random numbers go on from the state alone; points, whose sums have one order, to the bit."""
     system, _, start = built({"argon": 2}, 30.0, 2)
-    row = VERLET.with_bath(VelocityRescaling(BOLTZMANN * 100, 0.05, system.freedom.total, key_of(1, BATH)))
+    row = VERLET.with_bath(VelocityRescaling(steady(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, BATH)))
     whole = start.copy()
     move(system.engine(), whole, row, 0.003, 20)
     state = start

@@ -1,0 +1,205 @@
+"""Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve, the same bits."""
+
+import numba
+import numpy as np
+import pytest
+from conftest import built, move, small_scene
+from scipy import stats
+
+from rigidmd.assemble.rows import row as row_of_stage
+from rigidmd.assemble.system import build
+from rigidmd.core.schemes import SCHEMES, WITH_BATH
+from rigidmd.core.state import HEAT
+from rigidmd.dynamics import noise
+from rigidmd.dynamics.baths import Andersen, Langevin, NoseHoover
+from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.dynamics.ramps import Ramp, steady
+from rigidmd.engines.cpu import Engine
+from rigidmd.errors import SceneError
+from rigidmd.measure.observables import observe
+from rigidmd.run import Simulation
+from rigidmd.run.relief import relieve
+from rigidmd.units import BOLTZMANN
+
+VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_BATH["baoab"]
+THERMAL = 300 * BOLTZMANN
+MIXTURE = {"argon": 300, "nitrogen": 300, "benzene_opls": 300, "spce": 300}  # point, linear, symmetric, asymmetric
+
+
+def kinetic(system, state):
+    """Kinetic energy, and each square of a momentum over m or I (n, 3): NaN of axes without inertia."""
+    model = system.model
+    mass, inertia = model.mass[model.species], model.inertia[model.species]
+    moving = mass[:, None] * state.velocity**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        turning = np.where(inertia > 0, state.angular_momentum_body**2 / inertia, np.nan)
+    return 0.5 * moving.sum() + 0.5 * np.nansum(turning), moving, turning
+
+
+@numba.njit
+def numbers(key, count, step):
+    words = np.empty((4, 64), np.uint64)
+    found = np.empty(4 * 64 * count)
+    for batch in range(count):
+        noise.fill_words(words, key, 0, 64 * batch, step)
+        for m in range(64):
+            for k in range(4):
+                own = noise.normal_of(words[k, m], key, 1024 * (k + 1), 64 * batch + m, step)
+                found[4 * (64 * batch + m) + k] = own
+    return found
+
+
+def test_numbers_of_words_are_normal():
+    found = numbers(key_of(5, BATH), 4000, 3)
+    assert stats.kstest(found, "norm").pvalue > 1e-3
+    for x in (2.0, 3.0, 3.6, 4.0):  # the last two lie in the tail of the ziggurat
+        expected = len(found) * stats.norm.sf(x)
+        assert abs((np.abs(found) > x).sum() / 2 - expected) < 4 * np.sqrt(expected)
+    rows = found.reshape(-1, 4)
+    assert np.abs(np.corrcoef(rows.T) - np.eye(4)).max() < 5 / np.sqrt(len(rows))
+
+
+@pytest.mark.parametrize("bath", [Langevin(steady(THERMAL), 3.0, 7.0, key_of(2, BATH)),
+                                  Andersen(steady(THERMAL), 0.3, key_of(2, BATH))])  # fmt: skip
+def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
+    system = build(small_scene(MIXTURE, 150.0, start={"temperature_K": 30.0}))
+    state, engine = system.state.copy(), Engine(system.model, {})
+    before, *_ = kinetic(system, state)
+    move(engine, state, BAOAB.with_bath(bath), 0.05, 60)
+    after, moving, turning = kinetic(system, state)
+    assert after - before == pytest.approx(state.books[HEAT], rel=1e-11)
+    kind = np.array([m.name for m in system.species])[system.model.species]
+    for name in MIXTURE:
+        for squares in (moving, turning):
+            for k in range(3):
+                own = squares[kind == name][:, k] / THERMAL
+                if np.isfinite(own).all():
+                    assert stats.kstest(own, "chi2", args=(1,)).pvalue > 1e-4, (name, k)
+    assert np.isnan(turning[kind == "argon"]).all() and not state.angular_momentum_body[kind == "argon"].any()
+    assert (np.isnan(turning[kind == "nitrogen"]).sum(axis=1) == 1).all()
+
+
+def test_friction_is_that_of_each_motion():
+    """Without noise, at 0 K, momenta fall by exactly exp(-friction t)."""
+    system = build(small_scene({"spce": 5}, 40.0))
+    row = BAOAB.with_bath(Langevin(steady(0.0), 2.0, 5.0, key_of(1, BATH)))
+    state = system.state.copy()
+    move(Engine(system.model, {}), state, row, 0.01, 10)
+    assert state.velocity == pytest.approx(system.state.velocity * np.exp(-0.2), rel=1e-13)
+    size = np.linalg.norm(system.state.angular_momentum_body, axis=1)
+    assert np.linalg.norm(state.angular_momentum_body, axis=1) == pytest.approx(size * np.exp(-0.5), rel=1e-12)
+
+
+def test_collisions_come_after_their_mean_time():
+    system = build(small_scene({"argon": 4000}, 200.0))
+    row = VERLET.with_bath(Andersen(steady(THERMAL), 0.5, key_of(4, BATH)), halved=True)
+    state = system.state.copy()
+    move(Engine(system.model, {}), state, row, 0.1, 3)
+    kept = (state.velocity == system.state.velocity).all(axis=1).mean()
+    assert kept == pytest.approx(np.exp(-0.6), abs=4 * np.sqrt(0.25 / 4000))
+
+
+@pytest.fixture(scope="module")
+def liquid():
+    """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
+    system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
+        "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
+    relieve(engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    move(engine, state, BAOAB.with_bath(Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, BATH))), 0.001, 500)
+    return system, state._replace(books=np.zeros(3))
+
+
+def test_chains_conserve_the_energy_of_molecules_and_chains_to_order_two(liquid):
+    system, start = liquid
+    bath = NoseHoover(steady(THERMAL), 0.05, 3, system.freedom.translation, system.freedom.rotation)
+    row, spreads = VERLET.with_bath(bath, halved=True), []
+    for dt in (0.002, 0.001, 0.0005):
+        engine = system.engine()
+        state, found = engine.begin(start, row), []
+        for _ in range(50):
+            move(engine, state, row, dt, round(0.004 / dt))
+            found.append(observe(system, engine, state).energy - state.books.sum())
+        spreads.append(np.std(found))
+        assert state.bath.any() and abs(state.books[HEAT]) > 20 * spreads[-1]
+    assert np.log2(np.array(spreads[:-1]) / spreads[1:]) == pytest.approx([2, 2], abs=0.25)
+
+
+def test_chains_can_be_run_backwards(liquid):
+    system, start = liquid
+    bath = NoseHoover(steady(THERMAL), 0.05, 4, system.freedom.translation, system.freedom.rotation)
+    row, engine = VERLET.with_bath(bath, halved=True), system.engine()
+    state = engine.begin(start, row)
+    move(engine, state, row, 0.001, 50)
+    there = state.position.copy()
+    for array in (state.velocity, state.angular_momentum_body):
+        array *= -1
+    rates = state.bath.reshape(2, 2, 4)[:, 1]
+    rates *= -1
+    engine.forget()
+    move(engine, state, row, 0.001, 50)
+    assert np.abs(there - start.position).max() > 0.01
+    assert state.position == pytest.approx(start.position, abs=1e-9)
+    assert state.bath.reshape(2, 2, 4)[:, 0] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("thermostat", ["velocity_rescaling", "langevin", "nose_hoover", "andersen"])
+def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermostat):
+    stage = {"ensemble": "nvt", "temperature_K": [300.0, 310.0], "thermostat": thermostat, "duration_ps": 0.02}
+    scene = small_scene({"spce": 1000}, 32.0, stages=[stage], output={"trajectory": False})
+    before = numba.get_num_threads()
+    found = []
+    try:
+        for threads in (1, before):
+            found.append(Simulation(scene.model_copy(update={"threads": threads})).run().state)
+    finally:
+        numba.set_num_threads(before)
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(*found, strict=True))
+    assert found[0].books[HEAT] != 0
+
+
+def test_a_ramp_goes_from_its_begin_to_its_end():
+    system = build(small_scene({"argon": 3000}, 150.0))
+    row = BAOAB.with_bath(Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, BATH)))
+    state, engine = system.state.copy(), Engine(system.model, {})
+    for part in (0.5, 1.0):
+        move(engine, state, row, 0.02, 50)
+        _, moving, _ = kinetic(system, state)
+        assert moving.mean() / THERMAL == pytest.approx(1 + part, abs=0.05)
+
+
+def test_degrees_of_freedom_follow_the_thermostat():
+    heat = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.004}
+    stages = [heat | {"thermostat": "langevin"}, heat, {"duration_ps": 0.004}]
+    scene = small_scene({"spce": 20}, 20.0, stages=stages, output={"trajectory": False, "log_interval_ps": 0.002})
+    simulation = Simulation(scene)
+    system = simulation.system
+    assert [system.freedom_in(k).total for k in range(3)] == [120, 117, 117]
+    assert row_of_stage(system, 1).bath.degrees_of_freedom == 117
+    results = simulation.run()
+    own = results["stage"] == 0
+    assert results["momentum"][own][-1] > 1
+    assert results["momentum"][~own].max() < 1e-9  # taken out before the stage that conserves it, and booked
+    assert np.abs(np.diff(results["conserved"])).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "berendsen"}, "samples no ensemble"),
+        ({"ensemble": "nvt", "temperature_K": 300.0, "friction_translation_per_ps": 1.0}, "would do nothing with velo"),
+        ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "langevin", "friction_translation_per_ps": 0.0},
+         "must be greater than 0"),
+        ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 0.0}, "must be greater than 0"),
+        ({"ensemble": "nvt"}, "needs temperature_K"),
+        ({"temperature_K": 300.0}, "would do nothing in an nve stage"),
+        ({"integrator": "baoab"}, "has its place for a thermostat"),
+        ({"ensemble": "npt", "temperature_K": 300.0}, "needs pressure_bar"),
+        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": [1.0, 1.0, 2.0]}, "'anisotropic'"),
+        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "berendsen"}, "samples no"),
+        ({"ensemble": "nph", "pressure_bar": 1.0, "integrator": "srkn_4"}, "made of Verlet steps"),
+        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat_time_ps": 0.0}, "greater than 0"),
+    ],
+)  # fmt: skip
+def test_stages_that_cannot_be(stage, message):
+    with pytest.raises(SceneError, match=message):
+        small_scene({"argon": 20}, 30.0, stages=[{"duration_ps": 0.01} | stage])
