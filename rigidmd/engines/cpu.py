@@ -30,7 +30,7 @@ from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import Asked, answer
-from rigidmd.forces.external.walls import Behind
+from rigidmd.forces.external.walls import Behind, LennardJonesWalls
 from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room, workspace_of
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
@@ -167,7 +167,7 @@ class Engine:
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:
-            found = [workspace.behind(state) for workspace in workspaces if hasattr(workspace, "behind")]
+            found = [workspace.behind(state) for workspace in workspaces if isinstance(workspace, LennardJonesWalls)]
             raise BehindWallError(next(behind for behind in found if behind is not None))
         elif status == ASK:
             for name, workspace in zip(self.names, workspaces, strict=False):
