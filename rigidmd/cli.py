@@ -5,6 +5,10 @@ import json
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rigidmd.scene import BodyScene
 
 #: A command that a signal ended exits with this more than the signal's number: 130 of Ctrl-C, 143 of SIGTERM.
 BY_SIGNAL = 128
@@ -303,7 +307,7 @@ def _energy(options: argparse.Namespace) -> int:
     return 0
 
 
-def _body_energy(scene, options: argparse.Namespace) -> int:
+def _body_energy(scene: "BodyScene", options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.run import Simulation
 

@@ -3,7 +3,7 @@
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -335,7 +335,10 @@ def read_parameters(path: Path) -> tuple[Site, ...]:
     return entries
 
 
-def _read(path: Path, kind: type[Section]) -> Section:
+Table = TypeVar("Table", bound=Section)
+
+
+def _read(path: Path, kind: type[Table]) -> Table:
     """A file as this kind of table. Raises MoleculeError."""
     try:
         text = path.read_text(encoding="utf-8")

@@ -174,9 +174,10 @@ def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
     for key in keys:
         if isinstance(key, int):
             continue
-        model = next((m for m in _models_in(model.model_fields[key].annotation)), None)
-        if model is None:
+        inner = _models_in(model.model_fields[key].annotation)
+        if not inner:
             return []
+        model = inner[0]
     return list(model.model_fields)
 
 

@@ -211,30 +211,48 @@ HOVER = {
 }
 
 
-def pyright(folder, text):
+def pyright(project):
+    """What pyright says of the project in a folder: its report as a dictionary."""
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "-p", str(project)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    try:
+        found = json.loads(done.stdout)
+        assert "generalDiagnostics" in found
+    except (ValueError, AssertionError):
+        pytest.skip(f"pyright cannot run here (pip install 'pyright[nodejs]'): {done.stderr.strip()[-200:]}")
+    return found
+
+
+def findings_in_script(folder, text):
     """What pyright says of a script: (severity, line, message) of each finding."""
     (folder / "script.py").write_text(text)
     (folder / "pyrightconfig.json").write_text(json.dumps({"include": ["script.py"], "extraPaths": [str(ROOT)]}))
-    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "-p", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    try:
-        found = json.loads(done.stdout)["generalDiagnostics"]
-    except (ValueError, KeyError):
-        pytest.skip(f"pyright cannot run here (pip install 'pyright[nodejs]'): {done.stderr.strip()[-200:]}")
+    found = pyright(folder)["generalDiagnostics"]
     return [(entry["severity"], entry["range"]["start"]["line"], entry["message"]) for entry in found]
 
 
 def test_an_editor_knows_the_types(tmp_path):
     hover = "".join(f"reveal_type({expression})\n" for expression in HOVER)
-    found = pyright(tmp_path, SCRIPT + hover)
+    found = findings_in_script(tmp_path, SCRIPT + hover)
     assert [finding for finding in found if finding[0] != "information"] == []
     lines = SCRIPT.count("\n")
     for line, (expression, kind) in enumerate(HOVER.items(), start=lines):
         (message,) = [message for _, at, message in found if at == line]
         told = message.removeprefix(f'Type of "{expression}" is "').removesuffix('"')
         assert told.startswith(kind) or set(told.split(" | ")) == set(kind.split(" | ")), message
-    found = pyright(tmp_path, SCRIPT + "results.temperature\nrigidmd.Simulation(scene, obervers=[watch])\n")
+    found = findings_in_script(tmp_path, SCRIPT + "results.temperature\nrigidmd.Simulation(scene, obervers=[watch])\n")
     assert {at for severity, at, _ in found if severity == "error"} == {lines, lines + 1}  # it does look
+
+
+def test_the_package_passes_a_type_checker():
+    """With the section [tool.pyright] of pyproject.toml."""
+    found = pyright(ROOT)
+    assert found["summary"]["filesAnalyzed"] > 60
+    assert [
+        f"{entry['file']}:{entry['range']['start']['line'] + 1}: {entry['message']}"
+        for entry in found["generalDiagnostics"]
+        if entry["severity"] != "information"
+    ] == []
 
 
 def test_a_simulation_that_lacks_a_hook_is_not_made():

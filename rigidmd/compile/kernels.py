@@ -1,5 +1,8 @@
 """Kernels: compiled functions, with the compiler options that this engine needs."""
 
+from collections.abc import Callable
+from typing import Any
+
 from numba import types
 from numba.extending import overload
 
@@ -10,7 +13,9 @@ from rigidmd.compile.numba_private import dispatcher, uncounted
 PAIR_FLAGS = {"reassoc", "contract", "nsz", "arcp"}
 
 
-def kernel(function=None, *, parallel=False, fastmath=False, inline=False, counted=True, outer=False):
+def kernel(
+    function: Callable | None = None, *, parallel=False, fastmath: Any = False, inline=False, counted=True, outer=False
+) -> Any:
     """`numba.njit`, cached on disk.
 
     inline: LLVM inlines the function wherever it is called. For functions in an inner loop: a term is passed as its

@@ -31,7 +31,7 @@ class Model(NamedTuple):
     keeps_momentum: np.ndarray = np.ones(3, bool)  # (3,) components of the total momentum that nothing changes
 
 
-def code_of(model: NamedTuple, bath: NamedTuple) -> Code | None:
+def code_of(model: NamedTuple, bath: tuple) -> Code | None:
     """The machine code that moves molecules; None of a single body, whose flows are compiled into the loop."""
     if not isinstance(model, Model):
         return None

@@ -4,9 +4,10 @@ for it, and tells apart what they report."""
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+import numba
 import numpy as np
 
-from rigidmd.core.schemes import Scheme
+from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import (
     ASK,
     BEHIND_WALL,
@@ -28,8 +29,8 @@ from rigidmd.dynamics.boxes import BoxRoom, NoBox, Piston, box_room
 from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
-from rigidmd.forces.body.fields import answer
-from rigidmd.forces.external.walls import Behind
+from rigidmd.forces.body.fields import Asked, answer
+from rigidmd.forces.external.walls import Behind, LennardJonesWalls
 from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room, workspace_of
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
@@ -86,32 +87,34 @@ class Engine:
         """Say that positions were changed from outside since the last step."""
         self._stale = True
 
-    def begin(self, state: State, scheme: Scheme) -> State:
+    def begin(self, state: State, row: Scheme | Solver) -> State:
         """A copy of a state with room for all that evolves when a scheme moves it; chains and pistons begin at rest."""
-        variables = getattr(scheme.bath, "variables", 0) + isinstance(scheme.box, Piston)
+        row = _scheme_of(row)
+        variables = getattr(row.bath, "variables", 0) + isinstance(row.box, Piston)
         return state.copy()._replace(bath=np.zeros(variables))
 
-    def advance(self, state: State, scheme: Scheme, dt: float, until: int) -> None:
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
         """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
-        self._prepare(state)
+        row = _scheme_of(row)
+        workspaces = self._prepare(state)
         keep_time(state, dt)
         self._moved = state
         if self.load is None:
             self.load = no_load(state)
-        if scheme.has_gradient and self._probe is None:
+        if row.has_gradient and self._probe is None:
             self._probe = probe_for(state)
-        probe = self._probe if scheme.has_gradient else None
-        if scheme.box is not None and self._room is None:
+        probe = self._probe if row.has_gradient else None
+        if row.box is not None and self._room is None:
             self._room = box_room(state)
-        model, bath, box = self.model_for(scheme), scheme.bath or NoBath(), scheme.box or NoBox()
+        model, bath, box = self.model_for(row), row.bath or NoBath(), row.box or NoBox()
         kind = (type(model.rotor), type(bath))
         if kind not in self._codes:
             self._codes[kind] = code_of(model, bath)
         moved = (model, self._codes[kind], state, self.load)
-        flows, room = row_of(scheme), self._room if scheme.box is not None else None
+        flows, room = row_of(row), self._room if row.box is not None else None
         cursor = np.array([0, not self._stale, 0], np.int64)
-        while status := advance(*moved, self._workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor):
-            self._answer(status, state)
+        while status := advance(*moved, workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor):
+            workspaces = self._answer(status, state)
         self._stale = cursor[1] == 0  # also where there was no step, and nobody has evaluated forces
 
     def model_for(self, scheme: Scheme) -> Model | Body:
@@ -123,13 +126,13 @@ class Engine:
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
-        self._prepare(state)
+        workspaces = self._prepare(state)
         load = no_load(state)
         tallies = {}
         for k, name in enumerate(self.names):
             tally = np.zeros(TALLY_SIZE)
-            while status := add_term(self._workspaces[k], state, load, tally):
-                self._answer(status, state)
+            while status := add_term(workspaces[k], state, load, tally):
+                workspaces = self._answer(status, state)
             tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
         return load, tallies
 
@@ -149,23 +152,41 @@ class Engine:
         setup = self._setup._replace(cell=state.cell)
         return tuple(workspace_of(term, setup) for term in self.terms.values()) or (NoForce(),)
 
-    def _prepare(self, state: State) -> None:
-        """Check what compiled code is to work on, and make its workspaces."""
+    def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
+        """Check what compiled code is to work on; its workspaces, made where there are none."""
         _check_arrays(state)
         if self._workspaces is None:
             self._workspaces = tuple(with_code(workspace) for workspace in self.room(state))
+        return self._workspaces
 
-    def _answer(self, status: int, state: State) -> None:
+    def _answer(self, status: int, state: State) -> tuple[NamedTuple, ...]:
+        """Give compiled code what its status asks for; the workspaces with which to call it again."""
+        workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
-            self._workspaces = tuple(with_room(workspace, state.cell) for workspace in self._workspaces)
+            workspaces = self._workspaces = tuple(with_room(workspace, state.cell) for workspace in workspaces)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:
-            found = [workspace.behind(state) for workspace in self._workspaces if hasattr(workspace, "behind")]
+            found = [workspace.behind(state) for workspace in workspaces if isinstance(workspace, LennardJonesWalls)]
             raise BehindWallError(next(behind for behind in found if behind is not None))
         elif status == ASK:
-            for name, function in self._applied.items():
-                answer(self.workspaces[name], function, state)
+            for name, workspace in zip(self.names, workspaces, strict=False):
+                if isinstance(workspace, Asked):
+                    answer(workspace, self._applied[name], state)
+        return workspaces
+
+
+def thread_limit() -> int:
+    """Most threads that Numba uses here: NUMBA_NUM_THREADS of the environment, or one for each core."""
+    # Numba sets the names of its config when it is imported, where no checker sees it
+    return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
+
+
+def _scheme_of(row: Scheme | Solver) -> Scheme:
+    """The same. Raises TypeError unless it is a scheme."""
+    if not isinstance(row, Scheme):
+        raise TypeError(f"{row.name} is a general solver; OdeEngine moves a body by it")
+    return row
 
 
 def keep_time(state: State, dt: float) -> None:

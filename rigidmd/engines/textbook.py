@@ -6,6 +6,7 @@ RK4 (compiled) or by SciPy's DOP853 and Radau. The flows of `body` are the engin
 and nothing here keeps Q a rotation but accuracy.
 """
 
+from collections.abc import Callable
 from math import hypot, sin
 
 import numpy as np
@@ -13,9 +14,9 @@ from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
 from rigidmd.compile import kernel
-from rigidmd.core.schemes import DOP853, FORMULATIONS, RADAU, RK4, Solver
+from rigidmd.core.schemes import DOP853, FORMULATIONS, RADAU, RK4, Scheme, Solver
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
-from rigidmd.dynamics.body import relative_motion
+from rigidmd.dynamics.body import Body, relative_motion
 from rigidmd.engines.cpu import Engine, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import frame_rate
@@ -34,7 +35,7 @@ from rigidmd.mechanics.odes import (
 )
 from rigidmd.mechanics.rotor import moment_rates
 
-FORMS = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
+FORMS: dict[str, Form] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
 SINGULAR = 5  # beyond the codes of core.state: Euler angles too near theta = 0 or pi
 #: Half of the digits of phi and psi are gone there: theta itself has an error of 1e-16.
@@ -149,17 +150,20 @@ class OdeEngine(Engine):
     the bit; Radau up to its tolerance, because it also remembers a Jacobian.
     """
 
-    _solver = _between = None
+    model: Body
+    _solver: Dop853 | Radau | None = None
+    _between: Callable[[float], np.ndarray] | None = None
     _anew = False  # whether what acts has changed, so that nothing of earlier steps is of use
     own_steps = 0  # that DOP853 or Radau has taken
 
     @property
     def evaluations(self) -> int:
         """Of the slopes, by DOP853 or Radau, since it last began."""
-        return self._solver.nfev
+        return self._solver.nfev if self._solver is not None else 0
 
-    def begin(self, state: State, solver: Solver) -> State:
+    def begin(self, state: State, row: Scheme | Solver) -> State:
         """A copy of a state with the variables of a solver."""
+        solver = _solver_of(row)
         omega = []
         if len(state.rotation):
             for k in range(3):
@@ -171,8 +175,9 @@ class OdeEngine(Engine):
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._sizes(solver, state, y)])
         return state.copy()._replace(bath=y)
 
-    def advance(self, state: State, solver: Solver, dt: float, until: int) -> None:
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
         """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError."""
+        solver = _solver_of(row)
         self._prepare(state)
         keep_time(state, dt)
         self._moved = state
@@ -207,11 +212,11 @@ class OdeEngine(Engine):
             begun[:], there[:] = (state.time[NOW], 0.0), y
             sizes[:] = self._sizes(solver, state, y)
             self._anew = False
-        if self._solver is None:
+        running = self._solver
+        if running is None:
             if singular(form, there, there, 0.0):
                 raise SingularError(there[1], begun[0])
-            self._solver = self._new_solver(form, state, solver, begun, there, sizes)
-        running = self._solver
+            running = self._solver = self._new_solver(form, state, solver, begun, there, sizes)
         while running.t < end:
             begun[:] = running.t, running.h_abs
             there[:] = running.y
@@ -231,7 +236,7 @@ class OdeEngine(Engine):
         state.step[NOW] = until
         read(form, self.model, state, end, y)
 
-    def _new_solver(self, form: Form, state: State, solver: Solver, begun, there, sizes):
+    def _new_solver(self, form: Form, state: State, solver: Solver, begun, there, sizes) -> Dop853 | Radau:
         """SciPy's solver at the beginning of one of its steps; of a length that it chooses where none is known."""
         dy = np.zeros(len(there))
 
@@ -260,6 +265,13 @@ class OdeEngine(Engine):
             way = max(np.abs(state.position).max(), speed * duration)
             parts += [np.full(3, way or 1.0), np.full(3, speed or 1.0)]
         return np.concatenate(parts)
+
+
+def _solver_of(row: Scheme | Solver) -> Solver:
+    """The same. Raises TypeError unless it is a solver."""
+    if isinstance(row, Scheme):
+        raise TypeError(f"{row.name} is a row of flows; OdeEngine moves a body by general solvers")
+    return row
 
 
 def _form(solver: Solver, state: State) -> Form:

@@ -1,7 +1,7 @@
 """Errors of forces as a scene asks for them: of Ewald sums, and of single precision between pairs."""
 
 from math import pi, sqrt
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.special import erf
@@ -11,7 +11,11 @@ from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
+from rigidmd.forces.laws.screened import ScreenedCoulomb
+from rigidmd.forces.pairs.loop import PairForces, PairWorkspace
 from rigidmd.forces.pairs.sites import place_sites
+from rigidmd.forces.waves.ewald import EwaldWorkspace
+from rigidmd.forces.waves.mesh import PmeWorkspace
 from rigidmd.units import COULOMB
 
 #: The sum that others are held against leaves out so much of what they are estimated to.
@@ -54,7 +58,7 @@ def accuracy(system: System, state: State) -> Accuracy:
     )
     tight = scene.model_copy(update={"forces": forces, "precision": "double"})
     reference = build(tight)
-    moves = mobile(system.model)[system.terms["coulomb_real"].sites.molecule]
+    moves = mobile(system.model)[_real_part(system).sites.molecule]
     found, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((found - exact)[moves], axis=1)
@@ -82,16 +86,24 @@ def rounding(system: System, state: State) -> tuple[float, float] | None:
     return errors[0], errors[1]
 
 
+def _real_part(system: System) -> PairForces:
+    """The term of an Ewald sum that acts between pairs."""
+    return cast(PairForces, system.terms["coulomb_real"])
+
+
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     """Coulomb forces on charged sites (s, 3), pairs inside molecules left out, and the Coulomb energy."""
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     engine = Engine(system.model, charged, system.scene.precision, system.scene.forces.skin_A)
     _, tallies = engine.evaluate(state)
-    force = sum(workspace.site_force for workspace in engine.workspaces.values() if hasattr(workspace, "site_force"))
-    real = system.terms["coulomb_real"]
+    real, force = _real_part(system), np.zeros((len(system.sites.molecule), 3))
+    for workspace in engine.workspaces.values():
+        if isinstance(workspace, (PairWorkspace, EwaldWorkspace, PmeWorkspace)):
+            force = force + workspace.site_force
     position = np.empty_like(force)
     place_sites(real.sites, state, position)
-    force = force + _inside(real.law.charge, position, real.sites.first, real.law.alpha)
+    law = cast(ScreenedCoulomb, real.law)
+    force = force + _inside(law.charge, position, real.sites.first, law.alpha)
     constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
     return force, sum(tally.energy for tally in tallies.values()) + constants
 

@@ -75,7 +75,7 @@ def _longest_good(
         return None
     if bad is None or bad.diverged:  # no further: half of what diverges
         return good
-    order = subject.methods[name].how.order
+    order = subject.methods[name].order
     guess = bad.timestep * (target / getattr(bad, error)) ** (1 / order)
     for _ in range(4):
         guess = _rounded(MARGIN * guess)

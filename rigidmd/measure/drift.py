@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 FEW, MANY = 8, 64  # into how many blocks samples are cut to tell slow noise from fast
 
@@ -15,7 +16,7 @@ class Slope(NamedTuple):
     rms: float  # of what is left when the line is taken away
 
 
-def slope(time: np.ndarray, value: np.ndarray) -> Slope:
+def slope(time: ArrayLike, value: ArrayLike) -> Slope:
     """Slope of value (n,) against evenly spaced time (n,).
 
     The energy of a symplectic run is not a line in white noise. The fast part is the scheme's own, of order dt²; under

@@ -1,11 +1,15 @@
 """What the figures of `rigidmd energy` hold, where their names alone do not say it."""
 
 from math import inf
+from typing import cast
 
 import numpy as np
 
 from rigidmd.assemble.electrostatics import NEUTRAL
 from rigidmd.assemble.system import System
+from rigidmd.forces.laws.coulomb import ReactionField
+from rigidmd.forces.laws.endings import Plain
+from rigidmd.forces.pairs.loop import PairForces
 from rigidmd.units import BAR
 
 
@@ -24,14 +28,16 @@ def _of_reaction_field(system: System) -> dict[str, str]:
     """Of a law that ends at a cut-off."""
     if system.cutoff == inf or "coulomb" not in system.terms:
         return {}
-    name, law = system.scene.forces.truncation, system.terms["coulomb"].law
+    name = system.scene.forces.truncation
+    shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).law).shape
+    start = 0.0 if isinstance(shape, Plain) else shape.start
     ends = {"plain": "", "shift": ", less its value at the cut-off", "force_shift": ", less its value and slope there"}
     if name in ends:
         how = ends[name]
     elif name == "force_switch":
-        how = f", its force switched off from {law.shape.start:g} Å on"
+        how = f", its force switched off from {start:g} Å on"
     else:
-        how = f", less its value at the cut-off, times {name} from {law.shape.start:g} Å on"
+        how = f", less its value at the cut-off, times {name} from {start:g} Å on"
     return {
         "coulomb": f"q q (1/r + k r²) up to the cut-off{how}",
         "reaction_field_self": "charges of each molecule in the field that they raise themselves, by the same law",

@@ -62,7 +62,8 @@ class Motion:
 def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     """All columns of the samples of a run."""
     times = np.array([s.time for s in snapshots])
-    states = State(*(np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)), np.zeros(0))
+    parts = [np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)]
+    states = State._make([*parts, np.zeros(0)])
     position, velocity, rotation, omega = system.motion(times, states)
     columns = {"t": times} | _columns("position", position) | _columns("velocity", velocity)
     if system.turns:
@@ -202,7 +203,7 @@ def _relative(error: np.ndarray, scale: float) -> np.ndarray:
 def drawn_axis(system: BodySystem) -> np.ndarray:
     """The body axis (3,) whose path is drawn: the one asked for, towards the centre of mass, that of symmetry, or 3."""
     if system.scene.output.axis is not None:
-        return direction(system.scene.output.axis)
+        return direction(np.array(system.scene.output.axis))
     if system.centre.any():
         return direction(system.centre)
     for k in (2, 0, 1):

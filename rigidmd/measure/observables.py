@@ -8,7 +8,7 @@ import numpy as np
 from rigidmd.assemble.momenta import Freedom
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines import Engine
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 

@@ -184,7 +184,8 @@ def longest_step(
         good, bad = (middle, bad) if look(middle) else (good, middle)
     beyond = message = ""
     if good > 0 and bad < inf:
-        look(2 * bad), look(4 * bad)
+        look(2 * bad)
+        look(4 * bad)
         ways = {failure(outcome): outcome for step, outcome in seen.items() if step >= bad}
         order = (CRASH, SILENT, "blow-up", "drift", "detected")
         beyond = next(way for way in order if way in ways)

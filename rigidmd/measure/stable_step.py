@@ -180,8 +180,9 @@ def body_rate(system: BodySystem) -> float:
     for term in weights:
         arms = np.sqrt(np.maximum(term.point @ term.point - term.point**2, 0.0))
         stiffness += np.linalg.norm(term.force) * np.divide(arms, inertia, out=np.zeros(3), where=inertia > 0)
-    flows = isinstance(system.method, Scheme)
-    followed = not flows or isinstance(system.engine().model_for(system.method).rotor, SplitRotor)
+    method = system.method
+    flows = isinstance(method, Scheme)
+    followed = not flows or isinstance(system.engine().model_for(method).rotor, SplitRotor)
     for k in range(3) if flows else ():
         i, j = (k + 1) % 3, (k + 2) % 3
         if inertia[i] == inertia[j] > 0 and len(weights) == len(system.terms) and not stiffness[k]:

@@ -228,6 +228,10 @@ def decided_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple
 
 
 def _chosen(subject: Subject, longest: dict[str, float], energy: float | None, trajectory: float | None):
-    kind, target = ("energy_rms", energy) if energy is not None else ("trajectory_error", trajectory)
-    found = choose(subject, target, kind, longest)
+    if energy is not None:
+        found = choose(subject, energy, "energy_rms", longest)
+    elif trajectory is not None:
+        found = choose(subject, trajectory, "trajectory_error", longest)
+    else:
+        raise ValueError("no error is asked for")
     return found.integrator, found.timestep, found.reason

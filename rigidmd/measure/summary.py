@@ -7,6 +7,7 @@ from math import isnan, sqrt
 
 import numba
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidmd.assemble.system import System
 from rigidmd.core.state import TAKEN, State
@@ -173,7 +174,7 @@ def _known(value: float) -> float | None:
     return None if isnan(value) else float(value)
 
 
-def mean(values: list[float]) -> tuple[float | None, float | None]:
+def mean(values: ArrayLike) -> tuple[float | None, float | None]:
     """Mean and its standard error, with neighbouring samples' likeness counted; None where there is no value."""
     array = np.array(values, dtype=float)
     if np.isnan(array).any():

@@ -16,7 +16,8 @@ import numpy as np
 
 from rigidmd.core.schemes import RK4, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.engines.cpu import Engine, NotFiniteError
+from rigidmd.engines import Engine
+from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.textbook import OdeEngine
 from rigidmd.errors import SimulationError
 from rigidmd.measure.drift import slope
@@ -55,6 +56,11 @@ class Method(NamedTuple):
     def force_evaluations(self) -> int:
         """In a step, of what is given its steps."""
         return 4 if isinstance(self.how, Solver) else self.how.force_evaluations
+
+    @property
+    def order(self) -> int:
+        """Of the error in the step, of what is given its steps."""
+        return 4 if isinstance(self.how, Solver) else self.how.order
 
 
 @dataclass
@@ -186,7 +192,7 @@ def measure(
     trials: list[Trial],
     repeats: int,
     averages: float | None = None,
-    say: Callable[[float], None] = lambda share: None,
+    say: Callable[[float], object] = lambda share: None,
 ) -> Precision:
     """Run all trials and the reference; time the trials `repeats` times, alternating; say(share done) in between.
 
@@ -201,17 +207,17 @@ def measure(
     for trial in trials:  # compiled, and looked at
         look(subject, trial, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, length = 0.0, averages or 0.0
-    whole = len(good) * (repeats + length / subject.span)
+    done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / subject.span)
     for _ in range(repeats):
         for trial in good:
             trial.seconds.append(timing(subject, trial))
             done += 1
             say(done / whole)
-    for trial in good if averages else ():
-        _average(subject, trial, averages)
-        done += length / subject.span
-        say(done / whole)
+    if averages:
+        for trial in good:
+            _average(subject, trial, averages)
+            done += averages / subject.span
+            say(done / whole)
     return result
 
 
@@ -306,8 +312,11 @@ def end_of(subject: Subject, method: Method, steps: int) -> State:
 
 def gap(a: State, b: State) -> tuple[float, float]:
     """Largest differences of rotations and positions; NaN of what a state does not have."""
-    pairs = ((a.rotation, b.rotation), (a.position, b.position))
-    return tuple(float(np.abs(x - y).max()) if len(x) else np.nan for x, y in pairs)
+    return _furthest(a.rotation, b.rotation), _furthest(a.position, b.position)
+
+
+def _furthest(x: np.ndarray, y: np.ndarray) -> float:
+    return float(np.abs(x - y).max()) if len(x) else np.nan
 
 
 def look(subject: Subject, trial: Trial, exact: State | None) -> None:
@@ -348,6 +357,9 @@ def look(subject: Subject, trial: Trial, exact: State | None) -> None:
 
 def _average(subject: Subject, trial: Trial, length: float) -> None:
     """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and without bias."""
+    observe = subject.observe
+    if observe is None:
+        raise ValueError("averages are for molecules in a box")
     engine, state = _begun(subject, trial)
     dt = trial.timestep * subject.time_size
     verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
@@ -358,7 +370,7 @@ def _average(subject: Subject, trial: Trial, length: float) -> None:
             _advance(subject, engine, state, trial, every, k * every)
         except SimulationError:
             return
-        seen.append(subject.observe(engine, state, verlet_step))
+        seen.append(observe(engine, state, verlet_step))
 
     def series(name: str) -> np.ndarray:
         return np.array([getattr(observation, name) for observation in seen])
@@ -372,5 +384,5 @@ def _average(subject: Subject, trial: Trial, length: float) -> None:
         found[f"T_rot - T_trans{kind}"] = found[f"T_rot{kind}"] - found[f"T_trans{kind}"]
     for name, values in found.items():
         average, error = mean(values)
-        if average is not None:
+        if average is not None and error is not None:
             trial.averages[name] = average, error

@@ -219,13 +219,14 @@ def explained(
     states : where to look for sites inside one another, and what to say of each place; dt, stable : the step taken and
     the longest stable one, as far as known, ps
     """
-    finding = error
     if isinstance(error, NotFiniteError):
         seen = f"{named(system, error.molecule)} is nowhere: {error.fault}"
         finding = Finding(seen, error.molecule)
     elif isinstance(error, BehindWallError):
         finding = Finding(f"{named(system, error.molecule)} {error.fault}", error.molecule)
-    elif not isinstance(error, Finding):
+    elif isinstance(error, Finding):
+        finding = error
+    else:
         return str(error)
     text, pair = str(finding), None
     for where, state in states:
@@ -332,10 +333,12 @@ class BodyCheck:
 
     def explained(self, error: SimulationError, dt: float, stable: float | None) -> str:
         """The finding in full: what was seen, the likely cause, what to try."""
-        finding, system = error, self.system
+        system = self.system
         if isinstance(error, NotFiniteError):
             finding = Finding("position or momentum of the body is no finite number any more")
-        elif not isinstance(error, Finding):
+        elif isinstance(error, Finding):
+            finding = error
+        else:
             return str(error)
         shorter = f"a shorter timestep_s than {dt:g}"
         if stable is not None and stable < dt:

@@ -371,7 +371,7 @@ def _moments(rotor, time, k):
         return lambda rotor, time, k: (0.0, 0.0)
 
 
-def moment_rates(rotor, time, k):
+def moment_rates(rotor, time, k) -> tuple[float, float, float, float]:
     """(I_k, I_k', h_k, h_k') of a single body's rotor at a time."""
     raise TypeError("compiled code only")
 

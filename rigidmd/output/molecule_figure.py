@@ -28,7 +28,7 @@ INCHES, FONT = 7.0, 9.0
 
 
 class _Sphere(NamedTuple):
-    centre: np.ndarray  # (2,) Å
+    centre: tuple[float, float]  # Å
     depth: float  # Å, towards the viewer
     radius: float  # Å
 
@@ -53,7 +53,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     check_figure(path, force)
     view = _view(m)
     seen = m.positions_body @ view.T  # right, up, towards the viewer
-    spheres = [_Sphere(x[:2], x[2], _radius(m, i)) for i, x in enumerate(seen)]
+    spheres = [_Sphere((x, y), depth, _radius(m, i)) for i, (x, y, depth) in enumerate(seen.tolist())]
     reach = [max(s.radius, m.sigma[i] / 2 if m.epsilon[i] > 0 else 0.0) for i, s in enumerate(spheres)]
     half = 1.12 * max(np.abs(s.centre).max() + r for s, r in zip(spheres, reach, strict=True))
     figure = Figure(figsize=(INCHES, INCHES * 1.12))
@@ -113,7 +113,7 @@ def _diameters(axes, m: Molecule, spheres: list[_Sphere]) -> None:
     """Lennard-Jones diameters, faint."""
     from matplotlib.patches import Circle
 
-    for i in np.flatnonzero(m.epsilon > 0):
+    for i in np.flatnonzero(m.epsilon > 0).tolist():
         colour = _colour(m, i) if m.elements[i] != "H" else OTHER
         axes.add_patch(Circle(spheres[i].centre, m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1))
         axes.add_patch(
@@ -134,7 +134,7 @@ def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[
         ends = np.array([seen[i] + 0.9 * spheres[i].radius * along, seen[j] - 0.9 * spheres[j].radius * along])
         for colour, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
             axes.plot(*ends[:, :2].T, color=colour, lw=width, solid_capstyle="butt", zorder=_order(ends[:, 2].mean()))
-        taken += [(*x, *x) for x in np.linspace(*ends[:, :2], 12)]
+        taken += [(*x, *x) for x in np.linspace(ends[0, :2], ends[1, :2], 12)]
     return taken
 
 
@@ -154,11 +154,12 @@ def _sphere(axes, m: Molecule, i: int, sphere: _Sphere) -> None:
         axes.add_patch(RegularPolygon(sphere.centre, 4, radius=sphere.radius, **style))
         return
     base, steps = np.array(to_rgb(_colour(m, i))), 24
-    towards_light = np.array([-0.32, 0.36]) * sphere.radius
+    (x, y), towards_light = sphere.centre, (-0.32 * sphere.radius, 0.36 * sphere.radius)
     for k in range(steps):
         share = k / (steps - 1)  # from the dark rim to the light spot
         colour = np.clip(base * (0.72 + 0.33 * share) + 0.55 * max(0.0, share - 0.45) ** 2, 0, 1)
-        spot = Circle(sphere.centre + share * towards_light, sphere.radius * (1 - 0.93 * share), fc=colour, lw=0)
+        centre = x + share * towards_light[0], y + share * towards_light[1]
+        spot = Circle(centre, sphere.radius * (1 - 0.93 * share), fc=colour, lw=0)
         spot.set_zorder(order)
         axes.add_patch(spot)
     axes.add_patch(Circle(sphere.centre, sphere.radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))

@@ -106,7 +106,7 @@ def _geometry(m: Molecule) -> list[str]:
 def bonds(m: Molecule) -> list[tuple[int, int]]:
     """Links between sites, heavier first: atoms within bonding distance, all parts of a molecule by the shortest links
     between atoms, and each massless site to its nearest atom."""
-    atoms = np.flatnonzero(m.masses > 0)
+    atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
     part = {i: i for i in atoms}
     found = []
     for i, j in sorted(combinations(atoms, 2), key=lambda pair: round(_distance(m, *pair), 9)):
@@ -114,7 +114,7 @@ def bonds(m: Molecule) -> list[tuple[int, int]]:
         if _distance(m, i, j) <= reach or part[i] != part[j]:
             found.append((i, j) if m.masses[i] >= m.masses[j] else (j, i))
             part = {s: part[i] if p == part[j] else p for s, p in part.items()}
-    massless = np.flatnonzero(m.masses == 0)
+    massless: list[int] = np.flatnonzero(m.masses == 0).tolist()
     return sorted(found) + [(min(atoms, key=lambda i, s=s: round(_distance(m, i, s), 9)), s) for s in massless]
 
 

@@ -17,4 +17,4 @@ def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
 def write_npz(path: Path, columns: dict[str, np.ndarray]) -> None:
     """The same columns as arrays by name."""
     with whole_file(path) as temporary:
-        np.savez(temporary, **columns)
+        np.savez(temporary, **columns)  # pyright: ignore[reportArgumentType]  (none is called allow_pickle)

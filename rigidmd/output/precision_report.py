@@ -94,10 +94,10 @@ def _brief_headers() -> list[str]:
             "bias of P (bar)"]  # fmt: skip
 
 
-def _brief_row(found: Precision, trial: Trial) -> list[str]:
+def _brief_row(found: Precision, trial: Trial) -> list[str | None]:
     """The averages that tell one step from another."""
     seen, best = trial.averages, found.most_exact.averages
-    cells = [trial.integrator, f"{trial.timestep:.3g}", signed(*seen["T_trans"]).lstrip("+")]
+    cells: list[str | None] = [trial.integrator, f"{trial.timestep:.3g}", signed(*seen["T_trans"]).lstrip("+")]
     gaps = [seen.get(f"T_rot - T_trans{kind}") for kind in ESTIMATORS]
     cells += [gap and signed(*gap) for gap in gaps]
     for name in ("potential", "pressure"):
@@ -162,14 +162,14 @@ def _timing_words(found: Precision) -> list[str]:
         return []
     if timed[0].spread is None:
         return ["timed once: how far the seconds would be the same again is not known; see --repeats"]
-    doubtful = [trial for trial in timed if trial.spread > DOUBTFUL]
+    doubtful = [(spread, trial) for trial in timed if (spread := trial.spread) is not None and spread > DOUBTFUL]
     if not doubtful:
         return []
-    worst = max(doubtful, key=lambda trial: trial.spread)
+    spread, worst = max(doubtful, key=lambda pair: pair[0])
     which = f"{worst.integrator} at {worst.timestep:.3g} {found.subject.time_unit}"
     return [
         f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than {DOUBTFUL:.0%}, "
-        f"those of {which} by {worst.spread:.0%} (± % in the table): was another program running? A quieter machine or "
+        f"those of {which} by {spread:.0%} (± % in the table): was another program running? A quieter machine or "
         "more --repeats help"
     ]
 
@@ -212,7 +212,7 @@ def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(headers(found))
         writer.writerows(row(found, trial) for trial in found.trials)
-    written = list(FILES[:3])
+    written: list[str] = list(FILES[:3])
     if sampled := [trial for trial in found.trials if trial.averages]:
         written.append(FILES[3])
         with whole_file(folder / FILES[3]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

@@ -164,7 +164,8 @@ def picture(finding: Finding) -> bytes:
         axis.set_yscale("log")
         axis.spines[["top", "right"]].set_visible(False)
         axis.tick_params(labelsize=7, colors=INK)
-        axis.xaxis.label.set_size(8), axis.yaxis.label.set_size(8)
+        axis.xaxis.label.set_size(8)
+        axis.yaxis.label.set_size(8)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, fontsize=6.5, loc="best")
     stream = io.BytesIO()

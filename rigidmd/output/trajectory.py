@@ -5,9 +5,11 @@ import os
 import warnings
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import MDAnalysis as mda
 import numpy as np
+from MDAnalysis.coordinates.base import ProtoReader
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.coordinates.PDB import PDBReader
@@ -74,7 +76,11 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
     """A Universe that holds frames in memory, each with its own time and box."""
     u = universe(system, system.state)
     times, positions = _checked([frame.time for frame in frames]), np.array([frame.positions for frame in frames])
-    boxes = None if u.dimensions is None else np.array([dimensions(frame.cell) for frame in frames])
+    boxes = (
+        None
+        if u.dimensions is None
+        else np.array([dimensions(frame.cell) for frame in frames if frame.cell is not None])
+    )
     u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes)
     return u
 
@@ -96,12 +102,12 @@ def _checked(times: list[float]) -> list[float]:
     return times
 
 
-class _Timed:
+class _Timed(ProtoReader):
     """What makes a reader tell the times of the run (ps), evenly spaced or not, whatever its source holds of them."""
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
-        super().__init__(*source, times=times, **options)  # readers give all their options to copies
+        super().__init__(*source, **options | {"times": times})  # readers give all their options to copies
         self._timed(self.ts)
 
     @property
@@ -118,7 +124,8 @@ class _Timed:
         return self._timed(super()._read_frame(i))
 
     def _read_next_timestep(self, ts=None):
-        return self._timed(super()._read_next_timestep(ts))
+        # every reader has its own
+        return self._timed(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
 
 
 class _TimedFrames(_Timed, MemoryReader): ...
@@ -155,7 +162,8 @@ def write_topology(path: Path, system: System | BodySystem, state: State, wrappe
     _check_fits(path, system.site_positions(state, wrapped))
     with whole_file(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a format cannot hold (occupancies, ...) is not ours to give
-        universe(system, state, wrapped=wrapped).atoms.write(str(temporary))
+        sites = universe(system, state, wrapped=wrapped).select_atoms("all")
+        sites.write(str(temporary))
 
 
 def _check_fits(path: Path, positions: np.ndarray) -> None:
@@ -182,7 +190,7 @@ class TrajectoryFile:
         options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self._writer = mda.Writer(str(path), n_atoms=len(system.sites.name), **options.get(path.suffix, {}))
+            self._writer: Any = mda.Writer(str(path), n_atoms=len(system.sites.name), **options.get(path.suffix, {}))
         self._path, self._format = path, path.suffix
 
     def write(self, state: State, time: float, step: int) -> None:

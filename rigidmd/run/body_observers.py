@@ -65,10 +65,12 @@ class MotionFiles(Observer):
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
         """Write them."""
-        write_csv(run.path(MOTION), results.samples.columns)
+        if not isinstance(samples := results.samples, Motion):
+            raise TypeError("these are samples of molecules")
+        write_csv(run.path(MOTION), samples.columns)
         results.files.append(run.path(MOTION))
         if self._npz:
-            write_npz(run.path(MOTION_NPZ), results.samples.columns)
+            write_npz(run.path(MOTION_NPZ), samples.columns)
             results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "BodySimulation") -> str:
@@ -86,20 +88,25 @@ class Figures(Observer):
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
         """Draw them, if there is anything to see."""
-        if len(results.samples) > 2:
-            gravity = run.scene.gravity and run.scene.gravity.acceleration_m_s2
-            drawn = _drawn(run.system, results.samples) | {"gravity": gravity}
-            results.files += draw_motion(run.folder, run.scene.name, **drawn)
+        system, samples = run.system, results.samples
+        if not isinstance(samples, Motion) or len(samples) <= 2:
+            return
+        columns = dict(samples.columns)
+        if system.turns:  # omega along the principal axes, where it lies on ellipsoids
+            omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
+            columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
+        gravity = run.scene.gravity and run.scene.gravity.acceleration_m_s2
+        results.files += draw_motion(
+            run.path(""),
+            run.scene.name,
+            columns=columns,
+            axis_body=drawn_axis(system),
+            inertia=system.inertia if _keeps_its_ellipsoids(system) else None,
+            invariants=samples.invariants,
+            gravity=None if gravity is None else np.array(gravity),
+        )
 
 
-def _drawn(system: "BodySystem", samples: Motion) -> dict:
-    """What the figures show: omega along the principal axes, where it lies on ellipsoids that stay."""
-    omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes if system.turns else []
-    own = {f"omega_body_{k + 1}": omega[:, k] for k in range(3)} if system.turns else {}
-    constant = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
-    return {
-        "columns": samples.columns | own,
-        "axis_body": drawn_axis(system),
-        "inertia": system.inertia if constant else None,
-        "invariants": samples.invariants,
-    }
+def _keeps_its_ellipsoids(system: "BodySystem") -> bool:
+    """Whether the inertia is constant and the frame does not turn."""
+    return isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)

@@ -13,7 +13,7 @@ from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.core.state import HEAT, TAKEN, WORK, State, state_of
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu import Engine, thread_limit
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
@@ -49,7 +49,8 @@ class MolecularSimulation(Simulation):
     ):
         super().__init__(scene, folder, force, **options)
         self._built = build(scene)
-        self.threads = min(scene.threads or numba.config.NUMBA_NUM_THREADS, numba.config.NUMBA_NUM_THREADS)
+        most = thread_limit()
+        self.threads = min(scene.threads or most, most)
         self._reset()
 
     def start_from(self, state: State) -> None:
@@ -88,7 +89,8 @@ class MolecularSimulation(Simulation):
             thermal = BOLTZMANN * temperature or max((m.epsilon.max() for m in self.system.species), default=0.0)
             if thermal > 0:
                 scale = self.system.smallest_diameter
-                relief = relieve(self.engine, self.state, radius, scale, thermal, first.timestep_fs * FEMTOSECOND)
+                dt = first.timestep_fs * FEMTOSECOND
+                relief = relieve(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
                 if relief.excess > 1:
                     raise SceneError(
                         self.scene.source,

@@ -7,7 +7,9 @@ import numpy as np
 
 from rigidmd.assemble.momenta import mobile
 from rigidmd.core.state import State
-from rigidmd.engines.cpu import BehindWallError, Engine
+from rigidmd.dynamics.advance import Model
+from rigidmd.engines import Engine
+from rigidmd.engines.cpu import BehindWallError
 from rigidmd.measure.kicks import kicks
 from rigidmd.mechanics.rotation import from_vector
 
@@ -22,7 +24,9 @@ class Relief(NamedTuple):
     excess: float  # largest kick of a first step over its thermal momentum; fine at 1 or below
 
 
-def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, thermal: float, dt: float) -> Relief:
+def relieve(
+    model: Model, engine: Engine, state: State, radius: np.ndarray, scale: float, thermal: float, dt: float
+) -> Relief:
     """Steepest descent with a bounded move, in place, until the first step is no longer violent.
 
     radius (species,): how far from its centre a molecule reaches (Å), which turns angles into moves; scale: the
@@ -30,14 +34,14 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
     back and halved.
     """
     load, tallies = engine.evaluate(state)
-    left = float(kicks(engine.model, load, thermal, dt).max())
+    left = float(kicks(model, load, thermal, dt).max())
     if left <= 1:
         return Relief(0, left)
     energy = sum(tally.energy for tally in tallies.values())
     length = LONGEST_MOVE * scale
-    arm = np.where(radius > 0, radius, 1.0)[engine.model.species][: len(state.rotation), None]
-    free = mobile(engine.model)
-    turning = (engine.model.inertia > 0)[engine.model.species][: len(state.rotation)]
+    arm = np.where(radius > 0, radius, 1.0)[model.species][: len(state.rotation), None]
+    free = mobile(model)
+    turning = (model.inertia > 0)[model.species][: len(state.rotation)]
     for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
         # Each molecule along its own force, none further than `length`: overlaps do not slow down everybody else.
         push = load.force * free[:, None] / np.abs(load.force[free]).max()
@@ -56,7 +60,7 @@ def relieve(engine: Engine, state: State, radius: np.ndarray, scale: float, ther
             new_load, new_energy = load, inf
         if new_energy < energy:
             load, energy, length = new_load, new_energy, min(1.2 * length, LONGEST_MOVE * scale)
-            left = float(kicks(engine.model, load, thermal, dt).max())
+            left = float(kicks(model, load, thermal, dt).max())
             if left <= 1:
                 break
         else:

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, models_json_schema
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode, JsonSchemaValue, models_json_schema
 
 from rigidmd.molecules import available_models
 from rigidmd.scene.base import Scene, parse_override
@@ -17,7 +18,9 @@ def schema() -> dict[str, Any]:
 
     By the condition an editor holds a file against the kind of scene that it is, and says what is wrong there.
     """
-    scenes = [(kind, "validation") for kind in (BodyScene, MolecularScene)]
+    scenes: list[tuple[type[BaseModel], JsonSchemaMode]] = [
+        (kind, "validation") for kind in (BodyScene, MolecularScene)
+    ]
     _, found = models_json_schema(scenes, schema_generator=_TomlSchema)
     found["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
     return {

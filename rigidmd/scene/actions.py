@@ -42,8 +42,8 @@ class Timed(Section):
 
     def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
         """What is wrong between the times and these quantities; a single value is of type `entry`."""
-        faults = []
-        if self.times_s is not None and (self.from_s is not None or self.to_s is not None):
+        faults, times = [], self.times_s
+        if times is not None and (self.from_s is not None or self.to_s is not None):
             faults.append("from_s and to_s would do nothing beside times_s")
         if not (self.to_s is None or self.to_s > (self.from_s or 0)):
             faults.append(f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}")
@@ -51,12 +51,12 @@ class Timed(Section):
             if value is None:
                 continue
             many = isinstance(value, tuple) and (entry is float or isinstance(value[0], tuple))
-            if self.times_s is None and many:
+            if times is None and many:
                 faults.append(f"{key} is a list of values: times_s is missing")
-            elif self.times_s is not None and not many:
-                faults.append(f"{key} is one value: with times_s it must be a list of {len(self.times_s)}")
-            elif many and len(value) != len(self.times_s):
-                faults.append(f"{key} has {len(value)} values for {len(self.times_s)} times")
+            elif times is not None and not many:
+                faults.append(f"{key} is one value: with times_s it must be a list of {len(times)}")
+            elif times is not None and len(value) != len(times):
+                faults.append(f"{key} has {len(value)} values for {len(times)} times")
         return faults
 
     @property

@@ -96,13 +96,12 @@ class Scene(Section):
     ) -> "MolecularScene | BodyScene":
         """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault."""
         folder = Path(folder)
-        if cls is Scene:
-            from rigidmd.scene import BodyScene, MolecularScene
+        from rigidmd.scene import BodyScene, MolecularScene
 
-            cls = _kind(data, BodyScene, MolecularScene)
-            if cls is None:
-                raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
-        faults = cls.strange_paths(data, folder)
+        kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind(data, BodyScene, MolecularScene)
+        if kind is None:
+            raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
+        faults = kind.strange_paths(data, folder)
         overridden = []
         for key, value in (overrides or {}).items():
             faults += _override(data, key, value)
@@ -110,11 +109,11 @@ class Scene(Section):
                 text = ""  # without an entry, those after it have other numbers than in the text
             else:
                 overridden.append(key)
-        faults += cls.contradictions(data, text)
+        faults += kind.contradictions(data, text)
         try:
-            scene = cls.model_validate(data)
+            scene = kind.model_validate(data)
         except ValidationError as error:
-            raise SceneError(source, faults + faults_of(error, cls, text, overridden)) from None
+            raise SceneError(source, faults + faults_of(error, kind, text, overridden)) from None
         if faults:
             raise SceneError(source, faults)
         scene._source = source
@@ -148,13 +147,13 @@ def file_name(name: str, endings: tuple[str, ...]) -> str:
     return name
 
 
-def _kind(data: dict, body: type[Scene], molecules: type[Scene]) -> type[Scene] | None:
+def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
     """The kind of scene that has these tables, or the only one that knows any of them."""
     for kind, marker in ((body, "body"), (molecules, "molecules")):
         if marker in data:
             return kind
     own = {kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields)) for kind in (body, molecules)}
-    best = max(own, key=own.get)
+    best = max(own, key=lambda kind: own[kind])
     return best if own[best] > 0 else None
 
 
@@ -166,23 +165,24 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
     target: Any = data
     for depth, part in enumerate([*parents, last]):
         here = ".".join(key.split(".")[:depth])
-        if isinstance(target, list):
+        listed, table = isinstance(target, list), isinstance(target, dict)
+        if listed:
             if not part.isdigit() or int(part) >= len(target):
                 return [f"--set {key}: {here} has entries 0 to {len(target) - 1}, not {part!r}"]
-            part = int(part)
-        elif not isinstance(target, dict):
+        elif not table:
             return [f"--set {key}: {here} is no table"]
         elif value is None and part not in target:
             there = meant(part, target) or f"; there are {', '.join(target)}"
             return [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
+        index = int(part) if listed else part
         if depth == len(parents) and value is None:
-            del target[part]
+            del target[index]
         elif depth == len(parents):
-            target[part] = value
-        elif isinstance(target, dict):
-            target = target.setdefault(part, {})
+            target[index] = value
+        elif table:
+            target = target.setdefault(index, {})
         else:
-            target = target[part]
+            target = target[index]
     return []
 
 

@@ -135,7 +135,7 @@ class BodyTable(Section):
 
     def _impossible(self) -> list[str]:
         tensor = self.tensor
-        if tensor is None:
+        if tensor is None or self.mass_kg is None:
             return []
         if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():
             return ["inertia_tensor_kg_m2 is not symmetric"]
@@ -231,7 +231,7 @@ class BodyStart(Section):
         if self.yaw_pitch_roll_deg is not None:
             return from_yaw_pitch_roll(np.radians(self.yaw_pitch_roll_deg))
         if self.quaternion_wxyz is not None:
-            return from_quaternion(direction(self.quaternion_wxyz))
+            return from_quaternion(direction(np.array(self.quaternion_wxyz)))
         if self.rotation is not None:
             return nearest_rotation(np.array(self.rotation))
         if self.attitude_matrix is not None:
@@ -241,8 +241,8 @@ class BodyStart(Section):
     @property
     def angular_velocity(self) -> np.ndarray:
         """Along the body's axes (3,), rad/s."""
-        if self.euler_rates_rad_s is not None:
-            return angular_velocity_of_euler_rates(np.radians(self.euler_angles_deg), self.euler_rates_rad_s)
+        if self.euler_rates_rad_s is not None and self.euler_angles_deg is not None:
+            return angular_velocity_of_euler_rates(np.radians(self.euler_angles_deg), np.array(self.euler_rates_rad_s))
         if self.angular_velocity_lab_rad_s is not None:
             return self.attitude.T @ self.angular_velocity_lab_rad_s
         return np.array(self.angular_velocity_body_rad_s or (0.0, 0.0, 0.0))

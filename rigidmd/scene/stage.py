@@ -173,7 +173,7 @@ class Stage(Section):
         several = len(given) if isinstance(given, tuple) else 1
         if self.integrator == AUTO:
             faults.append("integrator = 'auto' chooses for a constant volume: name one for a stage with a pressure")
-        apart = coupling == "semi_isotropic" and several == 3 and given[0] != given[1]
+        apart = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
         if apart or (coupling == "isotropic" and several == 3):
             faults.append(f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}")
         if several == 6 and coupling != "flexible":

@@ -8,7 +8,7 @@ from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
 from rigidmd.measure.trials import Precision, Subject, measure, plan
 from rigidmd.run.molecules import MolecularSimulation
-from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.validation import meant
 
 #: Tried when no others are asked for: the common one, the best of each kind, and of a body what textbooks do.
@@ -26,13 +26,13 @@ AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are sing
 
 
 def precision(
-    scene: Scene,
+    scene: MolecularScene | BodyScene,
     integrators: list[str] | None = None,
     timesteps: list[float] | None = None,
     span: float | None = None,
     repeats: int = 3,
     averages: float | None = None,
-    say: Callable[[float], None] = lambda share: None,
+    say: Callable[[float], object] = lambda share: None,
 ) -> Precision:
     """Error against run time of integrators at time steps, on the start of a scene.
 
@@ -73,7 +73,7 @@ def precision(
     return found
 
 
-def _named(name: str, scene: Scene) -> str:
+def _named(name: str, scene: MolecularScene | BodyScene) -> str:
     """The method that a name stands for on a scene."""
     solver, _, form = name.partition("_")
     if solver in SOLVERS and isinstance(scene, BodyScene):
@@ -82,7 +82,7 @@ def _named(name: str, scene: Scene) -> str:
     return name
 
 
-def _own(scene: Scene) -> str:
+def _own(scene: MolecularScene | BodyScene) -> str:
     """The method that a scene itself asks for."""
     return _named(scene.run.integrator if isinstance(scene, BodyScene) else scene.stages[-1].integrator, scene)
 

@@ -11,7 +11,15 @@ from rigidmd.measure.stability import REFUSED, RIGHT, Finding, Outcome
 from rigidmd.scene import Scene
 from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.collisions import bent, from_file
-from rigidmd.study.stability.runs import SPLIT, WATER_FORCES, attempt, molecules_scene, only_built, run_molecules
+from rigidmd.study.stability.runs import (
+    SPLIT,
+    WATER_FORCES,
+    attempt,
+    molecular,
+    molecules_scene,
+    only_built,
+    run_molecules,
+)
 
 RIGHT_OR_REFUSED = (RIGHT, REFUSED)
 
@@ -54,7 +62,7 @@ def far_away(find: Finding, quick: bool) -> None:
     data = molecules_scene(
         [{"model": "spce", "count": 40}], {"lengths_A": edge}, 0.5, 10, SPLIT, 298.0, None, WATER_FORCES
     )
-    system = build(Scene.from_dict(data))
+    system = build(molecular(data))
     state = system.state.copy()
     state.position[:] = np.round(state.position * 2**10) / 2**10
     load, tallies = system.engine().evaluate(state)

@@ -26,7 +26,7 @@ def case(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[
     """Put a function among the cases, under its own name and with the first line of its docstring."""
 
     def enter(attempt: Attempt) -> Attempt:
-        sentence = attempt.__doc__.strip().splitlines()[0].rstrip(".")
+        sentence = (attempt.__doc__ or "").strip().splitlines()[0].rstrip(".")
         CASES[attempt.__name__] = Case(attempt.__name__, group, sentence, attempt, (x, error, step))
         return attempt
 

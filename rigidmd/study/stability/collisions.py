@@ -18,6 +18,7 @@ from rigidmd.study.stability.runs import (
     attempt,
     energy_error,
     families,
+    molecular,
     molecules_scene,
     run_molecules,
     simulate,
@@ -48,7 +49,7 @@ def pair_of(apart: float, speed: float, thickness: float = 0.5) -> tuple[list[di
     """Two bent molecules side by side (Å) that approach each other at a speed (Å/ps), turned at random."""
     species = [bent(thickness) | {"count": 2}]
     data = molecules_scene(species, BOX, 1.0, 1, temperature=0.0, forces=FORCES)
-    state = build(Scene.from_dict(data)).state
+    state = build(molecular(data)).state
     state.position[:] = [[10 - apart / 2, 10, 10], [10 + apart / 2, 10.1, 10]]
     state.velocity[:] = [[speed / 2, 0, 0], [-speed / 2, 0, 0]]
     state.angular_momentum_body[:] = 0.0
@@ -120,7 +121,7 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "start.npz"
             template = data | {"start": {"temperature_K": 0.0}}
-            system = build(Scene.from_dict(template))
+            system = build(molecular(template))
             write_state(path, system.saved(state))
             started = data | {"structure": {"file": path.name, "velocities": velocities}}
             results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
@@ -147,9 +148,9 @@ def bare_charges(find: Finding, quick: bool) -> None:
         data = molecules_scene([bare], BOX, 1.0, 500, family, 300.0, None, FORCES, looks=100)
         find.add("arms longer than sigma/2", run_molecules(data), 0.1, family, 0.0, 1.0, (REFUSED, TOLD))
     data = molecules_scene([bare | {"count": 2}], BOX, 1.0, 100, SPLIT, 300.0, None, FORCES)
-    state = build(Scene.from_dict(data)).state
+    state = build(molecular(data)).state
     state.rotation[:] = np.eye(3)
-    sites = build(Scene.from_dict(data)).sites.offset_body
+    sites = build(molecular(data)).sites.offset_body
     state.position[:] = [[10, 10, 10], 10 + sites[1] - sites[5]]
     find.add("a hydrogen on a charge site", from_file(data, state), 0.0, SPLIT, 0.0, 1.0, (REFUSED,))
 

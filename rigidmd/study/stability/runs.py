@@ -14,7 +14,7 @@ from rigidmd.measure.stability import Outcome
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Simulation
 from rigidmd.run.results import Results
-from rigidmd.scene import Scene
+from rigidmd.scene import MolecularScene, Scene
 
 #: Integrator families: the common one on both rotors, a symplectic Nystrom scheme, a composition on the split rotor.
 FAMILIES = {
@@ -143,9 +143,17 @@ def molecules_scene(
     }
 
 
+def molecular(data: dict) -> MolecularScene:
+    """The scene of tables of molecules. Raises SceneError."""
+    scene = Scene.from_dict(data)
+    if not isinstance(scene, MolecularScene):
+        raise TypeError(f"{scene.name} is a single body")
+    return scene
+
+
 def simulate(data: dict, state: State | None = None) -> Results:
     """Run a scene of molecules, from a state of its own where one is given."""
-    simulation = Simulation(Scene.from_dict(data))
+    simulation = Simulation(molecular(data))
     if state is not None:
         simulation.start_from(state)
     return simulation.run()

@@ -27,7 +27,7 @@ CENTRE_AT_HALF = np.array([-0.7024682970565856, -0.02116518470192333, -0.7114002
 @case(5, x="step (s)", error="error of the centre of mass after 0.5 s (m)")
 def fast_heavy_top(find: Finding, quick: bool) -> None:
     """The fast heavy top through its near-vertical pass, within 2.6e-13 of straight down."""
-    allowed = dict.fromkeys((SPLIT, EXACT), 1e-7)
+    allowed: dict[str, float] = dict.fromkeys((SPLIT, EXACT), 1e-7)
     for family in families(quick):
 
         def place(results) -> float:

@@ -132,8 +132,10 @@ def equipartition(find: Finding, quick: bool) -> None:
             def run(data=data) -> Outcome:
                 results = simulate(data)
                 half = len(results["time"]) // 5
-                parts = [mean(results[f"temperature_{kind}_unbiased"][half:]) for kind in ("rotation", "translation")]
-                (rotation, its_error), (translation, error) = parts
+                rotation, its_error = mean(results["temperature_rotation_unbiased"][half:])
+                translation, error = mean(results["temperature_translation_unbiased"][half:])
+                if rotation is None or its_error is None or translation is None or error is None:
+                    raise ValueError("these molecules have no temperature of one of their motions")
                 gap = abs(rotation - translation) / hypot(its_error, error)
                 return Outcome(float(gap), float(np.abs(results["drift"]).max() / results["kinetic"][0]))
 
