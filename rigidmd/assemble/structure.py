@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.atoms import SAME_MASS, Atoms
 from rigidmd.assemble.cells import (
     angles_deg,
     basis_in_words,
@@ -17,7 +18,7 @@ from rigidmd.assemble.cells import (
     standard_rotation,
 )
 from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
-from rigidmd.assemble.structure_files import SAME_MASS, Atoms, read_atoms
+from rigidmd.assemble.structure_files import read_atoms
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.waves.vectors import AS_GIVEN
