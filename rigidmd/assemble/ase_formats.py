@@ -6,11 +6,15 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
 from rigidmd.errors import StructureError
+
+if TYPE_CHECKING:
+    from ase import Atoms as AseAtoms
 
 # ASE's velocity unit (Å sqrt(u/eV)) in Å/ps.
 ASE_VELOCITY = 98.22694788464063
@@ -18,14 +22,14 @@ ASE_VELOCITY = 98.22694788464063
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
 
-def read_by_ase(path: Path, source, **options) -> list:
+def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list[AseAtoms]":
     """ASE's structures in a file or in text."""
-    import ase.io
+    import ase.io.formats
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = ase.io.read(source, index=":", **options)
+            found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
         raise StructureError(
             str(path), ["its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"]
