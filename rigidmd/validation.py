@@ -4,7 +4,7 @@ import difflib
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic_core import ErrorDetails
@@ -16,6 +16,8 @@ Count = Annotated[int, Strict(), Field(gt=0)]
 Flag = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
 
+T = TypeVar("T")
+
 #: More names than this that begin or end alike say nothing of which was meant.
 MOST_MEANT = 8
 
@@ -24,6 +26,12 @@ class Section(BaseModel):
     """A frozen table of a TOML file; keys it does not know are faults."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+def settled(value: T | None) -> T:
+    """A value that may be left out of a scene, but is there where it is used: in a validated and resolved one."""
+    assert value is not None, "the scene is not validated or not resolved"
+    return value
 
 
 def faults_of(

@@ -27,7 +27,10 @@ ROOMS = [
 RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 
 LIBRARIES = {
-    "ase": {"assemble/structure_files.py", "assemble/matching.py", "assemble/cells.py"},
+    "ase": {
+        "assemble/atoms.py", "assemble/ase_formats.py", "assemble/own_formats.py", "assemble/structure_files.py",
+        "assemble/matching.py", "assemble/cells.py",
+    },
     "MDAnalysis": {"output/trajectory.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},

@@ -25,7 +25,7 @@ from rigidmd.output import progress
 from rigidmd.output.log import columns
 from rigidmd.output.report import summary_text
 from rigidmd.run import Every, Simulation
-from rigidmd.scene import Scene
+from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN
 
 
@@ -333,10 +333,65 @@ def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, 
     assert "ewald_accuracy" not in again.forces.model_fields_set
     assert again.start.temperature_K == 300.0
     assert again.forces.skin_A == 1.6
-    assert again == scene.resolved() == first.system.scene
+    assert scene.resolved() == first.system.scene
+    assert again.model_dump() == first.system.scene.model_dump()
     repeated = Simulation(again).run()
     for one, other in zip(first.state, repeated.state, strict=True):
         assert one.tobytes() == other.tobytes()
+
+
+@pytest.mark.parametrize("electrostatics", [*DECIDED, "damped_shifted_force", "none"])
+@pytest.mark.parametrize("angles", [(90.0, 90.0, 90.0), (80.0, 75.0, 85.0)])
+def test_a_resolved_scene_has_every_number_and_resolves_to_itself(electrostatics, angles):
+    box = {"lengths_A": [22.0, 23.0, 24.0], "angles_deg": angles}
+    scene = small_scene({"spce": 30}, None, box=box, forces={"electrostatics": electrostatics})
+    resolved = scene.resolved()
+    assert resolved.resolved() == resolved != scene
+    for key in {"skin_A", *DECIDED.get(electrostatics, DECIDED["reaction_field"])}:
+        assert getattr(resolved.forces, key) is not None, key
+    assert resolved.forces.ewald_accuracy is None  # what follows from it is there
+    assert resolved.run.remove_momentum_interval_ps == (1.0 if electrostatics == "pme" else False)
+    assert resolved.start.temperature_K == 300.0
+    assert resolved.output.velocities is False
+    again = MolecularScene.model_validate(resolved.model_dump(exclude_none=True))
+    assert again.resolved() == again
+
+
+def test_without_a_box_there_is_no_cut_off_to_decide():
+    resolved = small_scene({"spce": 3}, None).resolved()
+    assert resolved.forces.cutoff_A is resolved.forces.switch_start_A is None
+
+
+def test_a_cell_that_leans_too_much_leaves_only_the_grid_open():
+    """The keys of a scene count along its own edges; the engine has others."""
+    box = {"lengths_A": [24.0, 24.0, 24.0], "angles_deg": [60.0, 60.0, 45.0]}
+    forces = {"electrostatics": "pme", "cutoff_A": 8.0}
+    scene = small_scene({"spce": 30}, None, box=box, forces=forces)
+    resolved = scene.resolved()
+    assert resolved.resolved() == resolved
+    assert resolved.forces.pme_grid is None
+    first, again = (build(each).terms["coulomb_reciprocal"] for each in (scene, resolved))
+    assert (resolved.forces.ewald_accuracy, resolved.forces.pme_order) == (1e-5, first.order)
+    assert (first.grid, first.order) == (again.grid, again.order)
+    even = small_scene({"spce": 30}, None, box=box, forces=forces | {"pme_grid": [60, 60, 60]}).resolved()
+    assert (even.forces.pme_grid, even.forces.ewald_accuracy) == ((60, 60, 60), None)
+
+
+def test_faults_of_all_tables_are_said_at_once():
+    molecules = [{"model": "spce", "count": 3, "frozen": "2-9"}]
+    scene = small_scene({}, 17.0, molecules=molecules, forces={"electrostatics": "pme", "ewald_alpha_per_A": 2.0})
+    with pytest.raises(SceneError) as error:
+        build(scene)
+    assert [fault.partition(":")[0].partition(" =")[0] for fault in error.value.faults] == [
+        "molecules.0.frozen", "forces.cutoff_A", "forces.ewald_alpha_per_A"
+    ]  # fmt: skip
+    assert "(the default)" in str(error.value)
+
+
+def test_an_accuracy_that_cannot_be_had_is_called_the_default():
+    forces = {"electrostatics": "pme", "cutoff_A": 6.0, "ewald_alpha_per_A": 1.3}
+    with pytest.raises(SceneError, match=r"ewald_accuracy = 1e-05 \(the default\) cannot be had"):
+        build(small_scene({"spce": 30}, 18.5, forces=forces | {"pme_grid": [8, 8, 8]}))
 
 
 def test_input_files_of_one_name_are_kept_apart(tmp_path):

@@ -12,9 +12,10 @@ from conftest import small_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rigidmd.assemble.atoms import element_of, element_of_mass
 from rigidmd.assemble.cells import basis_in_words, basis_of, pairs_within, reduced, standard_rotation
 from rigidmd.assemble.structure import read_structure
-from rigidmd.assemble.structure_files import element_of, element_of_mass, read_geometry
+from rigidmd.assemble.structure_files import read_geometry
 from rigidmd.assemble.system import build
 from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from rigidmd.assemble.body_parts import (
     rotor_of,
     terms_of,
 )
-from rigidmd.assemble.resolve import FORMULATION, resolve_body, settled
+from rigidmd.assemble.resolve import FORMULATION, resolve_body
 from rigidmd.assemble.system import Sites
 from rigidmd.core.schemes import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State, state_of
@@ -33,6 +33,9 @@ from rigidmd.mechanics.flight import Free, Immersed, Pinned
 from rigidmd.mechanics.inertia import Kind, kind_of_body
 from rigidmd.mechanics.rotor import DrivenRotor, NoRotor
 from rigidmd.scene import BodyScene
+from rigidmd.validation import settled
+
+Part = TypeVar("Part", bound=NamedTuple)
 
 LARGEST_IN_GRO = 9e4  # Å: eight columns in nm
 
@@ -119,8 +122,9 @@ class BodySystem:
 
     def during(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
         """Body and terms with what holds from a time to the next break."""
-        terms = {name: _at(term, time) for name, term in self.terms.items()}
-        return Body(*(_at(part, time) for part in self.body)), terms
+        flight, rotor, frame, resistance = self.body
+        body = Body(_at(flight, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
+        return body, {name: _at(term, time) for name, term in self.terms.items()}
 
     def _asker(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
         def ask(time: float, state: State) -> tuple:
@@ -156,7 +160,8 @@ class BodySystem:
                 own = np.where(inertia > 0, (states.angular_momentum_body.reshape(n, 3) - carried) / inertia, 0.0)
             omega = own @ self.axes.T - np.einsum("tji,tj->ti", rotation, frame)
         else:
-            rotation, omega = np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
+            engine_rotation = rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
+            omega = np.zeros((n, 3))
         if self.flies:
             position, velocity = states.position.reshape(n, 3), states.velocity.reshape(n, 3)
             if isinstance(self.body.flight, Immersed):
@@ -286,7 +291,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     return system
 
 
-def _at(part: NamedTuple, time: float) -> NamedTuple:
+def _at(part: Part, time: float) -> Part:
     """A part of a body with each of its courses as it goes on from a time."""
     courses = {key: during(value, time) for key, value in part._asdict().items() if isinstance(value, Course)}
     return part._replace(**courses)

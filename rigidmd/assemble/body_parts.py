@@ -14,16 +14,17 @@ from rigidmd.mechanics.rotor import DrivenRotor, split_rotor
 from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
 from rigidmd.scene import BodyScene
 from rigidmd.scene.actions import Timed
+from rigidmd.validation import settled
 
 #: Principal moments from a tensor that differ by less than this fraction of the largest differ by rounding.
 ROUNDING = 1e-13
 
 
-def inertia_of(scene: BodyScene):
+def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Mass, tensor about the centre of mass or pivot, centre of mass from there, points to draw and their names."""
     table_ = scene.body
     centre = np.array(table_.centre_of_mass_m or (0.0, 0.0, 0.0))
-    mass = table_.mass_kg
+    mass = table_.mass_kg or 0.0  # of points it is their sum
     tensor = table_.tensor
     if table_.points is not None:
         masses = np.array([p.mass_kg for p in table_.points])
@@ -38,7 +39,7 @@ def inertia_of(scene: BodyScene):
     else:
         about_centre = np.zeros((3, 3)) if tensor is None else tensor
         if table_.inertia_about == "pivot":
-            about_centre = shifted(tensor, -mass, centre)
+            about_centre = shifted(about_centre, -mass, centre)
         points = _equal_ellipsoid(mass, about_centre)
     if tensor is None:
         tensor = np.zeros((3, 3))
@@ -97,7 +98,7 @@ def carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
             np.array(fluid.added_inertia_kg_m2 or zero),
             fluid.displaced_mass_kg or 0.0,
         )
-    shape = scene.body.solid
+    shape = settled(scene.body.solid)
     half = np.array(shape.semi_axes_m or (shape.radius_m,) * 3)
     return *added_mass_of_ellipsoid(half, fluid.density_kg_m3), fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod()
 
@@ -159,7 +160,8 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
         g = np.array(scene.gravity.acceleration_m_s2)
         terms["gravity"] = SteadyForce(mass * g, where)
         if displaced:
-            at = centre if scene.fluid.centre_of_buoyancy_m is None else np.array(scene.fluid.centre_of_buoyancy_m)
+            buoyed = settled(scene.fluid).centre_of_buoyancy_m
+            at = centre if buoyed is None else np.array(buoyed)
             terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ at)
     if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
         course = _course(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))

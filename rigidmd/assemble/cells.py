@@ -78,7 +78,7 @@ def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     from ase.geometry import minkowski_reduce
 
     own = reduced(cell)
-    other, turn = standard_rotation(minkowski_reduce(cell)[0])
+    other, turn = standard_rotation(np.asarray(minkowski_reduce(cell)[0]))
     other = reduced(other)
     return (other, turn) if np.diag(other).min() > ROOMIER * np.diag(own).min() else (own, np.eye(3))
 
@@ -99,7 +99,7 @@ def pairs_within(
     position: np.ndarray, cell: np.ndarray | None, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs i, j of points (n, 3) within a radius, images in any cell (3, 3) included, and their distances."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     points, owner = position, np.arange(len(position))
     if cell is not None:
@@ -114,5 +114,5 @@ def pairs_within(
             owners.append(np.flatnonzero(((image >= -margin) & (image <= 1 + margin)).all(axis=1)))
             images.append(image[owners[-1]])
         owner, points = np.concatenate(owners), np.concatenate(images) @ cell
-    i, j = cKDTree(points).query_pairs(radius, output_type="ndarray").T
+    i, j = KDTree(points).query_pairs(radius, output_type="ndarray").T
     return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)

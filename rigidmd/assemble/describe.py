@@ -9,20 +9,21 @@ import numpy as np
 from rigidmd.assemble.body import BodySystem, build_body
 from rigidmd.assemble.cells import angles_deg, right_angled
 from rigidmd.assemble.fields import fields_in_words
-from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.stage_words import stage_in_words
 from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.dynamics.body import Body
 from rigidmd.forces.pairs.loop import PairForces
 from rigidmd.forces.pairs.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
-from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.validation import settled
 
 
-def describe(scene: Scene) -> str:
+def describe(scene: MolecularScene | BodyScene) -> str:
     """What a scene would do, in words. Raises as building it does."""
-    if not isinstance(scene, BodyScene):
+    if isinstance(scene, MolecularScene):
         return _molecules(build(scene))
     text = _body(build_body(scene))
     if scene.run.is_open:
@@ -54,7 +55,8 @@ def _body(system: BodySystem) -> str:
         lines.append(f"  starts at phi theta psi = {angles} degrees, turning at {spin:.6g} rad/s{turn}")
     body = system.body
     if isinstance(system.method, Scheme):
-        body = system.engine().model_for(system.method)
+        turned = system.engine().model_for(system.method)
+        body = turned if isinstance(turned, Body) else body
     parts = [body.flight, body.rotor, body.frame, body.resistance]
     lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
     lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.resolve import settled
 from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.coulomb import reaction_field, self_energy
@@ -27,6 +26,7 @@ from rigidmd.forces.waves.errors import (
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
+from rigidmd.validation import settled
 
 #: A sum of charges smaller than this share of the sum of their sizes is rounding.
 NEUTRAL = 1e-10
@@ -41,7 +41,7 @@ class Charged(NamedTuple):
     """The charged sites of a system."""
 
     species: list[Molecule]
-    index: np.ndarray  # (n,) species of each molecule
+    species_index: np.ndarray  # (n,) of each molecule
     frozen: np.ndarray  # (n,)
     chosen: list[np.ndarray]  # charged sites of each species
     sites: BodySites | CentralSites
@@ -50,14 +50,14 @@ class Charged(NamedTuple):
     @property
     def charge_e(self) -> np.ndarray:
         """Charges (s,) in e."""
-        return np.concatenate([self.species[k].charges[self.chosen[k]] for k in self.index])
+        return np.concatenate([self.species[k].charges[self.chosen[k]] for k in self.species_index])
 
     @property
     def summed(self) -> Charges:
         """All charges, as estimates of errors need them."""
         return charges_of(
             [
-                (int((self.index == k).sum()), m.charges[c], m.positions_body[c])
+                (int((self.species_index == k).sum()), m.charges[c], m.positions_body[c])
                 for k, (m, c) in enumerate(zip(self.species, self.chosen, strict=True))
             ]
         )
@@ -66,7 +66,7 @@ class Charged(NamedTuple):
         """Sum over molecules that move of what(charges (s,) in energy units, positions (s, 3)) of one."""
         total = 0.0
         for k, (m, c) in enumerate(zip(self.species, self.chosen, strict=True)):
-            count = int(((self.index == k) & ~self.frozen).sum())
+            count = int(((self.species_index == k) & ~self.frozen).sum())
             total += count * what(m.charges[c] * COULOMB_CHARGE, m.positions_body[c]) if count else 0.0
         return total
 

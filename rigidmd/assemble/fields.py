@@ -20,6 +20,7 @@ from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES, Walls
 from rigidmd.units import KJ_PER_MOL, METRE_PER_S2, VOLT_PER_NM
+from rigidmd.validation import settled
 
 #: The least distance of a lattice's molecules from a Lennard-Jones wall, in sigma: that of its well.
 WELL = (2 / 5) ** (1 / 6)
@@ -91,8 +92,9 @@ def _walls(walls: Walls, k: int, parts: Parts, moves: np.ndarray, faults: list[s
     sites = sites_of(parts.model.species, chosen)
     where = (walls.direction, *walls.positions_A)
     if walls.kind == "harmonic":
-        return HarmonicWalls(*where, walls.stiffness_kJ_mol_A2 * KJ_PER_MOL, sites)
-    return LennardJonesWalls(*where, walls.sigma_A, walls.epsilon_kJ_mol * KJ_PER_MOL, walls.cutoff_A or inf, sites)
+        return HarmonicWalls(*where, settled(walls.stiffness_kJ_mol_A2) * KJ_PER_MOL, sites)
+    sigma, epsilon = settled(walls.sigma_A), settled(walls.epsilon_kJ_mol) * KJ_PER_MOL
+    return LennardJonesWalls(*where, sigma, epsilon, walls.cutoff_A or inf, sites)
 
 
 def _acted_on(walls: Walls, species: list[Molecule], moves: np.ndarray) -> list[np.ndarray]:
@@ -221,14 +223,14 @@ def fields_in_words(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict
     """What each term of the fields is, by its name."""
     fields, words = scene.fields, {}
     if "electric_field" in terms:
-        words["electric_field"] = f"{_vector(fields.electric_V_per_nm)} V/nm"
+        words["electric_field"] = f"{_vector(settled(fields.electric_V_per_nm))} V/nm"
         if fields.electric_frequency_per_ps is not None:
             words["electric_field"] += (
                 f" cos(2 pi f t + {fields.electric_phase_deg:g}°), f = {fields.electric_frequency_per_ps:g}/ps; its "
                 "work is booked"
             )
     if "gravity" in terms:
-        words["gravity"] = f"{_vector(fields.gravity_m_s2)} m/s²"
+        words["gravity"] = f"{_vector(settled(fields.gravity_m_s2))} m/s²"
     for k, walls in enumerate(fields.walls):
         lower, upper = walls.positions_A
         kind = (
@@ -237,15 +239,18 @@ def fields_in_words(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict
             if walls.kind == "lj93"
             else f"harmonic, {walls.stiffness_kJ_mol_A2:g} kJ/mol/Å²"
         )
-        what = "centres of mass" if walls.acts_on == "centres" else f"{len(terms[f'walls_{k}'].sites.molecule)} sites"
+        term = terms[f"walls_{k}"]
+        assert isinstance(term, HarmonicWalls | LennardJonesWalls)
+        what = "centres of mass" if walls.acts_on == "centres" else f"{len(term.sites.molecule)} sites"
         places = [f"{walls.axis} = {x:g} Å" for x in (lower, upper) if abs(x) < inf]
         words[f"walls_{k}"] = f"at {' and '.join(places)}, on {what}: {kind}"
     for k, entry in enumerate(fields.restraints):
         stiffness = sorted(set(entry.stiffness))
         size = f"{stiffness[0]:g}" if len(stiffness) == 1 else _vector(entry.stiffness)
         place = "where they start" if entry.position_A is None else f"at {_vector(entry.position_A)} Å"
-        held = len(terms[f"restraints_{k}"].molecule)
-        words[f"restraints_{k}"] = f"{held} molecules held {place}, {size} kJ/mol/Å²"
+        term = terms[f"restraints_{k}"]
+        assert isinstance(term, Restraints)
+        words[f"restraints_{k}"] = f"{len(term.molecule)} molecules held {place}, {size} kJ/mol/Å²"
     return words
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.atoms import SAME_MASS, Atoms, element_of
 from rigidmd.assemble.cells import pairs_within
-from rigidmd.assemble.structure_files import SAME_MASS, Atoms, element_of
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
 

@@ -6,7 +6,7 @@ the cell of the scene leans so much that another cell of the same lattice stands
 """
 
 from math import inf, pi, sqrt
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from rigidmd.forces.waves.vectors import AS_GIVEN
 from rigidmd.molecules import Molecule
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.forces import Forces
-from rigidmd.scene.molecules import WITH_VELOCITIES, Output, Throughout
+from rigidmd.scene.molecules import WITH_VELOCITIES, Output
 
 CUTOFF = 9.0  # Å, in a periodic box
 ACCURACY = 1e-5  # of Ewald sums
@@ -34,14 +34,6 @@ FORMULATION = "matrix"
 TRAJECTORY_RADIUS = 10.0  # Å, of a body
 #: Largest entry of abs(QᵀQ - 1) of a body: under schemes, which keep it, and under general solvers, which do not.
 ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
-
-T = TypeVar("T")
-
-
-def settled(value: T | None) -> T:
-    """A value of a resolved scene that is never open where it is used."""
-    assert value is not None, "the scene is not resolved"
-    return value
 
 
 class Facts(NamedTuple):
@@ -85,7 +77,7 @@ class Resolved(NamedTuple):
 
 
 def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
-    """A scene of molecules with every number that a run of it uses."""
+    """A scene of molecules with every number that a run of it uses, but for that of `resolve_momentum`."""
     numbers, faults = _range_of_forces(scene.forces, facts)
     grid = None
     if not faults and scene.forces.electrostatics in ("ewald", "pme"):
@@ -93,7 +85,6 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
         numbers |= found
     tables = {
         "forces": scene.forces.model_copy(update=numbers),
-        "run": _throughout(scene),
         "output": _output(scene.output),
         "stages": tuple(stage.resolved for stage in scene.stages),
     }
@@ -103,12 +94,16 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
     return Resolved(scene.model_copy(update=tables), faults, grid)
 
 
-def _throughout(scene: MolecularScene) -> Throughout:
-    interval = scene.run.remove_momentum_interval_ps
-    if interval is None:
-        held = any(species.frozen for species in scene.molecules)
-        interval = REMOVE_MOMENTUM_INTERVAL if scene.forces.electrostatics == "pme" and not held else False
-    return scene.run.model_copy(update={"remove_momentum_interval_ps": interval})
+def resolve_momentum(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
+    """A scene with the time between removals of the total momentum.
+
+    keeps_momentum (3,) : which components of it the terms conserve
+    """
+    if scene.run.remove_momentum_interval_ps is not None:
+        return scene
+    removed = scene.forces.electrostatics == "pme" and keeps_momentum.any()
+    run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
+    return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
 
 
 def _output(output: Output) -> Output:

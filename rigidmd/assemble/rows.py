@@ -12,7 +12,7 @@ from rigidmd.dynamics.baths import Andersen, Langevin, NoseHoover, VelocityResca
 from rigidmd.dynamics.boxes import COUPLINGS, CellRescaling, Pressure, VolumeMoves, piston
 from rigidmd.dynamics.noise import BATH, BOX, key_of
 from rigidmd.dynamics.ramps import Ramp, steady
-from rigidmd.scene.stage import Stage
+from rigidmd.scene.stage import Six, Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
 
 #: Largest change of the volume in a Monte Carlo move, in standard deviations of what it fluctuates by.
@@ -57,9 +57,9 @@ def bath_of(system: System, k: int) -> NamedTuple:
 def box_of(system: System, k: int) -> NamedTuple:
     """The barostat of stage k."""
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BOX, k)
-    first, last = (tuple(value * BAR for value in tensor) for tensor in stage.pressures)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
-    pressure = Pressure(first, last, float(stage.steps))
+    first, last = stage.pressures
+    pressure = Pressure(_scaled(first, BAR), _scaled(last, BAR), float(stage.steps))
     tail = system.tail
     beyond = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
     compressibility, volume = stage.compressibility / BAR, system.state.volume
@@ -73,6 +73,11 @@ def box_of(system: System, k: int) -> NamedTuple:
     at_rest = (1.0, 1.0, 1.0) if stage.keeps_momentum else (0.0, 0.0, 0.0)
     rate = compressibility / stage.barostat_time
     return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], at_rest, beyond, key)
+
+
+def _scaled(tensor: Six, factor: float) -> Six:
+    xx, yy, zz, xy, xz, yz = tensor
+    return xx * factor, yy * factor, zz * factor, xy * factor, xz * factor, yz * factor
 
 
 def _thermal(stage: Stage) -> Ramp:

@@ -17,6 +17,7 @@ from rigidmd.molecules import (
 )
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.species import Molecules
+from rigidmd.validation import settled
 
 
 def species_of(scene: MolecularScene) -> list[Molecule]:
@@ -44,7 +45,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     else:
         table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters))
         sites = entry.sites if entry.file is None else _sites_from_file(scene, entry, table)
-        found = molecule(entry.name or scene.path(entry.file).stem, with_parameters(sites, table))
+        found = molecule(entry.label, with_parameters(settled(sites), table))
     if entry.masses_u is not None:
         found = with_masses(found, entry.masses_u)
     changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
@@ -53,7 +54,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
 
 def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
     """Geometry from the file, everything else from the scene's sites and the table, by atom name or else by element."""
-    path = scene.path(entry.file)
+    path = scene.path(settled(entry.file))
     own = entry.sites or ()
     faults = []
     sites = []

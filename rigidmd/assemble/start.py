@@ -4,7 +4,6 @@ import numpy as np
 
 from rigidmd.assemble.fields import start_lattice
 from rigidmd.assemble.momenta import draw_momenta, mobile, remove_momentum
-from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
 from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
@@ -14,6 +13,7 @@ from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import GRAM_PER_CM3
+from rigidmd.validation import settled
 
 
 def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
@@ -41,11 +41,11 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         if faults:
             raise StructureError(str(path), faults)
         return found
-    counts = [entry.count for entry in scene.molecules]
+    counts = [settled(entry.count) for entry in scene.molecules]
     mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
     cell = scene.box.cell
     if cell is None:
-        cell = np.eye(3) * np.cbrt(mass / (scene.box.density_g_cm3 * GRAM_PER_CM3))
+        cell = np.eye(3) * np.cbrt(mass / (settled(scene.box.density_g_cm3) * GRAM_PER_CM3))
     rng = np.random.default_rng([scene.seed, LATTICE])
     n = sum(counts)
     found = Arrangement(
@@ -76,7 +76,7 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: 
     """Give a state its momenta, in place: those of the structure file, or drawn at a temperature. Returns notes."""
     if scene.structure is not None and scene.structure.velocities:
         state.velocity[:] = arrangement.velocity
-        state.angular_momentum_body[:] = arrangement.angular_momentum_body[: len(state.angular_momentum_body)]
+        state.angular_momentum_body[:] = settled(arrangement.angular_momentum_body)[: len(state.angular_momentum_body)]
         held = ~mobile(model)
         state.velocity[held] = 0.0
         state.angular_momentum_body[held[: len(state.rotation)]] = 0.0

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.atoms import SAME_MASS, Atoms
 from rigidmd.assemble.cells import (
     angles_deg,
     basis_in_words,
@@ -17,12 +18,12 @@ from rigidmd.assemble.cells import (
     standard_rotation,
 )
 from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
-from rigidmd.assemble.structure_files import SAME_MASS, Atoms, read_atoms
+from rigidmd.assemble.structure_files import read_atoms
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.waves.vectors import AS_GIVEN
 from rigidmd.molecules import Molecule
-from rigidmd.validation import meant
+from rigidmd.validation import meant, settled
 
 MOST_NAMED = 5  # how many molecules a message names before it only counts
 ROUNDING = 1e-12  # of the longest edge: what turning a cell leaves
@@ -115,7 +116,8 @@ def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
 
 def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
     """The cell and its molecules beside one another, `repeat` times along each edge."""
-    shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ found.cell
+    cell = settled(found.cell)
+    shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
 
     def tiled(values):
         return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))
@@ -127,7 +129,7 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
         rotation=tiled(found.rotation),
         velocity=tiled(found.velocity),
         angular_momentum_body=tiled(found.angular_momentum_body),
-        cell=found.cell * np.array(repeat)[:, None],
+        cell=cell * np.array(repeat)[:, None],
         notes=(*found.notes, f"its {len(found.species)} molecules stand {' x '.join(map(str, repeat))} times"),
     )
 
@@ -139,12 +141,13 @@ def _read_molecules(
     atoms = read_atoms(path, frame, atom_types)
     notes = list(atoms.notes)
     if atoms.cell is not None:
+        handed = np.linalg.det(atoms.cell)
         cell, turn = standard_rotation(atoms.cell)
         if not np.array_equal(turn, np.eye(3)):
             velocity = None if atoms.velocity is None else atoms.velocity @ turn.T
             atoms = atoms._replace(position=atoms.position @ turn.T, velocity=velocity)
             notes.append("its cell was turned, contents included, so that a is along x and b in the xy plane")
-        if np.linalg.det(atoms.cell) < 0:
+        if handed < 0:
             notes.append("its cell is left-handed: -c stands for c, which leaves the lattice as it is")
         if right_angled(cell):
             upright = np.diag(np.linalg.norm(cell, axis=1))
@@ -253,7 +256,7 @@ def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: lis
     """
     if atoms.velocity is None:
         return None, None
-    without = np.isnan(atoms.velocity).any(axis=1)
+    without = np.array(np.isnan(atoms.velocity).any(axis=1))
     if lost := sorted(i for run in matched.atoms for i in run[without[run]]):
         notes.append(f"{len(lost)} of its atoms have no velocity (the first is atom {lost[0] + 1}): none is used")
         return None, None
@@ -276,13 +279,13 @@ def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: lis
 
 def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
     """A guess at the units, where atoms are as close to one another as those of molecules in other units than Å."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
     from scipy.spatial.distance import pdist
 
     bonds = [pdist(m.positions_body[massive(m)]).min() for m in species if len(massive(m)) > 1]
     if not bonds or len(atoms.position) < 2:
         return []
-    nearest = float(np.median(cKDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
+    nearest = float(np.median(KDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
     found = [
         f"the coordinates seem to be in {unit}, not in Å as this format has them: atoms are {nearest:.3g} apart"
         for unit, angstrom in OTHER_UNITS.items()

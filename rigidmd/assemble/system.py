@@ -10,7 +10,7 @@ import numpy as np
 from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_terms, fields_left_out
 from rigidmd.assemble.momenta import Freedom, freedom_of, kept_momentum, mobile
 from rigidmd.assemble.overlaps import overlaps
-from rigidmd.assemble.resolve import Facts, resolve
+from rigidmd.assemble.resolve import Facts, resolve, resolve_momentum
 from rigidmd.assemble.species import frozen_apart, species_of
 from rigidmd.assemble.stage_words import stage_notes
 from rigidmd.assemble.start import arrange, residue_numbers, set_momenta
@@ -152,9 +152,7 @@ def build(scene: MolecularScene) -> System:
     acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
     acting.terms.update(field_terms(scene, Parts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
     model = model._replace(keeps_momentum=kept_momentum(model, acting.terms))
-    if not model.keeps_momentum.any():
-        never = scene.run.model_copy(update={"remove_momentum_interval_ps": False})
-        scene = scene.model_copy(update={"run": never})
+    scene = resolve_momentum(scene, model.keeps_momentum)
     system = System(
         scene=scene,
         species=species,

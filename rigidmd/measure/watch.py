@@ -11,7 +11,6 @@ import numpy as np
 
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.overlaps import OVERLAP, close_pairs
-from rigidmd.assemble.resolve import settled
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
@@ -26,6 +25,7 @@ from rigidmd.molecules import Molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.watch import BodyWatch, Watch
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+from rigidmd.validation import settled
 
 #: Opposite charges that no repulsion of their own keeps apart, closer than this fraction of the smallest diameter, are
 #: on one another: the hydrogen of a hydrogen bond stays at half of it. Of molecules without any repulsion, all of it.

@@ -5,6 +5,7 @@ and roll in the sequence 3-2-1, attitude matrices. Angles are in rad.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 def random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -24,11 +25,11 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def direction(vector: np.ndarray) -> np.ndarray:
+def direction(vector: ArrayLike) -> np.ndarray:
     """Unit vector along a non-zero vector (k,) of any length, without overflow or underflow."""
-    vector = np.asarray(vector, dtype=float)
-    vector = vector / np.abs(vector).max()
-    return vector / np.linalg.norm(vector)
+    given = np.asarray(vector, dtype=float)
+    scaled = given / np.abs(given).max()
+    return scaled / np.linalg.norm(scaled)
 
 
 def to_quaternion(rotation: np.ndarray) -> np.ndarray:

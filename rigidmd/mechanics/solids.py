@@ -9,6 +9,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class Solid(NamedTuple):
@@ -87,7 +88,7 @@ def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[flo
     return Solid(spread[[1, 2, 0]] + spread[[2, 0, 1]], unit.outline * stretch)
 
 
-def added_mass_of_ellipsoid(semi_axes: Sequence[float], density: float) -> tuple[np.ndarray, np.ndarray]:
+def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.ndarray, np.ndarray]:
     """Added mass (3,) and added inertia (3,) along and about the axes of an ellipsoid in an ideal fluid at rest.
 
     semi_axes (3,), all positive; density of the fluid. H. Lamb, Hydrodynamics (6th ed. 1932), art. 114-115, with

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
-from rigidmd.assemble.resolve import settled
 from rigidmd.core.state import NOW
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
@@ -23,6 +22,7 @@ from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.results import Results
 from rigidmd.scene import BodyScene
+from rigidmd.validation import settled
 
 
 class BodySimulation(Simulation):

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.assemble.resolve import settled
 from rigidmd.forces.body.frame import Inertial
 from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
 from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
@@ -14,6 +13,7 @@ from rigidmd.output.folder import MOTION, MOTION_NPZ
 from rigidmd.output.motion_file import write_csv, write_npz
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
+from rigidmd.validation import settled
 
 if TYPE_CHECKING:
     from rigidmd.assemble.body import BodySystem

@@ -1,0 +1,227 @@
+"""Structure files read through ASE, and what it needs before or after for .pdb, .xyz and LAMMPS data."""
+
+import io
+import re
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
+from rigidmd.errors import StructureError
+
+if TYPE_CHECKING:
+    from ase import Atoms as AseAtoms
+
+# ASE's velocity unit (Å sqrt(u/eV)) in Å/ps.
+ASE_VELOCITY = 98.22694788464063
+#: A column of velocities in extended XYZ that ASE keeps as it stands: programs differ in its units.
+UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
+
+
+def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list[AseAtoms]":
+    """ASE's structures in a file or in text."""
+    import ase.io.formats
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
+    except ase.io.formats.UnknownFileTypeError:
+        raise StructureError(
+            str(path), ["its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"]
+        ) from None
+    except Exception as error:  # ASE's readers raise whatever their parsing trips over, ImportError to IndexError
+        raise StructureError(str(path), [f"ASE cannot read it: {type(error).__name__}: {error}"]) from None
+    return [atoms for atoms in found if len(atoms)]
+
+
+def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=None, notes=()) -> Atoms:
+    """ASE's atoms in our units; names and elements as given, else by ASE's symbols."""
+    symbols = atoms.get_chemical_symbols()
+    notes = list(notes)
+    if any(share < 1 for site in atoms.info.get("occupancy", {}).values() for share in site.values()):
+        shares = sorted({f"{e} {s:g}" for site in atoms.info["occupancy"].values() for e, s in site.items() if s < 1})
+        raise StructureError(
+            str(path),
+            [
+                f"some of its sites are occupied only partly ({', '.join(shares)}): the crystal is disordered, and "
+                "where the molecules are is open. Give one arrangement of it, in which every site is occupied or left "
+                "out (for ices, GenIce makes proton-disordered ones)"
+            ],
+        )
+    velocity = atoms.get_velocities() * ASE_VELOCITY if atoms.has("momenta") else None
+    if velocity is not None and not np.isfinite(velocity).all():
+        bad = int(np.argmin(np.isfinite(velocity).all(axis=1)))
+        raise StructureError(str(path), [f"atom {bad + 1} has a velocity that is not a finite number"])
+    if unitless := [key for key in UNITLESS_VELOCITIES if key in atoms.arrays]:
+        notes.append(f"the column {unitless[0]} does not say its units and is not used (ASE writes momenta instead)")
+    cell = None
+    if atoms.pbc.all():
+        cell = atoms.cell.array.copy()
+    elif atoms.pbc.any():
+        axes = ", ".join(x for x, periodic in zip("abc", atoms.pbc, strict=True) if periodic)
+        notes.append(f"its cell is periodic along {axes} only and is not used")
+    return Atoms(
+        symbols if names is None else names,
+        symbols if elements is None else elements,
+        [()] * len(atoms) if residue is None else residue,
+        atoms.get_positions(),
+        velocity,
+        cell,
+        masses,
+        notes,
+    )
+
+
+def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The models of a .pdb, each with the last CRYST1 before it (which ASE forgets from model to model)."""
+    models, cryst, body = [], [], []
+    for number, line in enumerate([*lines, "END"], 1):
+        if line.startswith("CRYST1"):
+            if len(line[6:54].split()) < 6:
+                raise StructureError(
+                    str(path), [f"line {number}: CRYST1 needs three edges and three angles, found {line[6:].strip()!r}"]
+                )
+            cryst = [line]
+        elif line.startswith(("ATOM", "HETATM")):
+            body.append(line)
+        elif line.startswith("ORIGX"):
+            cryst = [*cryst, line]
+        elif line.startswith("END") and body:
+            models.append(partial(_pdb_model, path, cryst, body))
+            body = []
+    return models
+
+
+def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
+    """One model through ASE, its lines made what ASE expects: some element in each, residues counted."""
+    if len(places := {line[16:17] for line in body} - {"", " "}) > 1:
+        raise StructureError(str(path), [f"has alternate locations {', '.join(sorted(places))}; keep one of them"])
+    names, elements, residue, lines = [], [], [], []
+    count, last = 0, None
+    for line in body:
+        symbol = line[76:78].strip().capitalize()
+        names.append(line[12:16].strip())
+        elements.append(symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
+        if (here := line[17:27]) != last:  # name, chain, number and insertion code: numbers alone wrap or run out
+            count, last = count + 1, here
+        number = line[22:26].strip()
+        residue.append((int(number) if number.isdecimal() else None, line[17:21].strip(), count))
+        lines.append(f"{line[:22]:22}{count % 10000:4d}{line[26:76]:50} X")
+    found = read_by_ase(path, io.StringIO("\n".join([*head, *lines]) + "\n"), format="proteindatabank")
+    if count == 1 and not residue[0][1]:
+        residue = [()] * len(names)
+    return from_ase(path, found[0], names, elements, residue)
+
+
+def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The frames of a plain or extended .xyz through ASE, which wants elements where files often have names."""
+    labels, at = [], 0
+    while at < len(lines) and lines[at].strip():
+        count = lines[at].strip()
+        if not count.isdigit() or at + 2 + int(count) > len(lines):
+            break  # ASE says what is wrong with it
+        properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
+        column = _species_column(properties.group(1)) if properties else 0
+        for k in range(at + 2, at + 2 + int(count)):
+            words = lines[k].split()
+            if column is None or len(words) <= column:
+                labels.append(None)
+                continue
+            name = words[column]
+            symbol = name.capitalize()
+            labels.append((name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""))
+            words[column] = symbol if is_element(symbol) else "H" if symbol in HEAVY_HYDROGEN else "X"
+            lines[k] = " ".join(words)
+        at += 2 + int(count)
+    frames, first = [], 0
+    for atoms in read_by_ase(path, io.StringIO("\n".join(lines) + "\n"), format="extxyz"):
+        own = labels[first : first + len(atoms)]
+        first += len(atoms)
+        named = len(own) == len(atoms) and None not in own
+        names, elements = map(list, zip(*own, strict=True)) if named else (None, None)
+        frames.append(partial(from_ase, path, atoms, names, elements))
+    return frames
+
+
+def _species_column(properties: str) -> int | None:
+    """Which column holds the species: `species:S:1:pos:R:3` says 0; None if no column does."""
+    words, column = properties.split(":"), 0
+    for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
+        if name.lower() in ("species", "symbols"):
+            return column
+        column += int(width) if width.isdigit() else 1
+    return None
+
+
+def read_lammps(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
+    """LAMMPS data through ASE. Its first line may say the units; real and metal differ in velocities only."""
+    text = "\n".join(lines) + "\n"
+    listed, labels = _lammps_types(lines)
+    if not listed and not labels and atom_types is None and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
+        fault = "has no section Masses, from which its atom types could be told: name them by structure.atom_types"
+        raise StructureError(str(path), [fault])
+    units = re.search(r"\bunits\s*=?\s*(real|metal|si|cgs|electron)\b", text.split("\n", 1)[0])
+    try:
+        found = read_by_ase(path, io.StringIO(text), format="lammps-data", units=units.group(1) if units else "metal")
+    except StructureError:
+        if re.search(r"^\s*0\s+atoms\b", text, re.MULTILINE):
+            return []
+        raise
+    return [partial(_lammps_atoms, path, atoms, listed, labels, atom_types, units is not None) for atoms in found]
+
+
+def _lammps_types(lines: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Of LAMMPS data the atom types in the section Masses, and what labels, or words after masses, call types."""
+    listed, labels, words, section = [], {}, {}, ""
+    for line in lines[1:]:
+        data, _, comment = line.partition("#")
+        fields = data.split()
+        if fields and all(field.isalpha() for field in fields):
+            section = " ".join(fields)
+        elif len(fields) == 2 and section == "Masses":
+            listed.append(fields[0])
+            if len(comment.split()) == 1:
+                words[fields[0]] = comment.strip()
+        elif len(fields) == 2 and section == "Atom Type Labels":
+            labels[fields[0]] = fields[1]
+    return listed, words | labels
+
+
+def _lammps_atoms(
+    path: Path, atoms, listed: list[str], labels: dict[str, str], atom_types: dict[str, str] | None, units_known: bool
+) -> Atoms:
+    """Types as names, by what the scene or else the file calls them; molecules as residues."""
+    types = [str(t) for t in atoms.arrays["type"]]
+    if atom_types is not None:
+        present = sorted({*types, *listed}, key=int)
+        unknown, unnamed = [t for t in atom_types if t not in present], [t for t in present if t not in atom_types]
+        faults = []
+        if unknown:
+            faults.append(
+                f"structure.atom_types: there is no type {', '.join(unknown)}; there are {', '.join(present)}"
+            )
+        if unnamed:
+            faults.append(f"structure.atom_types does not say what type {', '.join(unnamed)} is")
+        if faults:
+            raise StructureError(str(path), faults)
+    names = labels if atom_types is None else atom_types
+    masses = atoms.get_masses() if listed else None
+    of_type = {} if masses is None else dict(zip(types, masses.tolist(), strict=True))
+    element = {t: element_of_mass(mass) for t, mass in of_type.items()}
+    result = from_ase(
+        path,
+        atoms,
+        [names.get(t, t) for t in types],
+        [element.get(t, "") for t in types],
+        [(int(n), "") for n in atoms.arrays["mol-id"]] if "mol-id" in atoms.arrays else None,
+        masses,
+    )
+    if result.velocity is not None and not units_known:
+        result.notes.append("its first line does not say its units ('units = real'): its velocities are not used")
+        return result._replace(velocity=None)
+    return result

@@ -1,0 +1,153 @@
+"""Readers of the formats that ASE does not read well enough.
+
+These are .gro (more digits, several frames, velocities of some atoms: ASE takes none of them), Tinker's .arc and .txyz
+(ASE has none, MDAnalysis keeps single precision) and .cssr (neither has one).
+"""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.assemble.atoms import Atoms
+from rigidmd.errors import StructureError
+
+
+def _numbers(path: Path, number: int, words: list[str], what: str) -> list[float]:
+    """Words of a line as numbers. Raises StructureError with the line and what should stand there."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise StructureError(str(path), [f"line {number}: expected {what}, found {' '.join(words)[:60]!r}"]) from None
+
+
+def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The frames of a .gro: title, number of atoms, atoms, box; once or more."""
+    while lines and not lines[-1].strip():
+        lines.pop()
+    frames, first = [], 0
+    while first < len(lines):
+        promised = lines[first + 1].strip() if first + 1 < len(lines) else ""
+        if not promised.isdigit():
+            raise StructureError(
+                str(path), [f"line {first + 2}: expected the number of atoms, found {promised[:60]!r}"]
+            )
+        box = first + 2 + int(promised)
+        if box >= len(lines):
+            there = max(0, len(lines) - first - 3)
+            raise StructureError(
+                str(path), [f"line {first + 2} promises {promised} atoms and a box, {there} are there: truncated?"]
+            )
+        what = "the box, 3 or 9 numbers (is the number of atoms right?)"
+        edges = _numbers(path, box + 1, lines[box].split(), what)
+        if len(edges) not in (3, 9):
+            raise StructureError(str(path), [f"line {box + 1}: expected {what}, found {lines[box].strip()!r}"])
+        frames.append(partial(_gro_frame, path, lines, first, box, edges))
+        first = box + 1
+    return frames
+
+
+def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[float]) -> Atoms:
+    """Lines `first` to `box`. Columns are as wide as the decimal points of the first atom are apart, as in GROMACS."""
+    names, residue = [], []
+    position, velocity = np.zeros((box - first - 2, 3)), np.full((box - first - 2, 3), np.nan)
+    points = [m.start() for m in re.finditer(r"\.", lines[first + 2][20:])] if box > first + 2 else []
+    width = points[1] - points[0] if len(points) > 1 else 8
+    cuts = list(pairwise(range(20, 21 + 6 * width, width)))
+    for k in range(first + 2, box):
+        line = lines[k]
+        values = [line[a:b].strip() for a, b in cuts]
+        what = f"an atom of a .gro with coordinates in columns of {width} (is the number of atoms right?)"
+        position[k - first - 2] = _numbers(path, k + 1, values[:3], what)
+        given = [v for v in values[3:] if v]
+        if len(given) == 3:
+            found = _numbers(path, k + 1, given, "three velocities")
+            if not np.isfinite(found).all():
+                raise StructureError(
+                    str(path), [f"line {k + 1}: atom {k - first - 1} has a velocity that is not a finite number"]
+                )
+            velocity[k - first - 2] = found
+        names.append(line[10:15].strip())
+        number = line[:5].strip()
+        residue.append((int(number) if number.isdecimal() else None, line[5:10].strip()))
+    xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
+    cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
+    return Atoms(
+        names,
+        [""] * len(names),
+        residue,
+        10 * position,
+        None if np.isnan(velocity).all() else 10 * velocity,
+        cell,
+        None,
+        [],
+    )
+
+
+def read_arc(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The frames of Tinker's .arc or .txyz: number and title, edges and angles if periodic, atoms."""
+    lines = [line for line in lines if line.strip()]
+    frames, first = [], 0
+    while first < len(lines):
+        count = lines[first].split()[0]
+        if not count.isdigit():
+            raise StructureError(str(path), [f"frame {len(frames) + 1}: expected the number of atoms, found {count!r}"])
+        periodic = first + 1 < len(lines) and len(lines[first + 1].split()) == 6 and "." in lines[first + 1].split()[0]
+        start = first + 1 + periodic
+        end = start + int(count)
+        if end > len(lines):
+            raise StructureError(
+                str(path), [f"promises {count} atoms, {max(0, len(lines) - start)} are there: truncated?"]
+            )
+        frames.append(partial(_arc_frame, path, lines[first + 1] if periodic else "", lines[start:end], start + 1))
+        first = end
+    return frames
+
+
+def _arc_frame(path: Path, box: str, lines: list[str], first: int) -> Atoms:
+    """The atoms from line `first` on."""
+    cell = _cell(_numbers(path, first - 1, box.split(), "three edges and three angles")) if box else None
+    names, position = _columns(path, lines, first, "an atom of Tinker's format: number, name, x, y, z, type, bonds")
+    return Atoms(names, [""] * len(names), [()] * len(names), position, None, cell, None, [])
+
+
+def _columns(path: Path, lines: list[str], first: int, what: str) -> tuple[list[str], np.ndarray]:
+    """Names and positions (n, 3) in the columns after the first of lines from number `first` on."""
+    rows = [line.split() for line in lines]
+    position = [_numbers(path, first + k, [*row[2:5], *[""] * (5 - len(row))], what) for k, row in enumerate(rows)]
+    return [row[1] for row in rows], np.reshape(position, (-1, 3))
+
+
+def read_cssr(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """Cambridge Structure Search and Retrieval: edges, angles, how many atoms in which coordinates, title, atoms."""
+    return [partial(_cssr_atoms, path, lines)]
+
+
+def _cssr_atoms(path: Path, lines: list[str]) -> Atoms:
+    if len(lines) < 4:
+        raise StructureError(str(path), ["is too short for a .cssr: truncated?"])
+    edges, angles = (re.findall(r"\d+\.\d*", line)[:3] for line in lines[:2])
+    what = "the edges and angles of the cell in the first two lines"
+    if len(edges) < 3 or len(angles) < 3:
+        raise StructureError(str(path), [f"expected {what}"])
+    if re.search(r"SPGR\s*=\s*(?!1?\s*P\s*1\s*$)\S", lines[1]):
+        raise StructureError(str(path), [f"has the space group {lines[1].split('=')[-1].strip()}; only P1 is read"])
+    cell = _cell(_numbers(path, 1, [*edges, *angles], what))
+    head = [word for word in lines[2].split() if word.isdigit()]
+    if not head or len(lines) < 4 + int(head[0]):
+        raise StructureError(
+            str(path), [f"line 3 promises {head[0] if head else 'no'} atoms, {len(lines) - 4} are there: truncated?"]
+        )
+    names, position = _columns(path, lines[4 : 4 + int(head[0])], 5, "an atom of a .cssr: number, name, x, y, z")
+    if head[1:2] != ["1"]:
+        position = position @ cell
+    return Atoms(names, [""] * len(names), [()] * len(names), position, None, cell, None, [])
+
+
+def _cell(edges_and_angles: list[float]) -> np.ndarray:
+    from ase.geometry import cellpar_to_cell
+
+    return cellpar_to_cell(edges_and_angles)
