@@ -17,7 +17,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher
 
-from rigidmd.compile import Code, call, call_blocks, kernel, opened, packed, task
+from rigidmd.compile import Code, call, call_blocks, kernel, numba_private, opened, packed, task
 from rigidmd.compile.cache import cache_folder
 from rigidmd.compile.numba_private import Index, Inner, Kernel, callback
 
@@ -32,12 +32,6 @@ def doubled(x):
 @kernel
 def _twice(x):
     return x + x
-
-
-@kernel(outer=True, counted=False)
-def first_of(values):
-    part = values[1:]
-    return part[0]
 
 
 def test_a_cache_takes_its_folder_from_the_configuration_when_it_is_made():
@@ -65,22 +59,47 @@ def test_a_dispatcher_opens_its_cache_only_to_compile():
     assert "_opened" not in vars(unused)
 
 
+@pytest.fixture
+def empty_cache(tmp_path, monkeypatch):
+    """Kernels that a test defines are compiled in it: Numba does not show code that comes from the cache."""
+    monkeypatch.setattr(numba_private, "cache_folder", lambda: str(tmp_path))
+
+
+def llvm_of(dispatcher):
+    (compiled,) = dispatcher.overloads.values()
+    return compiled.library.get_llvm_str()
+
+
+@pytest.mark.usefixtures("empty_cache")
 def test_an_inner_kernel_has_no_wrapper_and_says_so():
-    assert type(_twice) is Inner
-    with pytest.raises(TypeError, match=r"_twice is for compiled code only; for Python, use kernel\(outer=True\)"):
-        _twice(2.0)
-    doubled(1.0)
-    _twice.compile((types.float64,))
+    @kernel
+    def inner(x):
+        return x + x
 
-    def has_wrapper(dispatcher):
-        return ["cpython" in found.library.get_llvm_str() for found in dispatcher.overloads.values()]
+    @kernel(outer=True)
+    def outer(x):
+        return x + x
 
-    assert not any(has_wrapper(_twice)) and all(has_wrapper(doubled))
+    assert type(inner) is Inner
+    with pytest.raises(TypeError, match=r"inner is for compiled code only; for Python, use kernel\(outer=True\)"):
+        inner(2.0)
+    inner.compile((types.float64,))
+    outer(2.0)
+    assert "cpython" not in llvm_of(inner) and "cpython" in llvm_of(outer)
 
 
-def test_references_are_not_counted_where_it_is_asked_for():
-    assert first_of(np.arange(3.0)) == 1.0
-    assert not any("NRT_incref" in str(o.library.get_llvm_str()) for o in first_of.overloads.values())
+@pytest.mark.usefixtures("empty_cache")
+@pytest.mark.parametrize("counted", [True, False])
+def test_references_are_not_counted_where_it_is_asked_for(counted):
+    @kernel(outer=True, counted=counted)
+    def after(values, count):
+        part = values
+        for _ in range(count):
+            part = part[1:]
+        return part[0]
+
+    assert after(np.arange(3.0), 2) == 2.0
+    assert ("call void @NRT_" in llvm_of(after)) == counted
 
 
 def test_a_callback_is_compiled_for_given_types_and_cached():

@@ -22,11 +22,11 @@ from rigidmd.compile.cache import cache_folder
 
 
 class Index(IndexDataCacheFile):
-    """Index of a cache: compiled functions by types of arguments. It counts as empty if it cannot be read.
+    """Index of a cache: compiled functions by the types of their arguments.
 
-    That is so if a type belongs to a module that is absent, such as a user's own term: another program could otherwise
-    not read the index. The files of machine code have random names. Numba numbers them, and two processes that compile
-    at the same time for different types would write to the same number; every later run then crashed.
+    An index with a type from a module that cannot be imported, for example a user's own term, counts as empty, so that
+    other programs can still use the cache. The files of machine code have random names: Numba numbers them, and two
+    processes that compiled at the same time for different types wrote to the same file, after which every run crashed.
     """
 
     def _data_name(self, number):

@@ -276,18 +276,22 @@ def _few(spline, array, index):
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def weights_at(spline, part):
     """Weights of the grid points from the corner on, as a vector."""
-    return _polynomials(spline, spline.value, len(spline.nodes), part)
+    return _polynomials(spline, spline.value, spline.nodes, part)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
 def slopes_at(spline, part):
     """Derivatives of these weights, per grid cell."""
-    return _polynomials(spline, spline.slope, len(spline.nodes) - 1, part)
+    return _polynomials(spline, spline.slope, spline.nodes[1:], part)
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
-def _polynomials(spline, coefficients, terms, part):
-    """Polynomials in `part`, one in each lane; coefficients (terms width,) in ascending order."""
+def _polynomials(spline, coefficients, powers, part):
+    """Polynomials in `part`, one in each lane, from coefficients (powers width,).
+
+    powers : a tuple, whose length is a constant at compile time, so that the loop is unrolled
+    """
+    terms = len(powers)
     width = len(coefficients) // terms
     found = few(spline, coefficients, width * (terms - 1))
     for j in range(terms - 2, -1, -1):
