@@ -34,7 +34,7 @@ def row(system: System, k: int) -> Scheme:
         found = found.with_box(box_of(system, k), every)
     elif stage.ensemble == "nph":
         found = found.with_piston(box_of(system, k))
-    if stage.keeps_momentum and (interval := scene.removes_momentum_every) is not None:
+    if stage.keeps_momentum and (interval := system.removes_momentum_every) is not None:
         found = found.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
     return found
 
@@ -70,7 +70,8 @@ def box_of(system: System, k: int) -> NamedTuple:
         return VolumeMoves(
             _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), beyond, key
         )
-    at_rest = (1.0, 1.0, 1.0) if stage.keeps_momentum else (0.0, 0.0, 0.0)
+    kept = system.model.keeps_momentum if stage.keeps_momentum else (False, False, False)
+    at_rest = tuple(float(axis) for axis in kept)
     rate = compressibility / stage.barostat_time
     return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], at_rest, beyond, key)
 

@@ -32,9 +32,7 @@ class Sample(NamedTuple):
     drift: Annotated[float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")]
     momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]
     orthogonality: Annotated[float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")]
-    conserved: Annotated[
-        float, Column("", "kJ/mol", "energy less what thermostat, drive and removal of momentum have put in")
-    ]
+    conserved: Annotated[float, Column("", "kJ/mol", "energy less what baths, drives, removal of momentum have put in")]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
 
 
