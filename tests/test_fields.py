@@ -265,7 +265,7 @@ def slit(fields, **sections):
 
 
 def test_a_run_of_waters_between_walls_keeps_its_energy_and_the_momentum_along_them():
-    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}, {"duration_ps": 2.0, "timestep_fs": 1.0}]
+    stages = [{"duration_ps": 1.0, "timestep_fs": 1.0}, {"duration_ps": 2.0, "timestep_fs": 1.0}]
     oscillating = {"electric_V_per_nm": [0.2, 0.0, 1.0], "electric_frequency_per_ps": 3.0}
     results = Simulation(slit(oscillating, stages=stages)).run()
     stage = results.summary["stages"][1]
@@ -505,11 +505,15 @@ def test_gravity_may_fall_where_something_stops_it():
 
 def test_fields_that_are_tied_to_places_say_so():
     def scene(fields):
-        return small_scene({"spce": 4}, 30.0, fields=fields)
+        return small_scene({"spce": 4}, 36.0, fields=fields)
 
     assert scene({"walls": [LJ]}).fields.holds_in_place
     assert scene({"restraints": [HELD]}).fields.holds_in_place
+    assert scene({"gravity_m_s2": [0.0, 0.0, -1.0], "walls": [LJ]}).fields.holds_in_place
     assert not scene(OSCILLATING).fields.holds_in_place
+    assert build(scene(OSCILLATING)).tied_to_places == []
+    assert alone({"kite": 1, "etik": 1}, STEADY)[0].tied_to_places == ["electric_field"]
+    assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).tied_to_places == ["walls_0", "restraints_0"]
     assert not build(scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})).external  # a sweep may pass through nothing
 
 

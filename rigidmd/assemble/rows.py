@@ -70,7 +70,8 @@ def box_of(system: System, k: int) -> NamedTuple:
         return VolumeMoves(
             _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), beyond, key
         )
-    at_rest = (1.0, 1.0, 1.0) if stage.keeps_momentum else (0.0, 0.0, 0.0)
+    kept = system.model.keeps_momentum if stage.keeps_momentum else (False, False, False)
+    at_rest = tuple(float(axis) for axis in kept)
     rate = compressibility / stage.barostat_time
     return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], at_rest, beyond, key)
 

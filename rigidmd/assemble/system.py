@@ -75,6 +75,12 @@ class System:
         return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
 
     @property
+    def tied_to_places(self) -> list[str]:
+        """Names of the terms whose energy depends on where in the lab molecules are: none can follow a box that
+        changes its size. A field on molecules without a net charge is not among them."""
+        return [name for name in self.external if self.terms[name].tied_to_places]
+
+    @property
     def removes_momentum_every(self) -> float | None:
         """Time between removals of the total momentum, ps; None for never."""
         return self.scene.run.remove_momentum_interval_ps or None

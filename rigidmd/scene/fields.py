@@ -136,8 +136,9 @@ class Fields(Section):
 
     @property
     def holds_in_place(self) -> bool:
-        """Whether walls or restraints stand at places in the lab, which do not follow a box that changes its size."""
-        return bool(self.walls or self.restraints)
+        """Whether energies depend on where in the lab molecules are: by walls, restraints and gravity. They do not
+        follow a box that changes its size. (So do those of charges in a field: see `System.tied_to_places`.)"""
+        return bool(self.walls or self.restraints or any(self.gravity_m_s2 or ()))
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Between which positions walls perpendicular to an axis leave molecules, Å; None where there are none."""

@@ -40,6 +40,11 @@ class ElectricField(NamedTuple):
         cancels = abs(charge.sum()) <= 1e-10 * np.abs(charge).sum()
         return np.zeros(3, bool) if cancels else self.field != 0
 
+    @property
+    def tied_to_places(self) -> bool:
+        """Whether its energy depends on where in the lab molecules are: if any has a net charge."""
+        return bool(self.charge[self.species].any())
+
 
 class OscillatingField(NamedTuple):
     """A uniform field E0 cos(frequency t + phase), t the time of the state."""
@@ -53,6 +58,7 @@ class OscillatingField(NamedTuple):
 
     drives = True
     changes_momentum = ElectricField.changes_momentum
+    tied_to_places = ElectricField.tied_to_places
 
 
 @implements(add_forces)

@@ -16,6 +16,8 @@ class Weight(NamedTuple):
     mass: np.ndarray  # (species,) u; 0 of what is frozen
     acceleration: np.ndarray  # (3,) lab frame, Å/ps²
 
+    tied_to_places = True
+
     @property
     def changes_momentum(self) -> np.ndarray:
         """Components (3,) of the total momentum that it changes."""

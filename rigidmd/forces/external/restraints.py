@@ -19,6 +19,8 @@ class Restraints(NamedTuple):
     place: np.ndarray  # (r, 3) lab frame, Å
     stiffness: np.ndarray  # (3,) along x, y, z, u/ps²
 
+    tied_to_places = True
+
     @property
     def changes_momentum(self) -> np.ndarray:
         """Components (3,) of the total momentum that they change."""

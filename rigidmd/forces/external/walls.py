@@ -31,6 +31,8 @@ class LennardJonesWalls(NamedTuple):
     cutoff: float  # Å; inf for none
     sites: BodySites | CentralSites
 
+    tied_to_places = True
+
     @property
     def changes_momentum(self) -> np.ndarray:
         """Components (3,) of the total momentum that they change: the one across them."""
@@ -60,6 +62,7 @@ class HarmonicWalls(NamedTuple):
     sites: BodySites | CentralSites
 
     changes_momentum = LennardJonesWalls.changes_momentum
+    tied_to_places = True
 
 
 class Behind(NamedTuple):
