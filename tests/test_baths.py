@@ -147,10 +147,8 @@ def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermost
     stage = {"ensemble": "nvt", "temperature_K": [300.0, 310.0], "thermostat": thermostat, "duration_ps": 0.02}
     scene = small_scene({"spce": 1000}, 32.0, stages=[stage], output={"trajectory": False})
     before = numba.get_num_threads()
-    found = []
     try:
-        for threads in (1, before):
-            found.append(Simulation(scene.model_copy(update={"threads": threads})).run().state)
+        found = [Simulation(scene.model_copy(update={"threads": k})).run().state for k in (1, before)]
     finally:
         numba.set_num_threads(before)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*found, strict=True))

@@ -149,7 +149,7 @@ def prepared(system, engine, box, before, after, room, h):
     return log_chance(box, system.model, after, room, h)
 
 
-def gas(count, pressure_of, thermostat, box_for):
+def gas(count, thermostat, box_for):
     """Volumes of an ideal gas in units of kT/p, every 40 steps."""
     site = {"name": "A", "element": "Ar", "sigma_A": 0.005, "epsilon_kJ_mol": 1e-6, "mass_u": 40.0,
             "position_A": [0.0, 0.0, 0.0]}  # fmt: skip
@@ -184,11 +184,9 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
         if barostat == "monte_carlo":
             return VolumeMoves(steady(THERMAL), asked, 600.0, float(n), (0.0, 0.0), key)
         at_rest = (1.0,) * 3 if thermostat == "velocity_rescaling" else (0.0,) * 3
-        return CellRescaling(
-            steady(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key
-        )
+        return CellRescaling(steady(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key)
 
-    volumes, moves = gas(n, None, thermostat, box_for)
+    volumes, moves = gas(n, thermostat, box_for)
     assert 0.2 < moves[1] / moves[0] < 0.99  # what is rejected matters
     blocks = volumes.reshape(30, -1).mean(axis=1)
     error = blocks.std(ddof=1) / np.sqrt(len(blocks))
@@ -200,7 +198,7 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
 
 
 def test_a_rejected_move_leaves_no_trace(liquid):
-    system, engine, state = liquid
+    system, _, state = liquid
     dear = CellRescaling(
         steady(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * box_of(system, 0).rate,
         COUPLINGS["flexible"], (1.0, 1.0, 1.0), (0.0, 0.0), key_of(1, BOX),
@@ -269,10 +267,9 @@ def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
     own = {key: value for key, value in (NPT | {"duration_ps": 0.02} | stage).items() if value is not None}
     own |= {} if own["ensemble"] == "nph" else {"barostat_interval_ps": 0.006}
     scene = small_scene({"spce": 800}, 30.0, stages=[own], output=QUIET)
-    before, found = numba.get_num_threads(), []
+    before = numba.get_num_threads()
     try:
-        for threads in (1, before):
-            found.append(Simulation(scene.model_copy(update={"threads": threads})).run().state)
+        found = [Simulation(scene.model_copy(update={"threads": k})).run().state for k in (1, before)]
     finally:
         numba.set_num_threads(before)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*found, strict=True))
