@@ -104,7 +104,7 @@ def liquid():
     """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
     system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
         "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
-    relieve(engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    relieve(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
     move(engine, state, BAOAB.with_bath(Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, BATH))), 0.001, 500)
     return system, state._replace(books=np.zeros(3))
 

@@ -61,7 +61,7 @@ def liquid(request):
     system, engine, state = built(
         {"spce": 20, "nitrogen": 12}, 12.0, 3, spread=0.1, forces=forces, stages=[stage], box=box
     )
-    relieve(engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    relieve(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
     return system, engine, state
 
 
@@ -221,7 +221,7 @@ def compressed():
     stage = {"ensemble": "nph", "pressure_bar": 2000.0, "duration_ps": 0.1, "barostat_time_ps": 0.3}
     forces = {"cutoff_A": 4.5, "truncation": "smooth_switch", "tail_correction": True}
     system, engine, state = built({"nitrogen": 32}, 11.5, 2, spread=0.1, forces=forces, stages=[stage])
-    relieve(engine, state, np.array([m.radius for m in system.species]), 3.3, THERMAL, 0.002)
+    relieve(system.model, engine, state, np.array([m.radius for m in system.species]), 3.3, THERMAL, 0.002)
     bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, BATH))
     move(engine, state, WITH_BATH["baoab"].with_bath(bath), 0.002, 300)
     state.velocity[:] -= state.velocity.mean(axis=0)
@@ -260,8 +260,7 @@ def test_a_piston_can_be_run_backwards(compressed):
 
 
 @pytest.mark.parametrize("stage", [
-    {}, {"barostat": "monte_carlo"}, {"pressure_coupling": "flexible", "thermostat": "langevin"},
-    {"pressure_coupling": "semi_isotropic", "thermostat": "nose_hoover"}, {"ensemble": "nph", "temperature_K": None},
+    {"barostat": "monte_carlo"}, {"pressure_coupling": "flexible"}, {"ensemble": "nph", "temperature_K": None},
 ], ids=str)  # fmt: skip
 def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
     own = {key: value for key, value in (NPT | {"duration_ps": 0.02} | stage).items() if value is not None}

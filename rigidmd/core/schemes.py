@@ -57,20 +57,16 @@ class Scheme(NamedTuple):
         return self._replace(flows=(*self.flows, Flow(BOX, float(every), every=every)), box=box)
 
     def with_piston(self, box: tuple) -> "Scheme":
-        """This scheme with a volume that has inertia: each kick and drift with one of the volume about or around it."""
-        flows: list[Flow] = []
-        kicks = [k for k, flow in enumerate(self.flows) if flow.kind == KICK]
-        for k, flow in enumerate(self.flows):
-            half = flow._replace(fraction=flow.fraction / 2)
-            if flow.kind == DRIFT:
-                flows += [half._replace(kind=STRETCH), flow, half._replace(kind=STRETCH)]
-            elif k == kicks[0]:
-                flows += [flow._replace(kind=BOX), flow]
-            elif k == kicks[-1]:
-                flows += [flow, flow._replace(kind=BOX)]
-            else:
-                flows += [half, flow._replace(kind=BOX), half] if flow.kind == KICK else [flow]
-        return self._replace(flows=tuple(flows), box=box)
+        """This scheme, a composition of Verlet steps, with a volume that has inertia.
+
+        Each step kicks the volume before its first and after its last kick, and moves it before and after its drift;
+        such a step is symmetric, so the composition keeps its order.
+        """
+        steps, flows = self.drifts, []
+        for before, after in pairwise((0.0, *steps, 0.0)):
+            flows += [Flow(KICK, before / 2), Flow(BOX, (before + after) / 2), Flow(KICK, after / 2)]
+            flows += [Flow(STRETCH, after / 2), Flow(DRIFT, after), Flow(STRETCH, after / 2)]
+        return self._replace(flows=tuple(flow for flow in flows if flow.fraction), box=box)
 
     def with_rest(self, every: int) -> "Scheme":
         """This scheme with the total momentum of all molecules taken out at the end of every so many steps."""

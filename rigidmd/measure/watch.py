@@ -229,7 +229,7 @@ def explained(
     else:
         return str(error)
     text, pair = str(finding), None
-    for where, state in states:
+    for where, state in () if finding.boiled else states:
         if all(np.isfinite(array).all() for array in state):
             pair = pair_in_core(system, state, finding.molecule)
         if pair:
