@@ -118,7 +118,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[[stages]]", '[[molecules]]\nname = "x"\nsites = []\n[[stages]]', ["molecules.1.sites", "needs at least 1"]),
         ("[[stages]]", '[[molecules]]\nname = "x"\ncount = 1\nsites = [{name = "A", mass_u = -1.0, position_A = [0,0,0]}]\n[[stages]]',
          ["molecules.1.sites.0.mass_u", "-1.0", "not be less than 0"]),
-        ("[[stages]]", '[[molecules]]\nmodel = "spce"\ncount = 1\n[[stages]]', ["spce stands there twice"]),
+        ("[[stages]]", '[[molecules]]\nmodel = "spce"\ncount = 1\n[[stages]]', ["spce appears twice"]),
     ],
 )  # fmt: skip
 def test_a_bad_scene(old, new, expected, capsys, tmp_path):
@@ -237,7 +237,7 @@ def test_a_missing_scene(capsys):
     [
         ("stages.1.timestep_fs=4", "stages has entries 0 to 0"),
         ("stages.x.timestep_fs=4", "stages has entries 0 to 0"),
-        ("stages.0.timestep_fs.y=4", "stages.0.timestep_fs is no table"),
+        ("stages.0.timestep_fs.y=4", "stages.0.timestep_fs is not a table"),
         ("stages.0.timestep_fs=fast", "'fast', must be a number"),
         ("timestep_fs", "is not KEY=VALUE"),
         ("nonsense=1", "unknown key"),
@@ -249,7 +249,7 @@ def test_a_missing_scene(capsys):
         ("molecules.1=", "molecules has entries 0 to 0, not '1'"),
         ("molecules.0=", "molecules: has 0 entries, needs at least 1"),
         ("stages.0.duration_ps=", "--set stages.0.duration_ps: is missing"),
-        ("box.lengths_A.x=", "box.lengths_A is no table"),
+        ("box.lengths_A.x=", "box.lengths_A is not a table"),
     ],
 )
 def test_a_bad_override(override, expected, capsys, tmp_path):
