@@ -532,7 +532,7 @@ def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
     good = simulation.system.state.position.copy()
     simulation.system.state.velocity[7] = 1e150  # gone within a step
     with pytest.raises(
-        SimulationError, match=r"step 1 .*molecule 8 \(spce\) is nowhere.*timestep_fs.*step 0 .*last_good_state"
+        SimulationError, match=r"step 1 .*molecule 8 \(spce\) is lost.*timestep_fs.*step 0 .*last_good_state"
     ):
         simulation.run()
     with np.load(tmp_path / "out" / "last_good_state.npz") as saved:
