@@ -353,7 +353,7 @@ def test_an_earlier_run_is_kept_when_the_new_scene_is_bad(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("sites", "expected"),
     [
-        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 0)), (1.0, (1, 0, 0))], "on one place"),
+        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 0)), (1.0, (1, 0, 0))], "coincide"),
         ([(0.0, (0, 0, 0)), (0.0, (1, 0, 0))], "massless"),
         ([(1.0, (0, 0, 0)), (0.0, (1, 0, 0))], "nothing resists its torque"),
         ([(1.0, (0, 0, 0)), (1.0, (0, 0, 1)), (0.0, (0.3, 0, 0.5))], "off the axis of a linear body"),

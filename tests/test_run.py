@@ -223,7 +223,7 @@ def test_displacements_over_time_are_speeds(name, tmp_path):
     assert universe.trajectory.dt == pytest.approx(0.1)
     assert universe.trajectory.totaltime == pytest.approx(20)
     assert results.summary["positions"] == "unwrapped"
-    assert "unwrapped: frames hold molecules where they travelled to" in summary_text(results.summary)
+    assert "unwrapped: molecules follow continuous paths" in summary_text(results.summary)
 
 
 def test_the_summary_says_when_positions_are_wrapped():
