@@ -73,7 +73,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ('model = "spce"', "file = a/water.xyz", ["line 5: molecules.0.file: is a/water.xyz without quotes", '"a/water.xyz"']),
         ("count = 20", 'count = 20\nresidue_names = ["SOL", W]', ["line 7: molecules.0.residue_names: is W without quotes"]),
         ("count = 20", "count = 20\nfrozen = True", ["line 7: molecules.0.frozen: is True, must be written true"]),
-        ("count = 20", "count = 20\nfrozen = null", ["line 7: molecules.0.frozen: is null", "leave the key out"]),
+        ("count = 20", "count = 20\nfrozen = null", ["line 7: molecules.0.frozen: is null", "omit the key"]),
         ("[start]", "[output]\npositions = [\n[start]", ["is not TOML", "line 14"]),
         ("timestep_fs = 1", "timestep_fs = 1 fs", ["is not TOML", "line 10"]),
         ("timestep_fs = 1", 'integrator = "velocity-verlet"', ["'velocity-verlet'", "did you mean velocity_verlet?"]),
@@ -110,7 +110,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", '[structure]\nfile = "."\n[start]', ["line 13: structure.file: is a folder"]),
         ("[start]", '[structure]\nfile = "bad.toml"\natom_types = { 1 = "O" }\n[start]', ["line 12: structure: atom_types are of LAMMPS' data files (.data .lmp .lammps), not of bad.toml"]),
         ("count = 20", 'count = 20\nparameters = "p.toml"', ["line 4: molecules.0: parameters would do nothing"]),
-        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [30.0, 30.0, 90.0]", ["cannot stand at these angles"]),
+        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [30.0, 30.0, 90.0]", ["cannot form these angles"]),
         ("lengths_A = 20.0", "density_g_cm3 = 1.0\nangles_deg = [80.0, 80.0, 90.0]", ["angles_deg needs lengths_A"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 180.0]", ["angles_deg.2", "less than 180"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 50.0]", ["smallest of a_x, b_y, c_z"]),
@@ -207,7 +207,7 @@ def test_no_shipped_scene_has_too_long_a_step(path):
 
 def test_a_thermostat_cannot_warm_what_is_at_rest(capsys, tmp_path):
     text = GOOD.replace("duration_ps", 'ensemble = "nvt"\ntemperature_K = 90\nduration_ps').replace("= 300", "= 0")
-    assert "cannot warm what is at rest" in refused(capsys, tmp_path, text)
+    assert "cannot heat molecules at rest" in refused(capsys, tmp_path, text)
 
 
 def test_the_good_scene_is_good(tmp_path, capsys):
@@ -285,7 +285,7 @@ def test_an_override_with_nothing_removes_the_key(tmp_path):
 def test_the_help_tells_how_a_key_is_removed(capsys):
     with pytest.raises(SystemExit):
         main(["run", "--help"])
-    assert "with nothing after = remove it" in " ".join(capsys.readouterr().out.split())
+    assert "KEY= without a value removes the key" in " ".join(capsys.readouterr().out.split())
 
 
 def test_too_dense_to_pack(capsys, tmp_path):
@@ -329,10 +329,10 @@ def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tm
     assert (out / "notes.txt").read_text() == "mine"
     kept = {path.name: path.read_bytes() for path in out.iterdir()}
     assert main(["run", str(out / "scene.toml"), "-o", str(out), "--force"]) == 2
-    assert "is read by this run" in capsys.readouterr().err
+    assert "is an input of this run" in capsys.readouterr().err
     restart = ["--set", f"structure.file={out / 'final.npz'}", "--set", "box.lengths_A=20.0"]
     assert main(["run", str(scene), *restart, "-o", str(out), "--force"]) == 2
-    assert "is read by this run" in capsys.readouterr().err
+    assert "is an input of this run" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in out.iterdir()} == kept
     project = tmp_path / "project"
     project.mkdir()

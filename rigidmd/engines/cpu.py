@@ -4,7 +4,6 @@ kernels, and handles their status codes."""
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-import numba
 import numpy as np
 
 from rigidmd.core.schemes import Scheme, Solver
@@ -174,12 +173,6 @@ class Engine:
                 if isinstance(workspace, Asked):
                     answer(workspace, self._applied[name], state)
         return workspaces
-
-
-def thread_limit() -> int:
-    """Most threads that Numba uses here: NUMBA_NUM_THREADS of the environment, or one for each core."""
-    # Numba defines the names of its config at import, out of sight of a checker
-    return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
 def _scheme_of(row: Scheme | Solver) -> Scheme:

@@ -13,7 +13,7 @@ from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.core.state import HEAT, TAKEN, WORK, State, state_of
-from rigidmd.engines.cpu import Engine, thread_limit
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
@@ -49,7 +49,8 @@ class MolecularSimulation(Simulation):
     ):
         super().__init__(scene, folder, force, **options)
         self._built = build(scene)
-        most = thread_limit()
+        # Numba defines the names of its config at import, out of sight of a type checker
+        most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
         self.threads = min(scene.threads or most, most)
         self._reset()
 
