@@ -418,7 +418,7 @@ def _models(options: argparse.Namespace) -> int:
 
     path = Path(options.output or f"{Path(options.model).stem}.png")
     draw_molecule(path, found, options.force)
-    print(f"{path}: picture of {found.name}")
+    print(f"{found.name} is drawn in {path}")
     return 0
 
 

@@ -107,7 +107,7 @@ def test_a_charge_on_a_site_without_repulsion(tmp_path):
     said = stopped(scene, tmp_path / "out")
     assert "of molecule 24 (ion) are" in said
     assert "HW1 of molecule 5 (tip4p2005)" in said
-    assert "a charge on a site without repulsion has fallen onto an opposite one" in said
+    assert "a charge on a site without repulsion has collapsed onto an opposite one" in said
     assert 'an entry [[forces.pairs]] with sites = ["HW1", "X"]' in said
     assert (tmp_path / "out" / "last_good_state.npz").exists()
     # what it advises helps
