@@ -1,4 +1,4 @@
-"""The commands. They print and never compute; what they need is imported when they need it."""
+"""The commands. They print and never compute. Each imports what it needs only when it runs."""
 
 import argparse
 import json
@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
 
-#: A command that a signal ended exits with this more than the signal's number: 130 of Ctrl-C, 143 of SIGTERM.
+#: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
 BY_SIGNAL = 128
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
-  rigidmd check water.toml                  what would happen, without running
-  rigidmd run water.toml                    run it, into runs/water
+  rigidmd check water.toml                  describe the run without running it
+  rigidmd run water.toml                    run it; results go to runs/water
   rigidmd run water.toml --set stages.1.timestep_fs=4 -o runs/water4
   rigidmd energy water.toml --unit kcal/mol
   rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
@@ -26,7 +26,7 @@ EXAMPLES = """examples:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; the exit code: 0 done, 1 a run that failed, 2 bad input, 130 or 143 ended by a signal."""
+    """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 130 or 143 ended by a signal."""
     from rigidmd.errors import RigidMDError, SimulationError
 
     options = _parser().parse_args(arguments)
@@ -62,10 +62,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    _command(commands, "examples", _examples, "list the scenes that come with rigidmd", "rigidmd examples")
-    new = _command(
-        commands, "new", _new, "copy a scene that comes with rigidmd, to start from", "rigidmd new water -o mine.toml"
-    )
+    _command(commands, "examples", _examples, "list the scenes that rigidmd ships", "rigidmd examples")
+    new = _command(commands, "new", _new, "copy a shipped scene as a starting point", "rigidmd new water -o mine.toml")
     new.add_argument("name", metavar="NAME", help="which scene; `rigidmd examples` lists them")
     new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml)")
     new.add_argument("--force", action="store_true", help="replace that file")
@@ -89,11 +87,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     energy.add_argument("--json", action="store_true", help="print JSON")
     energy.add_argument(
-        "--accuracy", action="store_true", help="also measure the error of Coulomb forces, of Ewald sums and PME"
+        "--accuracy", action="store_true", help="also measure the error of the Coulomb forces (Ewald sums and PME)"
     )
 
     check = _command(
-        commands, "check", _check, "say what would happen, and run nothing", "rigidmd check systems/water_nitrogen.toml"
+        commands, "check", _check, "describe a run without running it", "rigidmd check systems/water_nitrogen.toml"
     )
     _scene_arguments(check)
 
@@ -101,26 +99,26 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "precision",
         _precision,
-        "measure error against run time of integrators and time steps",
+        "measure the error and the run time of integrators at several time steps",
         "rigidmd precision systems/heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
         "  rigidmd precision systems/heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles",
     )
     _scene_arguments(precision)
     precision.add_argument(
         "--integrators", metavar="A,B,...",
-        help="integrators (default: the scene's own and those that suit it; of a body also the textbook's solvers, "
-        "each with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion, rk4_euler_angles, dop853, "
-        "dop853_quaternion, dop853_euler_angles). Where the scene has a run.formulation, rk4, dop853 and radau mean "
-        "that one, and rk4_matrix the matrix",
+        help="integrators (default: the scene's own and those that suit it; for a body also general ODE solvers, each "
+        "with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion, rk4_euler_angles, dop853, "
+        "dop853_quaternion, dop853_euler_angles). If the scene sets run.formulation, rk4, dop853 and radau use it, "
+        "and rk4_matrix uses the matrix",
     )  # fmt: skip
     precision.add_argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body")
     precision.add_argument("--span", type=float, metavar="T", help="how long each runs (default: 0.1 ps; a body's run)")
     precision.add_argument(
-        "--repeats", type=int, default=3, metavar="N", help="repeats of the timing (default: 3); 1 shows no spread"
+        "--repeats", type=int, default=3, metavar="N", help="timings of each run (default: 3); 1 shows no spread"
     )
     precision.add_argument(
         "--averages", type=float, metavar="PS",
-        help="of molecules: also average temperatures, energy and pressure over so many ps with every step",
+        help="molecules only: also average temperatures, energy and pressure over this many ps at each time step",
     )  # fmt: skip
     precision.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-precision)")
     precision.add_argument("--force", action="store_true", help="replace earlier results in that folder")
@@ -129,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "stability",
         _stability,
-        "try to break the engine: named cases, each held against what is known; exit code 1 if any is silently wrong",
+        "try to break the engine: named cases, each compared with a known answer; exit code 1 if any is silently wrong",
         "rigidmd stability --quick --case near_linear --case water_steps",
     )
     stability.add_argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes")
@@ -142,12 +140,12 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "models",
         _models,
-        "list the molecules that come with rigidmd, or show or draw one",
+        "list the molecular models that rigidmd ships, or show or draw one",
         "rigidmd models tip4p2005 --draw -o water.svg",
     )
-    models.add_argument("model", nargs="?", metavar="NAME", help="show this one; or a .toml file with one of your own")
-    models.add_argument("--draw", action="store_true", help="draw it, into NAME.png")
-    models.add_argument("-o", "--output", metavar="FILE", help="the picture: .png, .svg or .pdf")
+    models.add_argument("model", nargs="?", metavar="NAME", help="model to show, or a .toml file with your own")
+    models.add_argument("--draw", action="store_true", help="draw it to NAME.png")
+    models.add_argument("-o", "--output", metavar="FILE", help="picture file: .png, .svg or .pdf")
     models.add_argument("--force", action="store_true", help="replace that file")
     _command(
         commands,
@@ -159,7 +157,7 @@ def _parser() -> argparse.ArgumentParser:
     chapters = _command(
         commands, "help", _help, "list the chapters of the documentation, or print one", "rigidmd help water | less"
     )
-    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="print this one")
+    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print")
     return parser
 
 
@@ -191,8 +189,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KEY=VALUE",
         dest="overrides",
-        help="override a key of the scene by its dotted path (entries of lists count from 0), or with nothing after = "
-        "remove it; may be repeated",
+        help="override a key of the scene by its dotted path (list entries count from 0); KEY= without a value "
+        "removes the key; may be repeated",
     )
 
 
@@ -214,7 +212,7 @@ def _examples(options: argparse.Namespace) -> int:
             if example.is_body == is_body:
                 print(f"  {example.name:<{width}}  {example.about}")
         print()
-    print("`rigidmd new NAME` copies one into the working directory, to start from")
+    print("`rigidmd new NAME` copies one into the working directory")
     return 0
 
 
@@ -228,11 +226,11 @@ def _new(options: argparse.Namespace) -> int:
         print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
     print(f"{path}: {example.about}")
     if beside := [str(file) for file in written[1:]]:
-        print(f"beside it, read by it: {', '.join(beside)}")
+        print(f"files that it reads, copied beside it: {', '.join(beside)}")
     print("next:")
-    print(f"  rigidmd check {shlex.quote(str(path))}    says what would happen, and runs nothing")
-    print(f"  rigidmd run {shlex.quote(str(path))}      runs it, into {Path('runs') / path.stem}")
-    print("its comment says what to look at; `rigidmd help manual` describes every table")
+    print(f"  rigidmd check {shlex.quote(str(path))}    describes the run without running it")
+    print(f"  rigidmd run {shlex.quote(str(path))}      runs it; results go to {Path('runs') / path.stem}")
+    print("its comment says what to look at; `rigidmd help manual` explains every table")
     return 0
 
 
@@ -243,7 +241,7 @@ def _run(options: argparse.Namespace) -> int:
         from rigidmd.scene import BodyScene
 
         if isinstance(scene, BodyScene):
-            raise SceneError(scene.source, ["--threads is for molecules; one body is moved by one thread"])
+            raise SceneError(scene.source, ["--threads is for molecules; a single body uses one thread"])
         scene = _read_scene(options, threads=options.threads)
     folder = Path(options.output) if options.output else Path("runs") / scene.name
     from rigidmd.output.folder import check_folder
@@ -260,7 +258,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _say(sentence: str) -> None:
-    """What takes a moment."""
+    """Announce something that takes a moment."""
     print(f"  {sentence} ...", file=sys.stderr, flush=True)
 
 
@@ -297,7 +295,7 @@ def _energy(options: argparse.Namespace) -> int:
         print(f"  {name.replace('_', ' ')}: {text}")
     if options.accuracy:
         error = found["accuracy"]
-        print(f"Coulomb forces on sites, held against {error['reference']}")
+        print(f"Coulomb forces on sites, compared with {error['reference']}")
         print(f"  {'rms force':<22}{error['rms_force_per_A']:>22.4g} {unit}/Å")
         relative = f"{error['relative']:.2g} of it, {error['in_e2_per_A2']:.2g} e²/Å²"
         print(f"  {'rms error':<22}{error['rms_error_per_A']:>22.4g} {unit}/Å: {relative}")
@@ -312,7 +310,7 @@ def _body_energy(scene: "BodyScene", options: argparse.Namespace) -> int:
     from rigidmd.run import Simulation
 
     if options.accuracy:
-        raise SceneError(scene.source, ["--accuracy is for molecules with Ewald sums"])
+        raise SceneError(scene.source, ["--accuracy needs molecules with Ewald sums"])
     if options.unit is not None:
         raise SceneError(scene.source, [f"--unit {options.unit} is for molecules; the energy of a body is in J"])
     found = Simulation(scene).start_energy()
@@ -355,8 +353,8 @@ def _precision(options: argparse.Namespace) -> int:
     try:
         timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
     except ValueError:
-        raise SceneError("--timesteps", [f"{options.timesteps!r} is no list of numbers, for example 1,2,4"]) from None
-    _say("compiling, and running the reference")
+        raise SceneError("--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]) from None
+    _say("compiling and running the reference")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         found = precision(
             scene,
@@ -409,7 +407,7 @@ def _models(options: argparse.Namespace) -> int:
         if draws:
             raise MoleculeError("models", ["--draw and -o need the NAME of a model"])
         print(models_table([load_model(name) for name in available_models()]))
-        print("\n`rigidmd models NAME` shows one in full, with --draw in a picture")
+        print("\n`rigidmd models NAME` shows one in full; --draw draws it")
         return 0
     own = options.model.endswith(".toml")
     found = read_molecule(Path(options.model)) if own else load_model(options.model)

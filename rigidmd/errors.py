@@ -1,12 +1,12 @@
-"""The error tree: everything rigidmd refuses, it refuses with one of these and in words.
+"""The error tree. Whatever rigidmd refuses, it refuses with one of these errors and an explanation.
 
-The command line prints the message and exits with 2 for bad input and 1 for a run that failed; the Python side gets
-the exception.
+The command line prints the message and exits with 2 for bad input and 1 for a failed run. Python code gets the
+exception.
 """
 
 
 class RigidMDWarning(UserWarning):
-    """What whoever runs something should know before it is done; the summary of a run has it too."""
+    """Something that the user should know before a run ends; the summary of the run repeats it."""
 
 
 class RigidMDError(Exception):
@@ -14,12 +14,12 @@ class RigidMDError(Exception):
 
 
 class Faults(RigidMDError):
-    """Bad input: every fault found, at once.
+    """Bad input, with all faults found.
 
     Parameters
     ----------
     where : what was being read (a file, usually)
-    faults : one sentence each: what is wrong, where, what was expected
+    faults : one sentence each: where, what is wrong, what was expected
     """
 
     def __init__(self, where: str, faults: list[str]):
@@ -32,15 +32,15 @@ class Faults(RigidMDError):
 
 
 class SceneError(Faults):
-    """A scene that cannot be what its author meant."""
+    """An invalid scene."""
 
 
 class MoleculeError(Faults):
-    """A molecular model that is not a rigid body that can move."""
+    """An invalid molecular model."""
 
 
 class StructureError(Faults):
-    """A structure file that cannot be read, or not as the molecules of the scene."""
+    """A structure file that cannot be read, or does not fit the molecules of the scene."""
 
 
 class OutputError(RigidMDError):
@@ -48,4 +48,4 @@ class OutputError(RigidMDError):
 
 
 class SimulationError(RigidMDError):
-    """A run that stopped because its numbers stopped meaning anything."""
+    """A run that was stopped because its numbers became meaningless."""

@@ -1,4 +1,4 @@
-"""Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds the published ones."""
+"""Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds published models."""
 
 import tomllib
 from dataclasses import dataclass, replace
@@ -15,39 +15,39 @@ from rigidmd.validation import NonNegative, Number, Positive, Section, Vector, f
 
 MODELS = Path(__file__).parent / "models"
 
-#: Two sites closer than this fraction of the molecule's size are on one place.
+#: Two sites closer than this fraction of the molecule's size count as coinciding.
 SAME_PLACE = 1e-6
-#: A site further than this fraction of the size from a linear body's axis would turn it about an axis without inertia.
+#: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
 OFF_AXIS = 1e-4
 
 
-#: Keys of a site that come together.
+#: Keys of a site of which both or none are given.
 DEPTHS = ("epsilon_kJ_mol", "epsilon_kcal_mol", "epsilon_K")
 LENNARD_JONES = ("sigma_A", *DEPTHS)
 
-#: Names of sites and residues as every structure format can hold them: one to five visible ASCII characters.
+#: Names of sites and residues that every structure format can hold: one to five visible ASCII characters.
 SiteName = Annotated[str, Field(pattern=r"^[!-~]{1,5}$")]
 
 
 class Site(Section):
-    """A point of a rigid molecule: mass, charge and Lennard-Jones parameters, each only where it has them."""
+    """A point of a rigid molecule with optional mass, charge and Lennard-Jones parameters."""
 
     name: SiteName
     """Name in trajectories and topology files, at most five characters"""
     element: str = "X"
     """Chemical symbol; X for a site without mass"""
     mass_u: NonNegative | None = None
-    """Mass; 0 for a massless site. With `file`, taken from the element when not given"""
+    """Mass; 0 for a massless site. With `file` the default follows from the element"""
     position_A: Vector | None = None
-    """Position in any frame fixed in the molecule; taken from `file` where there is one"""
+    """Position in any frame fixed in the molecule; with `file` it is taken from there"""
     charge_e: Number | None = None
-    """Charge in elementary charges; none when not given"""
+    """Charge in elementary charges"""
     sigma_A: Positive | None = None
     """Lennard-Jones diameter"""
     epsilon_kJ_mol: NonNegative | None = None
     """Lennard-Jones well depth"""
     epsilon_kcal_mol: NonNegative | None = None
-    """Lennard-Jones well depth in the other unit of the field; 1 kcal is 4.184 kJ"""
+    """Lennard-Jones well depth; 1 kcal is 4.184 kJ"""
     epsilon_K: NonNegative | None = None
     """Lennard-Jones well depth over Boltzmann's constant"""
 
@@ -69,34 +69,34 @@ class Site(Section):
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
 
-#: In this order `rigidmd models` lists them.
+#: In the order of `rigidmd models`.
 GROUPS = ("water", "ion", "noble gas", "gas", "organic", "other")
 
 
 class MoleculeFile(Section):
-    """What a file of `models/` holds."""
+    """A file of `models/`."""
 
     name: str = Field(min_length=1)
     title: str = ""
     group: Literal[GROUPS] = "other"  # type: ignore[valid-type]
-    """Among which `rigidmd models` lists it"""
+    """Group in the list of `rigidmd models`"""
     source: str = ""
-    """Where the numbers come from"""
+    """Source of the numbers"""
     note: str = ""
-    """What else its user has to know"""
+    """Advice for its users"""
     mixing: Mixing | None = None
-    """The mixing rule it was made with, where its sites have parameters of several kinds"""
+    """Mixing rule of the model, if its sites have several kinds of parameters"""
     residue_names: tuple[SiteName, ...] = ()
     sites: tuple[Site, ...] = Field(min_length=1)
 
 
 class ParameterFile(Section):
-    """A table of parameters that several molecules may share: what a scene's `parameters` names."""
+    """A table of parameters that several molecules may share; the key `parameters` of a scene names it."""
 
     title: str = ""
     source: str = ""
     sites: tuple[Site, ...] = Field(min_length=1)
-    """By a site's name, or else its element"""
+    """Keyed by site name, or else by element"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class Molecule:
     """A rigid molecule in its principal frame, centre of mass at the origin.
 
     masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²; inertia (3,) u Å²,
-    ascending, 0 where the body has no extent about that axis.
+    ascending; 0 about an axis on which the whole mass lies.
     """
 
     name: str
@@ -127,12 +127,12 @@ class Molecule:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Three of translation and those of rotation."""
+        """Degrees of freedom: three of translation and those of rotation."""
         return 3 + rotational_freedom(self.kind)
 
     @property
     def charge(self) -> float:
-        """Net charge in e, rounded where the sites' charges cancel to rounding."""
+        """Net charge in e; exactly 0 if the charges of the sites cancel to rounding."""
         total = float(self.charges.sum())
         return 0.0 if abs(total) <= 1e-12 * np.abs(self.charges).sum() else total
 
@@ -149,17 +149,17 @@ class Molecule:
 
     @property
     def planar(self) -> bool:
-        """Whether all sites, massless ones too, lie in one plane and not in one line."""
+        """Whether all sites, massless ones included, lie in one plane but not on one line."""
         return bool(self._extents[2] <= OFF_AXIS * self.radius < self._extents[1])
 
     @property
     def _extents(self) -> np.ndarray:
-        """How far (3,) the sites reach along the axes of their own shape, Å, descending."""
+        """Extents (3,) of the sites along the principal axes of their shape, Å, descending."""
         return np.append(np.linalg.svd(self.positions_body, compute_uv=False), [0.0, 0.0])[:3]
 
     @property
     def words(self) -> str:
-        """What kind of body it is and what it weighs and carries, in words."""
+        """Kind of body, sites, mass, charge and dipole in words."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
         charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
         dipole = ""
@@ -175,7 +175,7 @@ class Molecule:
         return float(np.linalg.norm(self.positions_body, axis=1).max())
 
     def sites(self) -> list[dict]:
-        """The sites as they would stand in a scene file, in the principal frame."""
+        """The sites as in a scene file, in the principal frame."""
         entries = []
         for i, name in enumerate(self.site_names):
             entry = {
@@ -198,9 +198,9 @@ def _counted(number: int, noun: str) -> str:
 def molecule(
     name: str, sites: tuple[Site, ...], title: str = "", source: str = "", residue_names: tuple[str, ...] = ()
 ) -> Molecule:
-    """The rigid body of these sites, which all have a position and a mass.
+    """The rigid body of these sites, each of which needs a position and a mass.
 
-    Raises MoleculeError with every reason why they are none.
+    Raises MoleculeError with all faults.
     """
     faults = [
         f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
@@ -217,7 +217,7 @@ def molecule(
     for i in range(len(sites)):
         for j in range(i):
             if np.linalg.norm(body[i] - body[j]) <= SAME_PLACE * size:
-                faults.append(f"sites {sites[j].name} and {sites[i].name} are on one place")  # noqa: PERF401
+                faults.append(f"sites {sites[j].name} and {sites[i].name} coincide")  # noqa: PERF401
     if frame.kind == "point" and not faults:
         off = np.linalg.norm(body, axis=1)
         faults += [
@@ -235,7 +235,7 @@ def molecule(
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
     if frame.kind == "point":
-        body = np.zeros_like(body)  # the centre of mass, without the rounding of having computed it
+        body = np.zeros_like(body)  # exactly at the centre of mass, without rounding errors
     return Molecule(
         name=name,
         title=title,
@@ -255,7 +255,7 @@ def molecule(
 
 
 def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
-    """The same molecule with other masses (u) of sites, by their names or else their elements: other isotopes.
+    """The same molecule with other masses (u) of sites (isotopes), keyed by site name or else element.
 
     Raises MoleculeError.
     """
@@ -280,7 +280,7 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:
-    """Sites with what they do not say themselves from a table, by their name or else their element."""
+    """Sites with missing keys filled in from a table, by site name or else element."""
     filled = []
     for site in sites:
         if (entry := find_site(table, site.name, site.element)) is not None:
@@ -293,17 +293,17 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
 
 
 def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
-    """The entry that has this name, or else is called like the element."""
+    """The entry of this name, or else of the element."""
     return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)
 
 
 def available_models() -> list[str]:
-    """Names of the models that come with the package."""
+    """Names of the shipped models."""
     return sorted(path.stem for path in MODELS.glob("*.toml"))
 
 
 def model_fault(name: str) -> str:
-    """Why there is no model of this name; empty if there is one."""
+    """Message that there is no model of this name; empty if there is one."""
     known = available_models()
     if name in known:
         return ""
@@ -311,14 +311,14 @@ def model_fault(name: str) -> str:
 
 
 def load_model(name: str) -> Molecule:
-    """A model that comes with the package, by name. Raises MoleculeError."""
+    """A shipped model by name. Raises MoleculeError."""
     if fault := model_fault(name):
         raise MoleculeError("models", [fault])
     return read_molecule(MODELS / f"{name}.toml")
 
 
 def read_molecule(path: Path) -> Molecule:
-    """A molecule from a TOML file as those in `models/`. Raises MoleculeError."""
+    """A molecule from a TOML file like those in `models/`. Raises MoleculeError."""
     data = _read(path, MoleculeFile)
     found = molecule(data.name, data.sites, data.title, data.source, data.residue_names)
     return replace(found, group=data.group, note=data.note, mixing=data.mixing)
@@ -328,7 +328,7 @@ def read_parameters(path: Path) -> tuple[Site, ...]:
     """The entries of a table of parameters. Raises MoleculeError."""
     entries = _read(path, ParameterFile).sites
     names = [s.name for s in entries]
-    faults = [f"sites: {name} stands there twice" for name in sorted(set(names)) if names.count(name) > 1]
+    faults = [f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
     faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in entries if s.position_A is not None]
     if faults:
         raise MoleculeError(str(path), faults)
@@ -339,7 +339,7 @@ Table = TypeVar("Table", bound=Section)
 
 
 def _read(path: Path, kind: type[Table]) -> Table:
-    """A file as this kind of table. Raises MoleculeError."""
+    """A file read as this kind of table. Raises MoleculeError."""
     try:
         text = path.read_text(encoding="utf-8")
         return kind.model_validate(tomllib.loads(text))

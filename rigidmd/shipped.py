@@ -1,4 +1,4 @@
-"""What travels with the package for people: scenes to start from, and the chapters of the documentation."""
+"""Shipped with the package: example scenes and the chapters of the documentation."""
 
 import difflib
 import re
@@ -12,16 +12,16 @@ from rigidmd.errors import Faults, OutputError
 
 PACKAGE = Path(__file__).parent
 
-#: In a wheel the scenes lie inside the package; in a checkout, and in an editable install of one, beside it.
+#: In a wheel the scenes are inside the package; in a checkout or an editable install they are beside it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
 
-#: In the order in which they are listed.
+#: In the order of the list.
 CHAPTERS = ("top", "water", "molecule", "ensembles", "extending", "manual", "benchmarks", "validation", "changelog")
 
 
 class Example(NamedTuple):
-    """A scene that comes along."""
+    """A shipped scene."""
 
     name: str
     path: Path
@@ -30,7 +30,7 @@ class Example(NamedTuple):
 
 
 def examples() -> list[Example]:
-    """The scenes that come along, by name."""
+    """The shipped scenes, sorted by name."""
     found = []
     for path in sorted(SYSTEMS.glob("*.toml")):
         text = path.read_text(encoding="utf-8")
@@ -40,7 +40,7 @@ def examples() -> list[Example]:
 
 
 def _in_series(example: Example) -> list:
-    """Key by which a name's numbers sort as numbers."""
+    """Sort key in which numbers within a name count as numbers."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
 
 
@@ -59,12 +59,12 @@ def find_example(name: str) -> Example:
 
 
 def series_of(name: str) -> list[str]:
-    """The scenes NAME_1, NAME_2, ...; none where there is no such series."""
+    """The scenes NAME_1, NAME_2, ...; empty if there is no such series."""
     return [example.name for example in examples() if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)]
 
 
 def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
-    """Copy a scene to `path`, and beside it the files that it reads; the paths written. Raises OutputError."""
+    """Copy a scene to `path` and the files that it reads beside it. Returns the paths written. Raises OutputError."""
     from rigidmd.scene import Scene
 
     if path.suffix != ".toml":
@@ -93,7 +93,7 @@ def contents() -> dict[str, str]:
 
 
 def chapter_text(name: str) -> str:
-    """A chapter as plain text: without its comments, pictures by name and path. Raises Faults."""
+    """A chapter as plain text, without comments; pictures become name and path. Raises Faults."""
     if name not in CHAPTERS:
         near = difflib.get_close_matches(name, CHAPTERS, 1, 0.5)
         hint = f"did you mean {near[0]}? " if near else ""

@@ -1,4 +1,4 @@
-"""Units: Å, ps, u, e, K inside, energies in u Å²/ps²; everything else only at the edges.
+"""Units: Å, ps, u, e, K inside, energies in u Å²/ps². Other units appear only in input and output.
 
 `1 kJ/mol = 100 u Å²/ps²` exactly in the limit where the molar mass constant is 1 g/mol (it is to 3e-10, CODATA 2018).
 Constants: CODATA 2018; N_A, k_B and e are exact since 2019.

@@ -1,4 +1,4 @@
-"""Data from outside: strict value types for pydantic, and its complaints turned into sentences with key and line."""
+"""Input data: strict value types for pydantic, and its errors as sentences with key and line."""
 
 import difflib
 import re
@@ -18,12 +18,12 @@ Vector = tuple[Number, Number, Number]
 
 T = TypeVar("T")
 
-#: More names than this that begin or end alike say nothing of which was meant.
+#: With more similar names than this, no suggestion is made from a common beginning or end.
 MOST_MEANT = 8
 
 
 class Section(BaseModel):
-    """A frozen table of a TOML file; keys it does not know are faults."""
+    """A frozen table of a TOML file; unknown keys are faults."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -37,19 +37,19 @@ def settled(value: T | None) -> T:
 def faults_of(
     error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
 ) -> list[str]:
-    """One sentence for each complaint of pydantic: line (if the TOML text is given), key, what was expected.
+    """One sentence for each error of pydantic: line (if the TOML text is given), key, what was expected.
 
-    overridden : dotted keys whose values come from the command line and stand on no line
+    overridden : dotted keys whose values come from the command line, so that they have no line
     """
     faults = {}
     for detail in error.errors():
         keys = [key for key in detail["loc"] if not _is_union_branch(key)]
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
-            keys = keys[:-1]  # an entry that a list lacks: the list is what is wrong
+            keys = keys[:-1]  # a list lacks an entry: the fault is the list's
         path = ".".join(str(key) for key in keys)
         faults.setdefault((place(keys, text, overridden), path), []).append(_sentence(detail, keys, model))
-    # A value that may be several things gets one complaint from pydantic for each of them: say them as one. What is
-    # wrong inside a value says more than that the whole is wrong.
+    # pydantic reports one error for each type that a value may have: join them. An error inside a value is more
+    # specific than one about the whole value.
     return [
         f"{where}: {_either(list(dict.fromkeys(sentences)))}"
         for (where, path), sentences in faults.items()
@@ -58,13 +58,13 @@ def faults_of(
 
 
 def _either(sentences: list[str]) -> str:
-    """Sentences as one: "is 1, must be a list" and "is 1, must be a table" say that it is 1 once."""
+    """Join sentences: "is 1, must be a list" and "is 1, must be a table" state only once that it is 1."""
     begin, must, _ = sentences[0].partition(", must be ")
     return " or ".join([sentences[0], *(sentence.removeprefix(begin + must) for sentence in sentences[1:])])
 
 
 def place(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
-    """Where a key of a scene was given: by line, or on the command line."""
+    """Where a key of a scene was given: its line, or the command line."""
     path = ".".join(map(str, keys))
     if any(f"{path}.".startswith(f"{key}.") for key in overridden):
         return f"--set {path}"
@@ -73,7 +73,7 @@ def place(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
 
 
 def _is_union_branch(key: Any) -> bool:
-    """Whether pydantic put this in a location to tell which branch of a union complained."""
+    """Whether pydantic put this into a location to name the branch of a union."""
     return isinstance(key, str) and bool(re.search(r"[\[(]|^(constrained-)?(float|int|bool|str)$", key))
 
 
@@ -128,7 +128,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """'; did you mean ...?' for a name that is not known; empty where nothing is like it."""
+    """'; did you mean ...?' for an unknown name; empty if no known name is similar."""
     return perhaps(nearest(name, known))
 
 
@@ -138,10 +138,10 @@ def perhaps(names: list[str]) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> list[str]:
-    """What may have been meant by a name that is not known.
+    """Known names that an unknown one may stand for.
 
-    Known names that are the same but for case and punctuation; else those that it begins, as where a unit is
-    forgotten, or ends; else the one spelled most like it.
+    These are the names that differ only in case and punctuation; else those that begin with it, as when a unit is
+    forgotten, or end with it; else the one with the most similar spelling.
     """
     plain = {key: _plain(key) for key in known}
     asked = _plain(name)
@@ -159,13 +159,13 @@ def _plain(name: str) -> str:
 
 
 def toml_fault(error: tomllib.TOMLDecodeError, text: str) -> str:
-    """What is wrong with a text that is not TOML; of a value without quotes, its line and key."""
+    """What is wrong with a text that is not TOML. For a value without quotes the line and key are named."""
     place = re.search(r"at line (\d+), column (\d+)", str(error))
     number, column = map(int, place.groups()) if place else (0, 0)
     line = text.splitlines()[number - 1] if place else ""
     # tomllib stops at the word, or within it: after the inf of "infinite"
     bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
-    if not bare or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # the head of a table, after a list without its end
+    if not bare or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after a list that is not closed
         return f"is not TOML: {error}"
     keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1]
     where = f"line {number}: {'.'.join(map(str, keys))}: "
@@ -173,12 +173,12 @@ def toml_fault(error: tomllib.TOMLDecodeError, text: str) -> str:
         case "True" | "False":
             return f"{where}is {bare}, must be written {bare.lower()}"
         case "None" | "null":
-            return f"{where}is {bare}, which TOML does not have: leave the key out"
+            return f"{where}is {bare}, which TOML does not have: omit the key"
     return f'{where}is {bare} without quotes; a text needs them: "{bare}"'
 
 
 def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
-    """Keys of the section that the path of keys leads to."""
+    """Keys of the section at a path of keys."""
     for key in keys:
         if isinstance(key, int):
             continue
@@ -196,7 +196,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def line_of(keys: list, text: str) -> int | None:
-    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; None if nowhere."""
+    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; else None."""
     found = None
     for number, table, entry in _lines(text):
         if entry:

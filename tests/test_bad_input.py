@@ -73,7 +73,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ('model = "spce"', "file = a/water.xyz", ["line 5: molecules.0.file: is a/water.xyz without quotes", '"a/water.xyz"']),
         ("count = 20", 'count = 20\nresidue_names = ["SOL", W]', ["line 7: molecules.0.residue_names: is W without quotes"]),
         ("count = 20", "count = 20\nfrozen = True", ["line 7: molecules.0.frozen: is True, must be written true"]),
-        ("count = 20", "count = 20\nfrozen = null", ["line 7: molecules.0.frozen: is null", "leave the key out"]),
+        ("count = 20", "count = 20\nfrozen = null", ["line 7: molecules.0.frozen: is null", "omit the key"]),
         ("[start]", "[output]\npositions = [\n[start]", ["is not TOML", "line 14"]),
         ("timestep_fs = 1", "timestep_fs = 1 fs", ["is not TOML", "line 10"]),
         ("timestep_fs = 1", 'integrator = "velocity-verlet"', ["'velocity-verlet'", "did you mean velocity_verlet?"]),
@@ -110,7 +110,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", '[structure]\nfile = "."\n[start]', ["line 13: structure.file: is a folder"]),
         ("[start]", '[structure]\nfile = "bad.toml"\natom_types = { 1 = "O" }\n[start]', ["line 12: structure: atom_types are of LAMMPS' data files (.data .lmp .lammps), not of bad.toml"]),
         ("count = 20", 'count = 20\nparameters = "p.toml"', ["line 4: molecules.0: parameters would do nothing"]),
-        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [30.0, 30.0, 90.0]", ["cannot stand at these angles"]),
+        ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [30.0, 30.0, 90.0]", ["cannot form these angles"]),
         ("lengths_A = 20.0", "density_g_cm3 = 1.0\nangles_deg = [80.0, 80.0, 90.0]", ["angles_deg needs lengths_A"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 180.0]", ["angles_deg.2", "less than 180"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 50.0]", ["smallest of a_x, b_y, c_z"]),
@@ -118,7 +118,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[[stages]]", '[[molecules]]\nname = "x"\nsites = []\n[[stages]]', ["molecules.1.sites", "needs at least 1"]),
         ("[[stages]]", '[[molecules]]\nname = "x"\ncount = 1\nsites = [{name = "A", mass_u = -1.0, position_A = [0,0,0]}]\n[[stages]]',
          ["molecules.1.sites.0.mass_u", "-1.0", "not be less than 0"]),
-        ("[[stages]]", '[[molecules]]\nmodel = "spce"\ncount = 1\n[[stages]]', ["spce stands there twice"]),
+        ("[[stages]]", '[[molecules]]\nmodel = "spce"\ncount = 1\n[[stages]]', ["spce appears twice"]),
     ],
 )  # fmt: skip
 def test_a_bad_scene(old, new, expected, capsys, tmp_path):
@@ -207,7 +207,7 @@ def test_no_shipped_scene_has_too_long_a_step(path):
 
 def test_a_thermostat_cannot_warm_what_is_at_rest(capsys, tmp_path):
     text = GOOD.replace("duration_ps", 'ensemble = "nvt"\ntemperature_K = 90\nduration_ps').replace("= 300", "= 0")
-    assert "cannot warm what is at rest" in refused(capsys, tmp_path, text)
+    assert "cannot heat molecules at rest" in refused(capsys, tmp_path, text)
 
 
 def test_the_good_scene_is_good(tmp_path, capsys):
@@ -237,7 +237,7 @@ def test_a_missing_scene(capsys):
     [
         ("stages.1.timestep_fs=4", "stages has entries 0 to 0"),
         ("stages.x.timestep_fs=4", "stages has entries 0 to 0"),
-        ("stages.0.timestep_fs.y=4", "stages.0.timestep_fs is no table"),
+        ("stages.0.timestep_fs.y=4", "stages.0.timestep_fs is not a table"),
         ("stages.0.timestep_fs=fast", "'fast', must be a number"),
         ("timestep_fs", "is not KEY=VALUE"),
         ("nonsense=1", "unknown key"),
@@ -249,7 +249,7 @@ def test_a_missing_scene(capsys):
         ("molecules.1=", "molecules has entries 0 to 0, not '1'"),
         ("molecules.0=", "molecules: has 0 entries, needs at least 1"),
         ("stages.0.duration_ps=", "--set stages.0.duration_ps: is missing"),
-        ("box.lengths_A.x=", "box.lengths_A is no table"),
+        ("box.lengths_A.x=", "box.lengths_A is not a table"),
     ],
 )
 def test_a_bad_override(override, expected, capsys, tmp_path):
@@ -285,7 +285,7 @@ def test_an_override_with_nothing_removes_the_key(tmp_path):
 def test_the_help_tells_how_a_key_is_removed(capsys):
     with pytest.raises(SystemExit):
         main(["run", "--help"])
-    assert "with nothing after = remove it" in " ".join(capsys.readouterr().out.split())
+    assert "KEY= without a value removes the key" in " ".join(capsys.readouterr().out.split())
 
 
 def test_too_dense_to_pack(capsys, tmp_path):
@@ -329,10 +329,10 @@ def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tm
     assert (out / "notes.txt").read_text() == "mine"
     kept = {path.name: path.read_bytes() for path in out.iterdir()}
     assert main(["run", str(out / "scene.toml"), "-o", str(out), "--force"]) == 2
-    assert "is read by this run" in capsys.readouterr().err
+    assert "is an input of this run" in capsys.readouterr().err
     restart = ["--set", f"structure.file={out / 'final.npz'}", "--set", "box.lengths_A=20.0"]
     assert main(["run", str(scene), *restart, "-o", str(out), "--force"]) == 2
-    assert "is read by this run" in capsys.readouterr().err
+    assert "is an input of this run" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in out.iterdir()} == kept
     project = tmp_path / "project"
     project.mkdir()
@@ -353,7 +353,7 @@ def test_an_earlier_run_is_kept_when_the_new_scene_is_bad(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("sites", "expected"),
     [
-        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 0)), (1.0, (1, 0, 0))], "on one place"),
+        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 0)), (1.0, (1, 0, 0))], "coincide"),
         ([(0.0, (0, 0, 0)), (0.0, (1, 0, 0))], "massless"),
         ([(1.0, (0, 0, 0)), (0.0, (1, 0, 0))], "nothing resists its torque"),
         ([(1.0, (0, 0, 0)), (1.0, (0, 0, 1)), (0.0, (0.3, 0, 0.5))], "off the axis of a linear body"),
@@ -532,7 +532,7 @@ def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
     good = simulation.system.state.position.copy()
     simulation.system.state.velocity[7] = 1e150  # gone within a step
     with pytest.raises(
-        SimulationError, match=r"step 1 .*molecule 8 \(spce\) is nowhere.*timestep_fs.*step 0 .*last_good_state"
+        SimulationError, match=r"step 1 .*molecule 8 \(spce\) is lost.*timestep_fs.*step 0 .*last_good_state"
     ):
         simulation.run()
     with np.load(tmp_path / "out" / "last_good_state.npz") as saved:

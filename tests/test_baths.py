@@ -190,7 +190,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
         ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 0.0}, "must be greater than 0"),
         ({"ensemble": "nvt"}, "needs temperature_K"),
         ({"temperature_K": 300.0}, "would do nothing in an nve stage"),
-        ({"integrator": "baoab"}, "has its place for a thermostat"),
+        ({"integrator": "baoab"}, "contains a thermostat"),
         ({"ensemble": "npt", "temperature_K": 300.0}, "needs pressure_bar"),
         ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": [1.0, 1.0, 2.0]}, "'anisotropic'"),
         ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "berendsen"}, "samples no"),

@@ -36,14 +36,14 @@ def faults(**tables):
         ({"body": {"mass_kg": 1.0, "pinned": True}}, "nothing to move"),
         ({"start": {"rotation": [[1.0, 0.01, 0], [0, 1, 0], [0, 0, 1]]}}, "|Q^T Q - 1| is 0.01"),
         ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]]}}, "a reflection"),
-        ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]], "project": True}}, "is no rotation with rounded digits"),
+        ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]], "project": True}}, "is not a rotation with rounded digits"),
         ({"start": {"quaternion_wxyz": [0.0, 0, 0, 0]}}, "quaternion_wxyz is zero"),
         ({"start": {"euler_angles_deg": [0.0, 0, 0], "euler_rates_rad_s": [1.0, 0, 0]}}, "euler_rates_rad_s with theta = 0"),
         ({"start": {"euler_angles_deg": [0.0, 180, 0], "euler_rates_rad_s": [1.0, 0, 0]}}, "with theta = 180"),
         ({"start": {"euler_rates_rad_s": [1.0, 0, 0]}}, "needs euler_angles_deg"),
         ({"start": {"euler_angles_deg": [0.0, 1, 0], "quaternion_wxyz": [1.0, 0, 0, 0]}}, "give one of euler_angles_deg, quat"),
         ({"body": TOP, "start": {"position_m": [0.0, 0, 1]}}, "start.position_m: the body is pinned"),
-        ({"body": TOP, "fluid": {"added_mass_kg": [1.0, 1, 1]}}, "no force of translation acts"),
+        ({"body": TOP, "fluid": {"added_mass_kg": [1.0, 1, 1]}}, "no such force acts"),
         ({"body": {"mass_kg": 1.0}, "start": {"euler_angles_deg": [0.0, 1, 0]}}, "a point does not turn"),
         ({"body": {"mass_kg": 1.0}, "applied": [{"torque_N_m": [0.0, 1, 0]}]}, "a point cannot be turned"),
         ({"friction": {"viscous_N_m_s": [1.0, -1, 0]}}, "must not be less than 0"),
@@ -112,7 +112,7 @@ def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
     said = capsys.readouterr().err
     for part in (
         "6 faults", "line 1: body: no body has this inertia", "line 7: start.position_m: the body is pinned",
-        "line 6: start: the matrix is no rotation", "line 11: friction.viscous_N_m_s.1: is -1, must not be less than 0",
+        "line 6: start: the matrix is not a rotation", "line 11: friction.viscous_N_m_s.1: is -1, must not be less than 0",
         "line 14: applied.0.times_s: must increase: entry 2 is 1 after 2",
         "line 20: run.integrater: unknown key; did you mean integrator?",
     ):  # fmt: skip

@@ -176,7 +176,7 @@ def test_a_site_behind_a_wall_is_an_error_that_says_where():
         ):
             engine.evaluate(state)
     state.position[1, 2] = np.nan
-    with pytest.raises(SimulationError, match="molecule 2 is nowhere"):
+    with pytest.raises(SimulationError, match="molecule 2 is lost"):
         engine.evaluate(state)
     # one that shoots through the wall in a run is named, with a cause and advice
     scene = small_scene({"argon": 2}, None, stages=[{"duration_ps": 1.0, "timestep_fs": 10}], watch={"move": False},

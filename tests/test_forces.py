@@ -110,7 +110,7 @@ def test_molecules_millions_of_cells_away(angles):
         moved.position[:] += cells * away
         assert sum(energies(engine, moved).values()) == pytest.approx(expected, rel=digits)
     moved.position[3, 1] = -1e12
-    with pytest.raises(SimulationError, match=r"molecule 4 is nowhere: it is 1e\+12 Å from the origin"):
+    with pytest.raises(SimulationError, match=r"molecule 4 is lost: it is 1e\+12 Å from the origin"):
         engine.evaluate(moved)
 
 

@@ -276,7 +276,7 @@ def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
     assert found.most_exact.timestep == pytest.approx(1.0)
     said = table_text(found)
     assert "T_rot - T_trans (K): on the steps" in said
-    assert "(held against)" in said
+    assert "(reference)" in said
     assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(advice(found))
     written = write_precision(tmp_path, found, "a command")
     rows = list(csv.DictReader((tmp_path / "precision_averages.csv").open()))

@@ -223,12 +223,12 @@ def test_displacements_over_time_are_speeds(name, tmp_path):
     assert universe.trajectory.dt == pytest.approx(0.1)
     assert universe.trajectory.totaltime == pytest.approx(20)
     assert results.summary["positions"] == "unwrapped"
-    assert "unwrapped: frames hold molecules where they travelled to" in summary_text(results.summary)
+    assert "unwrapped: molecules follow continuous paths" in summary_text(results.summary)
 
 
 def test_the_summary_says_when_positions_are_wrapped():
     scene = small_scene({"argon": 20}, 20.0, output={"positions": "wrapped"})
-    assert "displacements need unwrapped ones" in summary_text(Simulation(scene).run().summary)
+    assert "displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
     for without in ({"output": {"trajectory": False}}, {"box": {"lengths_A": 20.0, "periodic": False}}):
         assert "positions" not in summary_text(Simulation(small_scene({"argon": 20}, 20.0, **without)).run().summary)
 
@@ -305,7 +305,7 @@ def test_when_total_momentum_is_taken_out():
     )
     assert small_scene({}, 25.0, molecules=frozen, forces=pme).resolved().run.remove_momentum_interval_ps is False
     assert small_scene({"argon": 3}, None).resolved().run.remove_momentum_interval_ps is False
-    with pytest.raises(SceneError, match="frozen molecules hold the others"):
+    with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
     assert "total momentum: taken out every 0.2 ps" in text

@@ -30,7 +30,7 @@ def species_of(scene: MolecularScene) -> list[Molecule]:
             faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.faults]
     names = [m.name for m in found]
     faults += [
-        f"molecules: {name} stands there twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1
+        f"molecules: {name} appears twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1
     ]
     if faults:
         raise SceneError(scene.source, faults)

@@ -1,10 +1,10 @@
 """Integrators as data: rows of flows, kicks (forces and torques), drifts (free flight and free rotation), baths, boxes.
 
-A row says by which fractions of the time step the flows follow one another. Kick and drift are symplectic and
-time-reversible, so any palindrome of them is too; its coefficients decide its order.
+A row holds the flows of a step with their fractions of the time step. Kick and drift are symplectic and
+time-reversible, so any palindrome of them is too; the coefficients determine its order.
 
 Compositions of whole Verlet steps keep their order with any rotor, because such a step is symmetric whatever the rotor
-does. Every other row counts on a drift that is the free motion itself: with the split rotor its order would fall to 2.
+does. All other rows need a drift that is the exact free motion: with the split rotor their order falls to 2.
 """
 
 from itertools import pairwise
@@ -25,7 +25,7 @@ class Flow(NamedTuple):
 
 
 class Scheme(NamedTuple):
-    """A step as a row of flows, with what the row needs to know."""
+    """A step as a row of flows, with its name, order and needs."""
 
     name: str
     flows: tuple[Flow, ...]  # kicks add up to 1, drifts too
@@ -36,7 +36,7 @@ class Scheme(NamedTuple):
     box: tuple | None = None  # whose flows BOX and STRETCH are (dynamics.boxes)
 
     def with_rotor(self, rotor: str | None) -> "Scheme":
-        """This scheme on the rotor named ("split" or "exact"); its own where none is."""
+        """This scheme with the named rotor ("split" or "exact"); unchanged for None."""
         return self if rotor is None else self._replace(exact_rotor=rotor == "exact")
 
     @property
@@ -69,7 +69,7 @@ class Scheme(NamedTuple):
         return self._replace(flows=tuple(flow for flow in flows if flow.fraction), box=box)
 
     def with_rest(self, every: int) -> "Scheme":
-        """This scheme with the total momentum of all molecules taken out at the end of every so many steps."""
+        """This scheme with the total momentum of all molecules removed at the end of every `every` steps."""
         return self._replace(flows=(*self.flows, Flow(REST, 0.0, every=every)))
 
     @property
@@ -89,7 +89,7 @@ class Scheme(NamedTuple):
 
     @property
     def force_evaluations(self) -> int:
-        """A step: each kick behind a drift takes one, the last kick of a step and the first of the next share theirs.
+        """In a step: one for each kick after a drift; the first kick of a step uses that of the last kick before it.
 
         A gradient takes one more.
         """
@@ -99,7 +99,7 @@ class Scheme(NamedTuple):
 
 
 def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Scheme:
-    """Velocity Verlet steps of these lengths one after the other; neighbouring kicks are one."""
+    """Velocity Verlet steps of these lengths in succession; neighbouring kicks are merged."""
     kicks = (steps[0] / 2, *((a + b) / 2 for a, b in pairwise(steps)), steps[-1] / 2)
     return Scheme(name, _alternating(kicks, steps), order, False, source)
 
@@ -122,7 +122,7 @@ def split(
 def _alternating(
     kicks: tuple[float, ...], drifts: tuple[float, ...], gradients: tuple[float, ...] | None = None
 ) -> tuple[Flow, ...]:
-    """Kick first, drift, ..., kick; those of length 0 are left out."""
+    """Kick, drift, ..., kick without those of length 0."""
     flows = []
     for k, (kick, tau) in enumerate(zip(kicks, gradients or (0.0,) * len(kicks), strict=True)):
         flows.append(Flow(KICK, kick, tau))
@@ -131,22 +131,22 @@ def _alternating(
 
 
 def odd(*half: float) -> tuple[float, ...]:
-    """Fractions that are mirrored about a single middle one, which makes their sum 1."""
+    """Fractions mirrored about a single middle one that makes their sum 1."""
     return (*half, 1 - 2 * sum(half), *reversed(half))
 
 
 def even(*half: float) -> tuple[float, ...]:
-    """Fractions that are mirrored about two equal middle ones, which make their sum 1."""
+    """Fractions mirrored about two equal middle ones that make their sum 1."""
     half = (*half, 0.5 - sum(half))
     return (*half, *reversed(half))
 
 
 Rotor = Literal["split", "exact"]
-AUTO = "auto"  # in place of a name: the cheapest for an accuracy, found by a pilot run
+AUTO = "auto"  # in place of a name: pilot runs find the cheapest one for an accuracy
 
 
 def auto_faults(integrator: str, asked: dict[str, float | None], idle: list[str]) -> list[str]:
-    """What is wrong between an integrator, the errors asked for (key -> value), and keys that a pilot decides."""
+    """Faults between an integrator, the requested errors (key -> value) and keys that pilot runs decide."""
     given = [key for key, value in asked.items() if value is not None]
     if integrator != AUTO:
         return [f"{', '.join(given)} would do nothing without integrator = 'auto'"] if given else []
@@ -157,20 +157,20 @@ def auto_faults(integrator: str, asked: dict[str, float | None], idle: list[str]
 
 
 def rotor_fault(integrator: str, rotor: Rotor | None) -> str:
-    """Why a scheme cannot go with a rotor; empty if it can."""
+    """Why a scheme and a rotor do not fit; empty if they do."""
     if rotor == "split" and integrator != AUTO and SCHEMES[integrator].exact_rotor:
         return f"{integrator} needs rotor = 'exact': with the split rotor it would be of order 2"
     return ""
 
 
-#: General solvers of the textbook's equations, and the variables of attitude that they may be written in.
+#: General ODE solvers for the textbook equations, and the variables of attitude for them.
 RK4, DOP853, RADAU = "rk4", "dop853", "radau"
 SOLVERS = (RK4, DOP853, RADAU)
 FORMULATIONS = ("matrix", "quaternion", "euler_angles")
 
 
 class Solver(NamedTuple):
-    """A general solver of first-order systems, in place of a scheme of flows."""
+    """A general ODE solver in place of a scheme of flows."""
 
     name: str  # RK4, DOP853 or RADAU
     formulation: str  # of FORMULATIONS

@@ -1,4 +1,4 @@
-"""The state: everything that evolves during a run, and nothing else. And what acts on it."""
+"""The state: everything that evolves during a run, and nothing else. Loads on it, and status codes."""
 
 from math import inf
 from typing import NamedTuple
@@ -53,7 +53,7 @@ class State(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether all that moves is finite numbers."""
+        """Whether all variables are finite."""
         return all(bool(np.isfinite(array).all()) for array in (*self[:4], self.books, self.bath))
 
     def begin_stretch(self, time: float | None = None) -> None:

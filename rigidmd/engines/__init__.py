@@ -1,4 +1,4 @@
-"""Who moves a state. `Engine` is all that a run asks for; `cpu` is this machine's processor, `textbook` a solver."""
+"""Engines move states. `Engine` is their protocol; `cpu` runs compiled code, `textbook` general ODE solvers."""
 
 from typing import NamedTuple, Protocol
 
@@ -9,17 +9,17 @@ from rigidmd.core.state import Load, State
 
 
 class Tally(NamedTuple):
-    """What one term contributes at one moment."""
+    """Contribution of one term at one moment."""
 
     energy: float  # u Å²/ps²
     virial: np.ndarray  # (3, 3) molecular, sum F (x) R, u Å²/ps²
 
 
 class Engine(Protocol):
-    """What a run asks of an engine."""
+    """The methods of an engine that a run uses."""
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state with room for all that evolves when a row moves it."""
+        """A copy of a state, with room for all variables that a row moves."""
         ...
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
@@ -31,9 +31,9 @@ class Engine(Protocol):
         ...
 
     def snapshot(self) -> State:
-        """The state that was last moved, as arrays of this process that nobody else writes; bit for bit."""
+        """An exact copy of the state that was last moved."""
         ...
 
     def forget(self) -> None:
-        """Say that positions were changed from outside since the last step."""
+        """Declare that positions were changed from outside since the last step."""
         ...

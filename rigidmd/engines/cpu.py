@@ -1,10 +1,9 @@
-"""The Python side of the compiled code: it owns lists, grids, sums and machine code, gives kernels room when they ask
-for it, and tells apart what they report."""
+"""The Python side of the compiled code. It owns lists, grids, sums and machine code, enlarges arrays at the request of
+kernels, and handles their status codes."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-import numba
 import numpy as np
 
 from rigidmd.core.schemes import Scheme, Solver
@@ -39,13 +38,13 @@ DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
 class Engine:
-    """What moves states of a model under terms, on this machine's processor.
+    """Moves states of a model under terms with compiled code.
 
     Parameters
     ----------
-    model : what never changes
+    model : the constant part of the system
     terms : name -> term, in the order in which forces are added
-    precision : arithmetic between sites; "mixed" is single, summed and moved in double
+    precision : arithmetic between sites; "mixed": pairs in single precision, sums and motion in double
     skin : extra radius of neighbour lists, Å; speed only
     applied : functions of (time, state) that terms of type `Told` stand for: name -> function
     """
@@ -74,21 +73,21 @@ class Engine:
 
     @property
     def workspaces(self) -> dict[str, NamedTuple]:
-        """The workspaces by the names of their terms, as they are now; there are none before the first use."""
+        """Name of a term -> its present workspace; empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
     def change(self, model: Model | Body, terms: dict[str, NamedTuple]) -> None:
-        """Go on with others of the same types: what follows time as told enters its next piece."""
+        """Continue with a model and terms of the same types, as at a break of given functions of time."""
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
 
     def forget(self) -> None:
-        """Say that positions were changed from outside since the last step."""
+        """Declare that positions were changed from outside since the last step."""
         self._stale = True
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state with room for all that evolves when a scheme moves it; chains and pistons begin at rest."""
+        """A copy of a state, with room for all variables that a scheme moves; chains and pistons begin at rest."""
         row = _scheme_of(row)
         variables = getattr(row.bath, "variables", 0) + isinstance(row.box, Piston)
         return state.copy()._replace(bath=np.zeros(variables))
@@ -115,10 +114,10 @@ class Engine:
         cursor = np.array([0, not self._stale, 0], np.int64)
         while status := advance(*moved, workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor):
             workspaces = self._answer(status, state)
-        self._stale = cursor[1] == 0  # also where there was no step, and nobody has evaluated forces
+        self._stale = cursor[1] == 0  # true also if there was no step, so that no forces were evaluated
 
     def model_for(self, scheme: Scheme) -> Model | Body:
-        """The model with the rotor that a scheme needs; only an asymmetric body turns differently by an exact one."""
+        """The model with the rotor that a scheme needs; only asymmetric bodies turn differently with an exact one."""
         rotor = self.model.rotor
         if scheme.exact_rotor and isinstance(rotor, SplitRotor) and (rotor.symmetry == NONE).any():
             return self.model._replace(rotor=ExactRotor(*rotor))
@@ -148,19 +147,19 @@ class Engine:
         return (0, 0) if self._room is None else (int(self._room.counts[0]), int(self._room.counts[1]))
 
     def room(self, state: State) -> tuple[NamedTuple, ...]:
-        """Workspaces for the cell of a state, new ones, without machine code: what they hold in memory."""
+        """New workspaces for the cell of a state, without machine code; they show the memory needed."""
         setup = self._setup._replace(cell=state.cell)
         return tuple(workspace_of(term, setup) for term in self.terms.values()) or (NoForce(),)
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
-        """Check what compiled code is to work on; its workspaces, made where there are none."""
+        """Check the arrays for compiled code; return its workspaces, made at the first use."""
         _check_arrays(state)
         if self._workspaces is None:
             self._workspaces = tuple(with_code(workspace) for workspace in self.room(state))
         return self._workspaces
 
     def _answer(self, status: int, state: State) -> tuple[NamedTuple, ...]:
-        """Give compiled code what its status asks for; the workspaces with which to call it again."""
+        """Handle a status of compiled code; return the workspaces with which to call it again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
             workspaces = self._workspaces = tuple(with_room(workspace, state.cell) for workspace in workspaces)
@@ -176,27 +175,21 @@ class Engine:
         return workspaces
 
 
-def thread_limit() -> int:
-    """Most threads that Numba uses here: NUMBA_NUM_THREADS of the environment, or one for each core."""
-    # Numba sets the names of its config when it is imported, where no checker sees it
-    return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
-
-
 def _scheme_of(row: Scheme | Solver) -> Scheme:
-    """The same. Raises TypeError unless it is a scheme."""
+    """The row itself. Raises TypeError unless it is a scheme."""
     if not isinstance(row, Scheme):
         raise TypeError(f"{row.name} is a general solver; OdeEngine moves a body by it")
     return row
 
 
 def keep_time(state: State, dt: float) -> None:
-    """Begin a new stretch of equal steps, in place, where the last one was of others, or time was set from outside."""
+    """Begin a new stretch of equal steps, in place, if the step has changed or time was set from outside."""
     if state.time[NOW] != state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt:
         state.begin_stretch()
 
 
 def _check_arrays(state: State) -> None:
-    """Raise TypeError if an array of a state is not of the type that code is compiled for."""
+    """Raise TypeError if an array of a state has another type than code is compiled for."""
     for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
         if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
             raise TypeError(
@@ -206,7 +199,7 @@ def _check_arrays(state: State) -> None:
 
 
 class NotFiniteError(SimulationError):
-    """Positions or momenta that are no numbers any more, or positions that say nothing about forces."""
+    """Positions or momenta that are not finite, or positions too large to define forces."""
 
     def __init__(self, state: State):
         moving = [array for array in state[:4] if len(array)]
@@ -218,8 +211,8 @@ class NotFiniteError(SimulationError):
             self.fault = f"it is {distance:.3g} Å from the origin, too far to tell in which image of the box"
         else:
             self.molecule = int(size.argmax())
-            self.fault = "its position or momentum is no finite number"
-        super().__init__(f"molecule {self.molecule + 1} is nowhere: {self.fault}")
+            self.fault = "its position or momentum is not finite"
+        super().__init__(f"molecule {self.molecule + 1} is lost: {self.fault}")
 
 
 class BehindWallError(SimulationError):

@@ -1,9 +1,9 @@
-"""The motion of a single body as the textbooks write it: a first-order system for a general solver.
+"""The motion of a single body as in textbooks: a first-order system for a general ODE solver.
 
 Variables: attitude (matrix, quaternion or Euler angles), angular velocity (body frame), position and velocity of a
-body that flies, and the work of all that drives or brakes it, so that its energy can be balanced. Solved by classical
-RK4 (compiled) or by SciPy's DOP853 and Radau. The flows of `body` are the engine's own way; these are for comparison,
-and nothing here keeps Q a rotation but accuracy.
+body that flies, and the work of drives and resistance, for the balance of energy. It is solved by classical RK4
+(compiled) or by SciPy's DOP853 and Radau. These solvers are for comparison with the flows of `body`; only their
+accuracy keeps Q a rotation.
 """
 
 from collections.abc import Callable
@@ -38,21 +38,21 @@ from rigidmd.mechanics.rotor import moment_rates
 FORMS: dict[str, Form] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
 SINGULAR = 5  # beyond the codes of core.state: Euler angles too near theta = 0 or pi
-#: Half of the digits of phi and psi are gone there: theta itself has an error of 1e-16.
+#: Half of the digits of phi and psi are lost there, because theta has an error of 1e-16.
 SMALLEST_SINE = 1e-8
-#: Nearer than this, an axis that moves by its distance in a step may jump over the pole.
+#: Nearer to the pole than this, an axis may jump over it in one step.
 NEAR_A_POLE = 0.1
 
 
 @kernel(outer=True)
 def moment_rates_of(rotor, time, k):
-    """`moment_rates`, to be called from Python."""
+    """`moment_rates` for calls from Python."""
     return moment_rates(rotor, time, k)
 
 
 @kernel(outer=True)
 def read(form, model, state, time, y):
-    """The variables as a state, in place."""
+    """Write the variables into a state."""
     n = form.variables
     state.time[NOW] = time
     read_attitude(form, y, state.rotation)
@@ -70,10 +70,10 @@ def read(form, model, state, time, y):
 
 @kernel(outer=True)
 def slopes(form, model, terms, state, load, time, y, dy):
-    """Rates of all variables, in place; a status code. Frame axes; quantities are relative to the frame where so named.
+    """Write the rates of all variables; returns a status code. Lab vectors are along the axes of the frame.
 
     I w' = n + L x w + P x v - h' - I' w; X' = v - Omega x X; V' = F/m - Omega x V; attitude by w - Q^T Omega;
-    W' = the power of drives and brakes, relative to the frame, and of what changes I and h.
+    W' = the power of drives and resistance, relative to the frame, and of changes of I and h.
     """
     read(form, model, state, time, y)
     status = load_bodies(terms, state, load, None)
@@ -111,7 +111,7 @@ def slopes(form, model, terms, state, load, time, y, dy):
 
 @kernel(outer=True)
 def singular(form, y, dy, dt):
-    """Whether theta is within a step of dt of 0 or pi, or so near that phi and psi have lost half of their digits."""
+    """Whether theta is within a step of 0 or pi, or so near that phi and psi have lost half of their digits."""
     if form.variables != 3:
         return False
     s = abs(sin(y[1]))
@@ -144,21 +144,21 @@ def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
 class OdeEngine(Engine):
     """An engine that moves a body by a general solver.
 
-    The variables are in `state.bath`, which `begin` makes; the rest of the state shows them. Of DOP853 and Radau,
-    whose steps go beyond where they are asked to stop, it also has where the last step began and how long it was to
-    be: (time, length, variables there, variables now, sizes of all of them but the work). DOP853 goes on from that to
-    the bit; Radau up to its tolerance, because it also remembers a Jacobian.
+    The variables are in `state.bath`, which `begin` makes; the rest of the state is computed from them. DOP853 and
+    Radau step beyond the requested time, so for them it also holds the begin and the length of the last step: (time,
+    length, variables there, variables now, sizes of all variables but the work). DOP853 continues from it to the bit;
+    Radau within its tolerance, because it also remembers a Jacobian.
     """
 
     model: Body
     _solver: Dop853 | Radau | None = None
     _between: Callable[[float], np.ndarray] | None = None
-    _anew = False  # whether what acts has changed, so that nothing of earlier steps is of use
+    _anew = False  # whether forces have changed, so that earlier steps are of no use
     own_steps = 0  # that DOP853 or Radau has taken
 
     @property
     def evaluations(self) -> int:
-        """Of the slopes, by DOP853 or Radau, since it last began."""
+        """Evaluations of the slopes by DOP853 or Radau since its last start."""
         return self._solver.nfev if self._solver is not None else 0
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
@@ -190,7 +190,7 @@ class OdeEngine(Engine):
             self._adaptive(form, state, solver, dt, until)
 
     def forget(self) -> None:
-        """As `Engine.forget`; the variables stay, the solver begins anew."""
+        """As `Engine.forget`; the variables stay, and the solver restarts."""
         super().forget()
         self._solver = self._between = None
         self._anew = True
@@ -237,7 +237,7 @@ class OdeEngine(Engine):
         read(form, self.model, state, end, y)
 
     def _new_solver(self, form: Form, state: State, solver: Solver, begun, there, sizes) -> Dop853 | Radau:
-        """SciPy's solver at the beginning of one of its steps; of a length that it chooses where none is known."""
+        """SciPy's solver at the begin of one of its steps; it chooses the length if none is known."""
         dy = np.zeros(len(there))
 
         def rates(time, y):
@@ -251,7 +251,7 @@ class OdeEngine(Engine):
         return kind(rates, begun[0], there.copy(), np.inf, rtol=solver.relative_tolerance, atol=absolute, **step)
 
     def _sizes(self, solver: Solver, state: State, y: np.ndarray) -> np.ndarray:
-        """Sizes of the variables but the work, from where they are and from what forces do in the time of the run."""
+        """Sizes of all variables but the work, from their values and from the forces over the duration of the run."""
         load, _ = self.evaluate(state)
         form, duration = _form(solver, state), solver.duration
         parts = [np.ones(form.variables)]
@@ -268,7 +268,7 @@ class OdeEngine(Engine):
 
 
 def _solver_of(row: Scheme | Solver) -> Solver:
-    """The same. Raises TypeError unless it is a solver."""
+    """The row itself. Raises TypeError unless it is a solver."""
     if isinstance(row, Scheme):
         raise TypeError(f"{row.name} is a row of flows; OdeEngine moves a body by general solvers")
     return row
@@ -279,7 +279,7 @@ def _form(solver: Solver, state: State) -> Form:
 
 
 class SingularError(SimulationError):
-    """Euler angles where they say nothing."""
+    """Singular Euler angles."""
 
     def __init__(self, theta: float, time: float):
         where = "0" if np.cos(theta) > 0 else "pi"

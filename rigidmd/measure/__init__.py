@@ -1,1 +1,1 @@
-"""What is read off a state: observables and drift. Never writes to it."""
+"""Measurements on states: observables, drift, limits. Nothing here changes a state."""

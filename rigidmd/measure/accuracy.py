@@ -1,4 +1,4 @@
-"""Errors of forces as a scene asks for them: of Ewald sums, and of single precision between pairs."""
+"""Errors of the forces of a scene: of Ewald sums, and of single precision between pairs."""
 
 from math import pi, sqrt
 from typing import NamedTuple, cast
@@ -18,7 +18,7 @@ from rigidmd.forces.waves.ewald import EwaldWorkspace
 from rigidmd.forces.waves.mesh import PmeWorkspace
 from rigidmd.units import COULOMB
 
-#: The sum that others are held against leaves out so much of what they are estimated to.
+#: Accuracy of the reference sum, relative to the estimated error of the sum under test.
 TIGHTER = 1e-3
 TIGHTEST = 1e-12  # e²/Å²; float64 has no more digits
 
@@ -31,7 +31,7 @@ class Accuracy(NamedTuple):
     largest: float
     force: float  # rms of the forces themselves
     energy: float  # u Å²/ps²
-    reference: str  # what was held against
+    reference: str  # the sum compared with
 
     @property
     def relative(self) -> float:
@@ -40,13 +40,13 @@ class Accuracy(NamedTuple):
 
 
 def accuracy(system: System, state: State) -> Accuracy:
-    """Of a system's Ewald sums at a state. Raises SceneError where it has none."""
+    """Errors of a system's Ewald sums at a state. Raises SceneError if it has none."""
     scene = system.scene
     if system.force_error is None:
         method = scene.forces.electrostatics
         raise SceneError(
             scene.source,
-            [f"--accuracy is that of Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"],
+            [f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"],
         )
     forces = scene.forces.model_copy(
         update={
@@ -73,7 +73,7 @@ def accuracy(system: System, state: State) -> Accuracy:
 
 
 def rounding(system: System, state: State) -> tuple[float, float] | None:
-    """Rms errors of forces and torques that `precision = "mixed"` makes, over their rms; None in double precision."""
+    """Relative rms errors of forces and torques from `precision = "mixed"`; None in double precision."""
     scene = system.scene
     if scene.precision == "double":
         return None
@@ -92,7 +92,7 @@ def _real_part(system: System) -> PairForces:
 
 
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
-    """Coulomb forces on charged sites (s, 3), pairs inside molecules left out, and the Coulomb energy."""
+    """Coulomb forces on charged sites (s, 3) without pairs inside molecules, and the Coulomb energy."""
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     engine = Engine(system.model, charged, system.scene.precision, system.scene.forces.skin_A)
     _, tallies = engine.evaluate(state)
@@ -109,7 +109,7 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
 
 
 def _inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, alpha: float) -> np.ndarray:
-    """Forces (s, 3) that take out what the reciprocal part does between sites of one molecule."""
+    """Forces (s, 3) that cancel those of the reciprocal part between sites of one molecule."""
     force = np.zeros_like(position)
     count = np.diff(first)
     for apart in range(1, count.max(initial=1)):

@@ -1,4 +1,4 @@
-"""The figures a run of a single body is judged by, as one dictionary with units in its keys."""
+"""The summary of a run of a single body: one dictionary with units in its keys."""
 
 import platform
 from importlib.metadata import version
@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.assemble.body import BodySystem
 from rigidmd.measure.motion import Motion
 
-#: Beyond this the motion is not that of the scene.
+#: Larger errors are noted: the motion is then wrong.
 LARGE_ENERGY_ERROR = 1e-3
 
 
@@ -55,11 +55,11 @@ def summarise_body(
 
 
 def _notes(system: BodySystem, motion: Motion) -> list[str]:
-    """What the reader should know before believing the figures."""
+    """Warnings about the results."""
     run, notes = system.scene.run, []
     if abs(run.steps * run.timestep_s - run.duration_s) > 1e-9 * run.duration_s:
         notes.append(
-            f"{run.duration_s:g} s is no whole number of steps; this run is {run.steps * run.timestep_s:g} s long"
+            f"{run.duration_s:g} s is not a whole number of steps; this run is {run.steps * run.timestep_s:g} s long"
         )
     if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
         notes.append(

@@ -1,6 +1,6 @@
-"""Which integrator at which step is the cheapest for an accuracy: found on the start itself, by counting forces.
+"""The cheapest integrator and time step for an accuracy, found by runs from the start.
 
-Forces, not seconds: the same scene makes the same choice on every machine and every day.
+Cost is counted in force evaluations, not seconds, so a scene leads to the same choice on every machine.
 """
 
 from math import ceil, floor, inf, log10
@@ -10,15 +10,15 @@ from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.measure.trials import Subject, Trial, end_of, gap, look
 
-#: In this order: a later one that costs more at its first good step is not refined.
+#: Tried in this order. A later one that costs more at its first good step is not refined.
 CANDIDATES = ("velocity_verlet", "two_stage", "pefrl", "srkn_4", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
 HALVINGS = 12
-#: What an interpolated step is shortened by, so that its error is below the one asked for, not about it.
+#: An interpolated step is shortened by this factor, so that its error falls below the target.
 MARGIN = 0.95
 
 
 class Choice(NamedTuple):
-    """The cheapest, and what it was measured to do."""
+    """The cheapest integrator with its step, and the measured error."""
 
     integrator: str
     timestep: float  # in the subject's unit
@@ -44,9 +44,7 @@ def choose(subject: Subject, target: float, error: str, longest: dict[str, float
     best = min(found.values(), key=lambda trial: _cost(subject, trial))
     per = "ps" if subject.time_unit == "fs" else "s"
     cost, value = _cost(subject, best), getattr(best, error)
-    reason = (
-        f"error {value:.1e} over {subject.span:.3g} {per} where {target:g} was asked for; {cost:.4g} forces per {per}"
-    )
+    reason = f"error {value:.1e} over {subject.span:.3g} {per} for a target of {target:g}; {cost:.4g} forces per {per}"
     common = found.get("velocity_verlet")
     if common is not None and common is not best:
         reason += f", {_cost(subject, common) / cost:.1f} times fewer than velocity_verlet at {common.timestep:.3g} "
@@ -62,7 +60,7 @@ def _cost(subject: Subject, trial: Trial) -> float:
 def _longest_good(
     subject: Subject, name: str, target: float, error: str, longest: float, cheapest: float, exact: State | None
 ) -> Trial | None:
-    """The longest step that is good enough: by halving, then between the last two by the order. None if too dear."""
+    """The longest step within the target: halve the step, then interpolate by the order. None if too expensive."""
     step, bad = longest, None
     for _ in range(HALVINGS):
         good = _trial(subject, name, step, exact)
@@ -70,10 +68,10 @@ def _longest_good(
             break
         bad, step = good, step / 2
         if subject.methods[name].force_evaluations / (2 * step * subject.time_size) > cheapest:
-            return None  # already dearer than another by this, at a step that is too long
+            return None  # already more expensive than another, at a step that is too long
     else:
         return None
-    if bad is None or bad.diverged:  # no further: half of what diverges
+    if bad is None or bad.diverged:  # no interpolation from a step that diverges
         return good
     order = subject.methods[name].order
     guess = bad.timestep * (target / getattr(bad, error)) ** (1 / order)
@@ -88,7 +86,7 @@ def _longest_good(
 
 
 def _trial(subject: Subject, name: str, timestep: float, exact: State | None) -> Trial:
-    """An integrator at a step, over the span, or to its very end where a trajectory is to be compared."""
+    """A trial of an integrator at a step; it ends exactly at the span if trajectories are compared."""
     n = max(1, ceil(subject.span / (timestep * subject.time_size) * (1 - 1e-12)))
     if exact is not None:
         timestep = subject.span / n / subject.time_size
@@ -98,13 +96,13 @@ def _trial(subject: Subject, name: str, timestep: float, exact: State | None) ->
 
 
 def _rounded(step: float) -> float:
-    """Down to three digits."""
+    """Rounded down to three digits."""
     unit = 10.0 ** (floor(log10(step)) - 2)
     return floor(step / unit) * unit
 
 
 def _reference(subject: Subject, target: float) -> State:
-    """The end of the span, good to a tenth of the target. Raises SimulationError."""
+    """The state at the end of the span, exact to a tenth of the target. Raises SimulationError."""
     method = subject.methods[subject.reference]
     steps = 16
     before = end_of(subject, method, steps)
@@ -115,4 +113,4 @@ def _reference(subject: Subject, target: float) -> State:
         if (position if rotation != rotation else rotation) <= 0.1 * target:
             return now
         before = now
-    raise SimulationError(f"no reference is good to a tenth of trajectory_error = {target:g}")
+    raise SimulationError(f"no reference is exact to a tenth of trajectory_error = {target:g}")

@@ -1,15 +1,15 @@
-"""What the columns of results mean: one table for molecules, one for a body, whoever writes, shows or documents them.
+"""Columns of results: one table for molecules and one for a body, for files, displays and documentation.
 
-Of molecules the table is the record itself (`samples.Sample`), each of whose fields carries a `Column`.
+For molecules the table is the record itself (`samples.Sample`): each field carries a `Column`.
 """
 
 from typing import NamedTuple
 
 
 class Column(NamedTuple):
-    """What a column holds."""
+    """Header, unit and meaning of a column."""
 
-    header: str  # in log.csv, in motion.csv; empty where it is not written
+    header: str  # in log.csv or motion.csv; empty if it is not written
     unit: str  # "1" of plain numbers, empty of words
     about: str
 
@@ -51,7 +51,7 @@ BODY = {
     "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
 }
 
-#: What `results[...]` knows of a body besides: several columns as one array.
+#: Additional key of `results[...]` for a body: several columns as one array.
 MATRIX = "Q"
 
 BODY_COLUMNS = {name: Column(name, family.unit, family.about) for family in BODY.values() for name in family.names}

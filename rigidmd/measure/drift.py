@@ -1,11 +1,11 @@
-"""Drift: the slope of a conserved quantity, with an error that knows what kind of noise such a quantity has."""
+"""Drift: the slope of a conserved quantity, with an error for the kind of noise that such quantities have."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-FEW, MANY = 8, 64  # into how many blocks samples are cut to tell slow noise from fast
+FEW, MANY = 8, 64  # numbers of blocks that separate slow noise from fast
 
 
 class Slope(NamedTuple):
@@ -13,21 +13,21 @@ class Slope(NamedTuple):
 
     value: float
     error: float  # standard error; NaN with too few samples
-    rms: float  # of what is left when the line is taken away
+    rms: float  # of the residual
 
 
 def slope(time: ArrayLike, value: ArrayLike) -> Slope:
     """Slope of value (n,) against evenly spaced time (n,).
 
-    The energy of a symplectic run is not a line in white noise. The fast part is the scheme's own, of order dt²; under
-    it the energy walks at random, because potentials are smooth only to some order at their cut-off. A least-squares
-    error that takes all of it for white was too small by a factor 2.2 in 16 runs of 20 ps (64 waters, 1 fs). So both
-    parts are measured, from the Allan variances of few and of many block means,
+    The energy of a symplectic run is not a line in white noise. Its fast part, of order dt², comes from the scheme. Its
+    slow part is a random walk, because potentials are smooth only to some order at their cut-off. The least-squares
+    error for white noise was too small by a factor 2.2 in 16 runs of 20 ps (64 waters, 1 fs). So both parts are
+    measured, from the Allan variances of few and of many block means,
 
         A(m) = white/m + walk m/3,    error² = 12 white/n³ + 6 walk/(5 n)    (per sample spacing)
 
-    and in the same runs slope/error then has a standard deviation of 1.1. The walk's share rests on seven differences
-    of eight blocks: take the error to be good to a third.
+    With it, slope/error has a standard deviation of 1.1 in the same runs. The walk is estimated from seven differences
+    of eight blocks, so the error itself is uncertain by a third.
     """
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)
@@ -56,7 +56,7 @@ def _allan(value: np.ndarray, m: int) -> float:
 
 
 def inefficiency(value: np.ndarray) -> float:
-    """Statistical inefficiency of samples (n,) of mean zero: how many of them are worth one independent sample.
+    """Statistical inefficiency of samples (n,) of mean zero: the number of samples per independent one.
 
     1 + 2 sum C(k), summed to the first k with C(k) <= 0 (Chodera et al. 2007, J. Chem. Theory Comput. 3, 26, eq. 25).
     """

@@ -1,4 +1,4 @@
-"""How violent the next step of molecules would be."""
+"""Strength of the kicks in the next step of molecules."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from rigidmd.dynamics.advance import Model
 
 
 def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
-    """How violent a step would be to each molecule (n,): its largest kick over the thermal size of that momentum.
+    """Largest kick of each molecule (n,) in a step, relative to the thermal size of that momentum.
 
     A kick F dt beyond sqrt(m kT), or n dt beyond sqrt(I kT), comes from an overlap, not from a liquid. The measure is
     relative to the scene's own masses, temperature and time step.

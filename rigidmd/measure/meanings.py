@@ -1,4 +1,4 @@
-"""What the figures of `rigidmd energy` hold, where their names alone do not say it."""
+"""Explanations of the values of `rigidmd energy` whose names are not enough."""
 
 from math import inf
 from typing import cast
@@ -14,7 +14,7 @@ from rigidmd.units import BAR
 
 
 def meanings(system: System) -> dict[str, str]:
-    """In words, by the name of a component of the energy, `virial` or `pressure`."""
+    """Name of an energy component, `virial` or `pressure` -> explanation."""
     methods = {"reaction_field": _of_reaction_field, "ewald": _of_ewald, "pme": _of_ewald}
     has = {*system.terms, *system.constants}
     of_charges = methods.get(system.scene.forces.electrostatics, lambda system: {})(system)
@@ -25,7 +25,7 @@ def meanings(system: System) -> dict[str, str]:
 
 
 def _of_reaction_field(system: System) -> dict[str, str]:
-    """Of a law that ends at a cut-off."""
+    """Of a reaction field."""
     if system.cutoff == inf or "coulomb" not in system.terms:
         return {}
     name = system.scene.forces.truncation
@@ -40,12 +40,12 @@ def _of_reaction_field(system: System) -> dict[str, str]:
         how = f", less its value at the cut-off, times {name} from {start:g} Å on"
     return {
         "coulomb": f"q q (1/r + k r²) up to the cut-off{how}",
-        "reaction_field_self": "charges of each molecule in the field that they raise themselves, by the same law",
+        "reaction_field_self": "charges of each molecule in their own reaction field",
     }
 
 
 def _of_ewald(system: System) -> dict[str, str]:
-    """Of what depends on whether energies of real space are shifted."""
+    """Of Ewald sums; they depend on whether the real-space energy is shifted."""
     real, own = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
     if system.scene.forces.ewald_truncation == "plain":
         return {"coulomb_real": f"{real}, plain at the cut-off", "coulomb_self": own}
@@ -59,7 +59,7 @@ def _of_ewald(system: System) -> dict[str, str]:
 
 
 def _of_pressure(system: System) -> dict[str, str]:
-    """Which of the two has what no motion changes."""
+    """Of virial and pressure: which of them includes constant parts."""
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:
         virial += ", of their forces on one another: fields, walls and restraints act from outside and add nothing"
@@ -68,5 +68,5 @@ def _of_pressure(system: System) -> dict[str, str]:
         pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"
     if "coulomb_frozen" in system.constants:
         constant = f"{system.constant_pressure / BAR:.10g} bar"
-        pressure += f", and {constant}, which takes out what frozen molecules do to one another"
+        pressure += f", and {constant}, which removes the forces between frozen molecules"
     return {"virial": virial, "pressure": pressure}

@@ -1,4 +1,4 @@
-"""The motion of a single body as columns: what motion.csv holds, and how well what should be constant is."""
+"""The motion of a single body as the columns of motion.csv, with the errors of its invariants."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from rigidmd.mechanics.rotor import DrivenRotor
 
 
 class Snapshot(NamedTuple):
-    """A moment of a run as it is kept until the end."""
+    """Time and state of a sample."""
 
     time: float
     state: State
@@ -26,9 +26,9 @@ class Snapshot(NamedTuple):
 
 @dataclass
 class Motion:
-    """The samples of a run, by column.
+    """The samples of a run as columns.
 
-    columns : arrays (t,), in SI units, by the names in motion.csv; `described` says what they are. Position, velocity,
+    columns : arrays (t,), in SI units, by the names in motion.csv; `described` explains them. Position, velocity,
         attitude and omega are relative to the frame; L is the angular momentum relative to axes that do not turn, that
         of wheels (h) included, along the frame's (lab) or body's axes; the kinetic energy is that of I omega, without
         that of wheels about their axes
@@ -52,7 +52,7 @@ class Motion:
 
     @property
     def described(self) -> dict[str, Column]:
-        """What there is, by name."""
+        """Name -> column."""
         found = {name: BODY_COLUMNS[name] for name in self.columns}
         if BODY["rotation"].names[0] in found:
             found[MATRIX] = Column("", "1", "the rotation matrices (n, 3, 3): lab = Q body")
@@ -99,19 +99,19 @@ def _rotation_columns(
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """The same rotations with signs that do not jump from one sample to the next."""
+    """The same rotations, with signs that do not change from one sample to the next."""
     turned = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
     return quaternions * np.concatenate([[1.0], np.cumprod(np.where(turned < 0, -1.0, 1.0))])[:, None]
 
 
 def is_balanced(system: BodySystem) -> bool:
-    """Whether its energy less the work done is conserved: in axes that do not turn, or turn evenly."""
+    """Whether the energy less the work done is conserved: if the frame does not turn, or turns uniformly."""
     frame = system.body.frame
     return isinstance(frame, Inertial) or is_steady(frame.angular_velocity)
 
 
 def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
-    """Kinetic energy (less Omega . J in a turning frame), potential, their sum, and the work of what is neither."""
+    """Kinetic energy (less Omega . J in a turning frame), potential energy, their sum, and the work of other forces."""
     n = len(times)
     kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
     if system.turns:
@@ -138,7 +138,7 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
 
 
 def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Relative error since the start of all that this scene conserves."""
+    """Relative errors since the start of the invariants of this scene."""
     body = system.body
     forces = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
     driven = any(isinstance(term, Drive | Told) for term in system.terms.values())
@@ -171,7 +171,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
 
 
 def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int | None:
-    """The axis of a symmetric body about which nothing acts: L along it is conserved."""
+    """The symmetry axis of a body if no torque acts about it: L along it is conserved."""
     body = system.body
     if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.flight, Immersed):
         return None
@@ -201,7 +201,7 @@ def _relative(error: np.ndarray, scale: float) -> np.ndarray:
 
 
 def drawn_axis(system: BodySystem) -> np.ndarray:
-    """The body axis (3,) whose path is drawn: the one asked for, towards the centre of mass, that of symmetry, or 3."""
+    """The body axis (3,) whose path is drawn: that of the scene, else towards the centre of mass, of symmetry, or 3."""
     if system.scene.output.axis is not None:
         return direction(np.array(system.scene.output.axis))
     if system.centre.any():

@@ -14,7 +14,7 @@ from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 
 class Reading(NamedTuple):
-    """What can be measured of molecules at one moment, in the units of the log. NaN where there is no such thing."""
+    """Observables of molecules at one moment, in the units of the log. NaN if one does not exist."""
 
     components: dict[str, float]  # potential energy by term and constant, kJ/mol
     potential: float  # their sum, kJ/mol
@@ -37,7 +37,7 @@ class Reading(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """One look at a state, in internal units (Å, ps, u, K, u Å²/ps²)."""
+    """Observables at one moment, in internal units (Å, ps, u, K, u Å²/ps²)."""
 
     components: dict[str, float]  # potential energy by term and constant
     virial: np.ndarray  # (3, 3) molecular
@@ -95,7 +95,7 @@ class Observation(NamedTuple):
 
     @property
     def largest_force(self) -> tuple[float, int]:
-        """Largest force on a molecule (u Å/ps²), and which molecule (from 0)."""
+        """Largest force on a molecule (u Å/ps²), and the index of that molecule."""
         size = np.linalg.norm(self.load.force, axis=1)
         return float(size.max()), int(size.argmax())
 
@@ -103,14 +103,14 @@ class Observation(NamedTuple):
 def observe(
     system: System, engine: Engine, state: State, verlet_step: float = nan, freedom: Freedom | None = None
 ) -> Observation:
-    """Everything at once; one evaluation of forces and energies.
+    """All observables, from one evaluation of forces and energies.
 
     freedom : degrees of freedom that temperatures count; those of a conserved total momentum when not given
 
-    verlet_step : time step (ps) of the velocity Verlet that led here. Between its kicks the kinetic energy is higher
+    verlet_step : time step (ps) if the state comes from velocity Verlet. Between its kicks the kinetic energy is higher
     than at its steps by dt²/8 [sum F²/m + sum n . I^-1 n] on average: for a mode of frequency w the first is too high
-    by x/12 and the second too low by x/6, x = (w dt)². Twice the one and once the other, over three, is right to
-    O(x²) (Eastwood et al. 2010, J. Chem. Theory Comput. 6, 2045): the unbiased temperatures.
+    by x/12 and the second too low by x/6, x = (w dt)². The weighted mean (twice the first plus once the second)/3 is
+    right to O(x²) (Eastwood et al. 2010, J. Chem. Theory Comput. 6, 2045): the unbiased temperatures.
 
     Pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
     tensor is the symmetric part: the rest is the rate at which orientations take angular momentum up, 0 on average.

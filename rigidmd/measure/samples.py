@@ -1,4 +1,4 @@
-"""Samples of a run of molecules: one line an observation, kept as rows and asked for as columns."""
+"""Samples of a run of molecules, kept as rows and read as columns."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple, get_args, get_type_hints
@@ -9,7 +9,7 @@ from rigidmd.measure.columns import Column
 
 
 class Sample(NamedTuple):
-    """One line of the log, in its units. What is not there is NaN: pressure without a box, T_rot of points."""
+    """One line of the log, in its units. Missing values are NaN: pressure without a box, T_rot of points."""
 
     step: Annotated[int, Column("Step", "1", "steps since the start")]
     time: Annotated[float, Column("Time (ps)", "ps", "time since the start")]
@@ -74,5 +74,5 @@ class Samples:
 
     @property
     def described(self) -> dict[str, Column]:
-        """What there is, by name."""
+        """Name -> column."""
         return COLUMNS

@@ -1,4 +1,4 @@
-"""Stability: what came of runs that try to break the engine, the verdict on each, and the longest step that holds."""
+"""Stability: outcomes of runs that try to break the engine, verdicts on them, and the longest bounded step."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from typing import NamedTuple
 from rigidmd.measure.body_summary import LARGE_ENERGY_ERROR
 
 RIGHT, REFUSED, TOLD, SILENT, CRASH = "right", "refused", "told", "SILENT", "crash"
-#: What each verdict means; the last two fail the battery.
+#: Meaning of each verdict; the last two fail the battery.
 VERDICTS = {
     RIGHT: "the answer is right within the error stated",
     REFUSED: "one of the engine's own errors says what is wrong",
@@ -16,17 +16,17 @@ VERDICTS = {
     SILENT: "the answer is wrong and nothing shows it",
     CRASH: "an error that is not one of the engine's own",
 }
-#: A run whose conserved quantities are off by this much of the kinetic energy is no longer bounded.
+#: A run is bounded while the errors of conserved quantities stay below this fraction of the kinetic energy.
 BOUND = 0.1
-#: The step is doubled until it is no longer bounded, so often at most; then bisected to this ratio.
+#: Most doublings of a step that is bounded; ratio at which bisection ends.
 DOUBLINGS, RATIO = 10, 1.1
 
 
 class Outcome(NamedTuple):
-    """What came of one run.
+    """The outcome of one run.
 
-    error : against what is known, in the unit of its case; told : the largest error of what the run itself reports as
-    conserved, relative to kinetic energy or |L|; message : the error of ours that refused or stopped it
+    error : against the known answer, in the unit of the case; told : the largest error of a conserved quantity that the
+    run itself reports, relative to kinetic energy or |L|; message : of the rigidmd error that refused or stopped it
     """
 
     error: float = nan
@@ -38,9 +38,9 @@ class Outcome(NamedTuple):
 
 @dataclass
 class Trial:
-    """One run, and what was expected of it.
+    """One run with its expected outcome.
 
-    setting : what was varied, in words; x : the same as a number, for the figure; allowed : the error stated
+    setting : what was varied, in words; x : the same as a number for the figure; allowed : largest error
     """
 
     setting: str
@@ -70,20 +70,20 @@ class Trial:
 
 
 class Limit(NamedTuple):
-    """The longest step of a family that is still bounded, and how it fails beyond."""
+    """The longest bounded step of a family of integrators, and how longer steps fail."""
 
     setting: str
     family: str
-    longest: float  # inf where no step tried was too long, 0 where none was short enough
+    longest: float  # inf if no step tried was too long, 0 if none was short enough
     beyond: str  # drift, blow-up, detected, SILENT, crash; empty where nothing fails
     message: str
     seconds: float
-    curve: tuple[tuple[float, float], ...]  # (step, what the run told), by step
+    curve: tuple[tuple[float, float], ...]  # (step, error that the run reported), by step
 
 
 @dataclass
 class Finding:
-    """All trials and limits of a case. x_title, error_title, step_unit say what its numbers are."""
+    """All trials and limits of a case. x_title, error_title, step_unit describe its numbers."""
 
     name: str
     group: int
@@ -111,12 +111,12 @@ class Finding:
 
     @property
     def families(self) -> list[str]:
-        """Integrators, in the order in which they came."""
+        """Integrators in the order of the trials."""
         return list(dict.fromkeys([t.family for t in self.trials] + [limit.family for limit in self.limits]))
 
     @property
     def silent(self) -> list[str]:
-        """What fails the battery: each a sentence."""
+        """Failures of the battery, one sentence each."""
         found = [
             f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or SILENT}"
             for t in self.trials
@@ -130,17 +130,17 @@ class Finding:
 
     @property
     def unexpected(self) -> list[Trial]:
-        """Trials that ended otherwise than expected."""
+        """Trials with another outcome than expected."""
         return [trial for trial in self.trials if not trial.as_expected]
 
 
 def bounded(outcome: Outcome, bound: float = BOUND) -> bool:
-    """Whether a run came to its end and what it conserves is no further off than this."""
+    """Whether a run reached its end with all errors of conserved quantities within this bound."""
     return not outcome.message and not outcome.crash and outcome.told <= bound
 
 
 def failure(outcome: Outcome) -> str:
-    """How a run that is not bounded fails; a result that nothing tells to be wrong is SILENT."""
+    """How an unbounded run fails; SILENT if nothing reveals the error."""
     if outcome.crash:
         return CRASH
     if outcome.message:
@@ -155,8 +155,8 @@ def longest_step(
 ) -> Limit:
     """The longest step that is bounded: doubled or halved from `start`, then bisected.
 
-    What is just beyond, and at two and four times the limit, says how it fails; the worst of them is told, because a
-    step far too long can look quiet again.
+    Runs just beyond the limit and at two and four times it show how it fails. The worst outcome is reported, because a
+    step that is far too long can look stable again.
     """
     seen: dict[float, Outcome] = {}
 

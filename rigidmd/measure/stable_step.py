@@ -1,4 +1,4 @@
-"""The longest stable time step, estimated before the first one from the stiffest motion that a state shows."""
+"""The longest stable time step, estimated before the first step from the stiffest motion of a state."""
 
 from functools import cache
 from math import inf, sqrt
@@ -18,13 +18,13 @@ from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
-#: Evaluations of forces for the stiffest motion; its frequency is then good to a few percent.
+#: Force evaluations for the stiffest motion; its frequency is then exact to a few percent.
 DIRECTIONS = 16
 #: Displacement for a difference of forces, in smallest diameters.
 SMALL = 1e-5
-#: Larger systems are estimated only where that costs less than 1 % of the stage.
+#: For larger systems the estimate is made only if it costs less than 1 % of the stage.
 SMALL_SYSTEM = 1000
-#: How far the stiffest motions of a liquid swing (rms) at its temperature, as angles and in diameters. Measured by
+#: Rms amplitudes of the stiffest motions of a liquid at its temperature, as angles and in diameters. Measured by
 #: `stiffest` at the end of 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in
 #: CO2 and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in CO2, 0.006 in water.
 SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
@@ -34,8 +34,8 @@ SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 def stable_angle(method: Scheme | Solver) -> float:
     """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and all smaller steps.
 
-    A step of a scheme multiplies (x, v/w) by a matrix of determinant 1, bounded while |trace| <= 2. Inf of solvers
-    that choose their own steps.
+    A step of a scheme multiplies (x, v/w) by a matrix of determinant 1, which is bounded while |trace| <= 2. Infinite
+    for solvers that choose their own steps.
     """
     if isinstance(method, Solver):
         return 2 * sqrt(2) if method.name == RK4 else inf
@@ -57,14 +57,14 @@ class Stiffest(NamedTuple):
     """The fastest small motion about a state."""
 
     rate: float  # angular frequency, rad/ps
-    molecule: int  # that takes the largest part in it
+    molecule: int  # with the largest share in it
 
 
 def stiffest(system: System, state: State) -> Stiffest | None:
-    """The fastest small motion of all molecules together; None where none of them is held.
+    """The fastest small motion of all molecules together; None if no restoring force acts.
 
-    The largest eigenvalue of the mass-weighted matrix of force differences, in the space that it makes of one random
-    vector (Arnoldi); the state is left alone. One evaluation of forces for each of `DIRECTIONS` directions.
+    The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of one random vector
+    (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one force evaluation.
     """
     model, engine = system.model, system.engine()
     mass = np.sqrt(model.inverse_mass[model.species])[:, None]
@@ -113,11 +113,11 @@ def stiffest(system: System, state: State) -> Stiffest | None:
 
 
 def long_steps(scene: MolecularScene) -> list[str]:
-    """Warnings of steps too long for what these molecules do in a liquid; nothing is compiled for it.
+    """Warnings of steps too long for these molecules in a liquid. Nothing is compiled for them.
 
-    At a temperature T a motion of angular frequency w swings by sqrt(kT/m)/w, rms. So a step is unstable where a
-    molecule at its thermal speed sqrt(kT/m) goes further in it than `stable_angle` such swings; and turns further,
-    about its lightest axis.
+    At a temperature T a motion of angular frequency w has the rms amplitude sqrt(kT/m)/w. So a step is unstable if a
+    molecule at its thermal speed sqrt(kT/m) moves in it by more than `stable_angle` such amplitudes; the same holds
+    for the rotation about its lightest axis.
     """
     warnings = []
     species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
@@ -140,9 +140,9 @@ def long_steps(scene: MolecularScene) -> list[str]:
 
 
 class _Swing(NamedTuple):
-    """What the stiffest motion of a molecule in a liquid is like."""
+    """The stiffest motion of a molecule in a liquid."""
 
-    time: float  # ps, in which it goes so far at its thermal speed
+    time: float  # ps, for the amplitude at its thermal speed
     size: float
     unit: str
     name: str
@@ -150,7 +150,7 @@ class _Swing(NamedTuple):
 
 
 def _swings(m: Molecule, thermal: float) -> list[_Swing]:
-    """Of a molecule's translation, where it has a diameter, and of its lightest axis. thermal : kT, u Å²/ps²"""
+    """Those of a molecule with a diameter in translation, and about its lightest axis. thermal : kT, u Å²/ps²"""
     diameter = max((sigma for sigma, epsilon in zip(m.sigma, m.epsilon, strict=True) if epsilon > 0), default=inf)
     moves = SWING_DIAMETERS * diameter * sqrt(m.mass / thermal)
     lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
@@ -162,15 +162,15 @@ def _swings(m: Molecule, thermal: float) -> list[_Swing]:
 
 
 def is_worth_it(system: System, evaluations: int) -> bool:
-    """Whether an estimate costs next to nothing, compared with the forces that a stage evaluates."""
+    """Whether an estimate is cheap compared with the force evaluations of a stage."""
     return len(system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
 
 
 def body_rate(system: BodySystem) -> float:
-    """The fastest of what a body's steps have to follow at its start, rad/s: the swing of its weight, and its spin.
+    """The fastest rate (rad/s) that a body's steps have to resolve at its start: swing under its weight, or spin.
 
-    Rotors turn a body on which nothing acts however it spins, the split one unless it is asymmetric; about an axis of
-    symmetry that the weight lies on, they leave of a spin the nutation. General solvers have to follow it all.
+    The exact rotor turns a free body exactly at any spin, the split one only a symmetric body. For a weight on the axis
+    of symmetry, only the nutation remains of the spin. General solvers have to resolve all of it.
     """
     if not system.turns:
         return 0.0

@@ -1,4 +1,4 @@
-"""What errors are measured on: the start of a scene, with every method that can move it.
+"""Subjects of error measurements: the start of a scene with every method that can move it.
 
 Both `rigidmd precision` and `integrator = "auto"` use these.
 """
@@ -23,27 +23,27 @@ from rigidmd.scene import BodyScene
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
-#: General solvers of the textbook's equations, beside which the engine's own ways with a body can be seen.
+#: General ODE solvers for the textbook equations of a body, for comparison with the engine's schemes.
 COMPARATORS = {
     solver if form == "matrix" else f"{solver}_{form}": (solver, form) for solver in SOLVERS for form in FORMULATIONS
 }
 SPAN_PS = 0.1
-#: A step of velocity Verlet, and the span of a pilot run, for one radian of the mean vibration or libration.
+#: Step of velocity Verlet and span of a pilot run, in radians of the mean vibration or libration.
 PILOT_STEP, PILOT_SPAN = 0.15, 10.0
-#: Looks and steps of a body's first run, which only tells how fast it moves.
+#: Looks and steps of a body's first run, which only measures how fast it moves.
 LOOKS, STEPS = 200, 20_000
 
 
 def _on_rotor(name: str, rotor: str | None) -> Scheme:
-    """The scheme on the rotor that the scene asks for, where it can have that."""
+    """The scheme with the rotor of the scene if it supports it."""
     scheme = SCHEMES[name]
     return scheme if scheme.exact_rotor else scheme.with_rotor(rotor)
 
 
 def natural_time(system: System, state: State) -> float | None:
-    """Time (ps) in which the faster of vibration and libration moves on by a radian; None of what is at rest.
+    """Time (ps) of one radian of the faster of vibration and libration; None at rest.
 
-    Its inverse squared is <F²/m> / <m v²>, for a harmonic motion in equilibrium its mean square frequency; the same of
+    Its inverse squared is <F²/m> / <m v²>, the mean square frequency of a harmonic motion in equilibrium; likewise for
     torques.
     """
     engine = system.engine()
@@ -61,7 +61,7 @@ def _ratio(a: float, b: float) -> float:
 
 
 def molecular_subject(system: System, start: State, rotor: str | None, span: float) -> Subject:
-    """Molecules from a state on, for `span` ps."""
+    """Molecules that start at a state and run for `span` ps."""
     state = start.copy()
     state.step[:] = 0
     state.begin_stretch(0.0)
@@ -122,7 +122,7 @@ def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
 def body_subject(
     scene: BodyScene, span: float | None = None, applied: dict[str, Callable[[Pose], tuple]] | None = None
 ) -> tuple[Subject, float]:
-    """A body for `span` s, its run or until something told changes; and the fastest rate (rad/s) at which it turns."""
+    """A body for `span` s (default: its run, up to the first break), and its fastest rate of rotation (rad/s)."""
     run = scene.run
     keys = ("rotor", "formulation", "relative_tolerance", "absolute_tolerance", "energy_error", "trajectory_error")
     plain = dict.fromkeys(keys)
@@ -136,7 +136,7 @@ def body_subject(
         except SceneError as error:
             refused[name] = "; ".join(_why(fault, solver) for fault in error.faults)
     if not fits:
-        build_body(scene, applied)  # says what is wrong with it
+        build_body(scene, applied)  # raises the error
     system = fits["velocity_verlet"]
     whole = min([span or run.duration_s, *system.breaks()])
     seen = _first_look(system, whole)
@@ -189,12 +189,12 @@ def body_subject(
 
 
 def _why(fault: str, name: str) -> str:
-    """A fault of an integrator as a reason, without what to use instead."""
+    """A fault of an integrator as a reason, without the advice."""
     return re.split("[:;] use ", fault.removeprefix("run: "))[0].replace(name, "it")
 
 
 def _first_look(system: BodySystem, whole: float) -> Motion:
-    """How the body moves in this time, roughly."""
+    """The motion in this time, roughly."""
     engine = system.engine()
     state = engine.begin(system.state, system.method)
     snapshots, every = [Snapshot(0.0, state.copy())], STEPS // LOOKS
@@ -205,7 +205,7 @@ def _first_look(system: BodySystem, whole: float) -> Motion:
 
 
 def choose_for_molecules(system: System, state: State, stage: Stage) -> tuple[str, float, str]:
-    """Integrator, time step (fs) and reason for a stage that starts at a state and leaves them open.
+    """Integrator, time step (fs) and reason for a stage that leaves them open and starts at a state.
 
     Raises SimulationError.
     """
@@ -217,7 +217,7 @@ def choose_for_molecules(system: System, state: State, stage: Stage) -> tuple[st
 
 
 def decided_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None) -> tuple[BodyScene, str]:
-    """A scene that leaves integrator and step open, with both; and in words why. Raises SimulationError."""
+    """A scene with integrator and step chosen, and the reason in words. Raises SimulationError."""
     run = scene.run
     subject, _ = body_subject(scene, applied=applied)
     longest = {name: run.timestep_s for name in subject.methods if name in SCHEMES}

@@ -1,4 +1,4 @@
-"""The figures a run is judged by, as one dictionary with units in its keys."""
+"""The summary of a run: one dictionary with units in its keys."""
 
 import platform
 from collections import Counter
@@ -15,7 +15,7 @@ from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
-#: Share of the translational temperature that a drift of all molecules may have unsaid.
+#: Largest share of the translational temperature in a common drift of all molecules without a note.
 SHOWS = 1e-4
 
 
@@ -36,7 +36,7 @@ def summarise(
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
 
-    choices : of stages that left their integrator open, what was chosen and why
+    choices : choice and reason for stages that left their integrator open
     stable : the longest stable step (ps) of stages, as estimated at their start
     moves : of stages with a box that moves, how many moves were tried and accepted
     """
@@ -80,7 +80,7 @@ def summarise(
 
 
 def _removed(system: System, state: State) -> dict | None:
-    """What removals of the total momentum took out in the whole run; None where there are none."""
+    """Energy removed with the total momentum in the whole run; None without such removals."""
     if system.removes_momentum_every is None:
         return None
     return {
@@ -90,8 +90,8 @@ def _removed(system: System, state: State) -> dict | None:
 
 
 def _drifting(system: System, state: State, last: Sample) -> list[str]:
-    """A note where what is conserved of the total momentum, whose degrees of freedom are not counted, has energy that
-    temperatures show."""
+    """A note if the conserved part of the total momentum, whose degrees of freedom are not counted, shows in the
+    temperatures."""
     if not system.freedom.translation or not last.temperature_translation > 0:
         return []
     mass = system.model.mass[system.model.species]
@@ -101,7 +101,7 @@ def _drifting(system: System, state: State, last: Sample) -> list[str]:
         return []
     return [
         f"the molecules drift together with |P| = {momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
-        "run.remove_momentum_interval_ps takes the total momentum out"
+        "run.remove_momentum_interval_ps removes the total momentum"
     ]
 
 
@@ -113,7 +113,7 @@ def _relative_momentum(system: System, state: State, momentum: float) -> float:
 
 
 def _stage(system: System, samples: list[Sample], k: int, computing: float, moves: tuple[int, int]) -> dict:
-    """Figures of one stage. It begins with the last sample before it, from which its drift is counted."""
+    """Values of one stage. Its drift is counted from the last sample before it."""
     own = [sample for sample in samples if sample.stage == k]
     before = [sample for sample in samples if sample.stage == k - 1][-1:]
     stage = system.scene.stages[k]
@@ -175,7 +175,7 @@ def _known(value: float) -> float | None:
 
 
 def mean(values: ArrayLike) -> tuple[float | None, float | None]:
-    """Mean and its standard error, with neighbouring samples' likeness counted; None where there is no value."""
+    """Mean and its standard error, which accounts for correlation; None if a value is NaN."""
     array = np.array(values, dtype=float)
     if np.isnan(array).any():
         return None, None

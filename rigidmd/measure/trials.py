@@ -1,8 +1,8 @@
-"""Error against run time: the same start moved by every integrator at several steps, each measured.
+"""Error against run time: every integrator moves the same start at several time steps.
 
-What is compared is what a user pays and gets: seconds of computing and force evaluations for a stretch of time, against
-the error of the trajectory at its end, that of the energy and of all else that is conserved on the way, and, of liquids
-on request, the bias of what they are simulated for: temperatures, potential energy, pressure.
+The cost is seconds of computing and force evaluations for a span of time. The errors are those of the trajectory at its
+end, of the energy and of other conserved quantities on the way and, for liquids on request, the bias of temperatures,
+potential energy and pressure.
 """
 
 import time as clock
@@ -26,18 +26,18 @@ from rigidmd.measure.summary import mean
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import KJ_PER_MOL
 
-#: Looks at the energy in a span.
+#: Number of looks at the energy in a span.
 LOOKS = 40
-#: An energy that is wrong by this much of the kinetic energy is no result of a step that is merely inaccurate.
+#: A run diverges if its energy error exceeds this fraction of the kinetic energy.
 DIVERGED = 0.5
-#: Averages are taken from looks this far apart, ps: about as long as the kinetic energy of water remembers itself.
+#: Time between looks for averages, ps: about the correlation time of the kinetic energy of water.
 LOOK_PS = 0.02
-#: Steps that warm up an engine: its lists are built, its buffers grow, its memory is touched. The first 25 steps of
-#: 216 waters took 40 ms, the next 25 20 ms.
+#: Steps that warm up an engine: they build lists, grow buffers and touch memory. The first 25 steps of 216 waters took
+#: 40 ms, the next 25 took 20 ms.
 WARM_UP = 10
-#: Seconds of computing in a timing, at least.
+#: Least seconds of computing in a timing.
 TIMED = 0.2
-#: Of general solvers that choose their own steps.
+#: For general solvers that choose their own steps.
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 
 
@@ -54,25 +54,25 @@ class Method(NamedTuple):
 
     @property
     def force_evaluations(self) -> int:
-        """In a step, of what is given its steps."""
+        """In a step of given length."""
         return 4 if isinstance(self.how, Solver) else self.how.force_evaluations
 
     @property
     def order(self) -> int:
-        """Of the error in the step, of what is given its steps."""
+        """Order of the error in a given step."""
         return 4 if isinstance(self.how, Solver) else self.how.order
 
 
 @dataclass
 class Subject:
-    """What is moved: a start, and how to measure it.
+    """A start, and how to measure errors on it.
 
-    methods : by name. energy(engine, state) : the conserved energy. energy_unit : one unit of the reported error of the
-    energy, in words, with a note on it; energy_size : that unit in the units of `energy`. kinetic : a kinetic energy by
-    which divergence is judged. kept(state) : relative errors of all else that is conserved. observe(engine, state,
-    step) : of molecules in a box, what averages are taken of; None of others. reference : the method of the reference.
-    goes_on : whether the motion may be followed beyond the span to time it; else it starts again. refused : why, by
-    name, of what cannot move this subject. singular : names of methods whose variables do not exist at the start.
+    methods : by name. energy(engine, state) : the conserved energy. energy_unit : the unit of the reported energy
+    error, in words, with a note; energy_size : that unit in the units of `energy`. kinetic : the kinetic energy that
+    sets the limit of divergence. kept(state) : relative errors of other conserved quantities. observe(engine, state,
+    step) : the averaged observables of molecules in a box; None for others. reference : the method of the reference.
+    goes_on : whether timing may continue beyond the span; else it starts again. refused : name -> reason for methods
+    that cannot move this subject. singular : names of methods whose variables do not exist at the start.
     rounding : relative rms errors of forces and torques in mixed precision; None in double.
     """
 
@@ -103,19 +103,19 @@ class Trial:
     """One integrator at one step."""
 
     integrator: str
-    timestep: float  # in the subject's unit; the mean one of what chooses its steps
+    timestep: float  # in the subject's unit; the mean of steps that the method chooses
     steps: int
     forces: int  # evaluations in the span
-    seconds: list[float] = field(default_factory=list)  # of computing in a span, one for each repeat
+    seconds: list[float] = field(default_factory=list)  # of computing in a span, for each repeat
     rotation_error: float = np.nan  # largest |Q - Q_ref| at the end
     position_error: float = np.nan  # largest |X - X_ref| at the end
     energy_rms: float = np.nan  # in the subject's unit
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality: float = np.nan
-    kept: dict[str, float] = field(default_factory=dict)  # largest relative errors of what else is conserved
-    tolerance: float | None = None  # of what chooses its steps
-    fault: str = ""  # why it did not get to the end, or to nothing that means anything
+    kept: dict[str, float] = field(default_factory=dict)  # largest relative errors of other conserved quantities
+    tolerance: float | None = None  # of a method that chooses its steps
+    fault: str = ""  # why it failed or diverged
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
 
     @property
@@ -130,29 +130,29 @@ class Trial:
 
     @property
     def spread(self) -> float | None:
-        """Largest less smallest of the seconds over their median; None of what was timed once."""
+        """Range of the seconds over their median; None if timed once."""
         return (max(self.seconds) - min(self.seconds)) / self.time if len(self.seconds) > 1 else None
 
     @property
     def trajectory_error(self) -> float:
-        """The error of the rotation, or of the position of what does not turn."""
+        """The error of the rotation; of the position if nothing turns."""
         return self.position_error if np.isnan(self.rotation_error) else self.rotation_error
 
 
 @dataclass
 class Precision:
-    """All trials of a subject, and how good the reference is that they were held against."""
+    """All trials of a subject, and the error of their reference."""
 
     subject: Subject
     trials: list[Trial]
     reference_steps: int
-    reference_error: float  # of the reference's own end, from half as many steps
-    sampled: float | None = None  # ps of which averages were taken
-    left_out: dict[str, str] = field(default_factory=dict)  # usual methods that were not tried -> why
+    reference_error: float  # of the reference, from a run with half as many steps
+    sampled: float | None = None  # ps of averaging
+    left_out: dict[str, str] = field(default_factory=dict)  # usual methods that were not tried -> reason
 
     @property
     def most_exact(self) -> Trial:
-        """The trial with the smallest energy error, against whose averages those of the others are held."""
+        """The trial with the smallest energy error, whose averages are the reference of the others."""
         return min((t for t in self.trials if t.averages), key=lambda t: t.energy_rms)
 
     def stable_step(self, integrator: str) -> float | None:
@@ -171,7 +171,7 @@ class Precision:
     def time_for(self, integrator: str, error: str, target: float) -> tuple[float, float] | None:
         """(seconds, time step) at which an integrator reaches an error, between its trials.
 
-        Its longest step where that is good enough; None where its shortest is not.
+        Its longest step if that is exact enough; None if its shortest is not.
         """
         own = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
         own.sort(key=lambda t: -t.timestep)
@@ -194,9 +194,9 @@ def measure(
     averages: float | None = None,
     say: Callable[[float], object] = lambda share: None,
 ) -> Precision:
-    """Run all trials and the reference; time the trials `repeats` times, alternating; say(share done) in between.
+    """Run all trials and the reference; time the trials alternately `repeats` times; report progress by say(share).
 
-    averages : ps over which every trial is sampled besides; none when not given
+    averages : ps over which every trial is also averaged; None for no averages
     """
     most = max((trial.forces for trial in trials), default=0) or LOOKS * LOOKS
     reference = subject.methods[subject.reference]
@@ -204,7 +204,7 @@ def measure(
     exact = end_of(subject, reference, steps)
     own_error = gap(exact, end_of(subject, reference, steps // 2))
     result = Precision(subject, trials, steps, max(gap for gap in own_error if not np.isnan(gap)), averages)
-    for trial in trials:  # compiled, and looked at
+    for trial in trials:  # compile and measure errors
         look(subject, trial, exact)
     good = [trial for trial in trials if not trial.diverged]
     done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / subject.span)
@@ -222,9 +222,9 @@ def measure(
 
 
 def timing(subject: Subject, trial: Trial) -> float:
-    """Seconds of computing in a span, from spans that take `TIMED` together, of an engine that has made steps before.
+    """Seconds of computing in a span, from spans of `TIMED` seconds in all, with a warm engine.
 
-    What a call of no steps costs is taken off: 15 µs, as much as 200 steps of a free body.
+    The cost of a call without steps is subtracted: 15 µs, as much as 200 steps of a free body.
     """
     engine, state = _begun(subject, trial)
     begun, done = state.copy(), 0
@@ -250,7 +250,7 @@ def timing(subject: Subject, trial: Trial) -> float:
         call = seconds_of(0)
         try:
             computing += seconds_of(trial.steps)
-        except SimulationError:  # a step that is good for the span is not for ever
+        except SimulationError:  # a step that is stable over the span may fail later
             if done == 0:
                 raise
             start_again()
@@ -262,9 +262,9 @@ def timing(subject: Subject, trial: Trial) -> float:
 
 
 def plan(subject: Subject, steps: dict[str, list[float]]) -> list[Trial]:
-    """Trials of integrators at time steps (in the subject's unit), fitted a whole number of times into the span.
+    """Trials of integrators at time steps (in the subject's unit), adjusted to a whole number in the span.
 
-    What chooses its steps is given tolerances instead.
+    Methods that choose their steps get tolerances instead.
     """
     trials = {}
     for integrator, timesteps in steps.items():
@@ -282,14 +282,14 @@ def plan(subject: Subject, steps: dict[str, list[float]]) -> list[Trial]:
 
 
 def _begun(subject: Subject, trial: Trial) -> tuple[Engine, State]:
-    """A new engine for a trial, and the start for it to move."""
+    """A new engine for a trial, and a state at the start."""
     method = subject.methods[trial.integrator]
     engine = method.engine()
     return engine, engine.begin(subject.state, _how(method, trial))
 
 
 def _how(method: Method, trial: Trial) -> Scheme | Solver:
-    """What moves the subject, with the tolerance of a trial where it has one."""
+    """The method's scheme or solver, with the tolerance of a trial if it has one."""
     if not method.chooses_steps:
         return method.how
     return method.how._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
@@ -303,7 +303,7 @@ def _advance(subject: Subject, engine: Engine, state: State, trial: Trial, steps
 
 
 def end_of(subject: Subject, method: Method, steps: int) -> State:
-    """The end of the span in so many steps."""
+    """The state at the end of the span after this many steps."""
     engine = method.engine()
     state = engine.begin(subject.state, method.how)
     engine.advance(state, method.how, subject.span / steps, steps)
@@ -311,7 +311,7 @@ def end_of(subject: Subject, method: Method, steps: int) -> State:
 
 
 def gap(a: State, b: State) -> tuple[float, float]:
-    """Largest differences of rotations and positions; NaN of what a state does not have."""
+    """Largest differences of rotations and positions; NaN if a state has none."""
     return _furthest(a.rotation, b.rotation), _furthest(a.position, b.position)
 
 
@@ -320,7 +320,7 @@ def _furthest(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def look(subject: Subject, trial: Trial, exact: State | None) -> None:
-    """One run with looks at what is conserved; all of the trial but its seconds. Its end is held against `exact`."""
+    """One run that measures all errors of a trial. Its end is compared with `exact`."""
     engine, state = _begun(subject, trial)
     first = subject.energy(engine, state)
     times, energies = [0.0], [0.0]
@@ -356,7 +356,7 @@ def look(subject: Subject, trial: Trial, exact: State | None) -> None:
 
 
 def _average(subject: Subject, trial: Trial, length: float) -> None:
-    """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and without bias."""
+    """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and unbiased."""
     observe = subject.observe
     if observe is None:
         raise ValueError("averages are for molecules in a box")
@@ -378,7 +378,7 @@ def _average(subject: Subject, trial: Trial, length: float) -> None:
     found = {"potential": series("potential") / KJ_PER_MOL / subject.molecules, "pressure": series("pressure_bar")}
     for name, key in (("T_trans", "translation"), ("T_rot", "rotation")):
         on, unbiased = series(f"temperature_{key}"), series(f"temperature_{key}_unbiased")
-        # the one on the steps and the one between them, of which the unbiased is (one + twice the other)/3
+        # unbiased = (on the steps + twice between the kicks)/3
         found |= {name: on, f"{name} half-step": 1.5 * unbiased - 0.5 * on, f"{name} unbiased": unbiased}
     for kind in ("", " half-step", " unbiased"):
         found[f"T_rot - T_trans{kind}"] = found[f"T_rot{kind}"] - found[f"T_trans{kind}"]

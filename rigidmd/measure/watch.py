@@ -1,7 +1,7 @@
-"""What shows that the numbers of a run no longer mean what its scene says, and the words for it.
+"""Checks that the numbers of a run are still meaningful, and messages if they are not.
 
-Nothing here costs an evaluation of forces: states, loads and samples are looked at as the run has them anyway. Only a
-finding starts a search for the pair of sites behind it.
+No check evaluates forces: states, loads and samples are those that the run has anyway. Only a finding starts a search
+for the pair of sites that causes it.
 """
 
 from math import inf, sqrt
@@ -27,23 +27,23 @@ from rigidmd.scene.watch import BodyWatch, Watch
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 from rigidmd.validation import settled
 
-#: Opposite charges that no repulsion of their own keeps apart, closer than this fraction of the smallest diameter, are
-#: on one another: the hydrogen of a hydrogen bond stays at half of it. Of molecules without any repulsion, all of it.
+#: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
+#: hydrogen bond stays at half of it. For molecules without any repulsion the fraction is the second one.
 BARE, NAKED = 0.3, 1.0
-#: A moment of inertia below this fraction of that of the whole mass as far out as the sites are (of a body: of its
-#: largest moment) is one that torques turn at once. Of water it is 0.05.
+#: A moment of inertia is suspiciously small below this fraction of that of the whole mass at the outermost site (for a
+#: body: of its largest moment). For water the fraction is 0.05.
 THIN = 0.01
-#: Rounding may take this fraction of a potential energy: half of its digits.
+#: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
-#: A step is checked at least every so many moves of molecules; a body's, evaluations of its forces, and looks.
+#: Most moves of molecules between two checks; for a body, evaluations of its forces, and looks.
 PATIENCE, BODY_PATIENCE, LOOKS = 100_000, 1_000_000, 512
 
 
 class Finding(SimulationError):
-    """What was seen, as a sentence.
+    """An observation that shows something wrong, as a sentence.
 
-    molecule : which one shows it (from 0), if one does; shorter : by which factor the step would have to be shorter to
-    stay within the limit, where one can tell; unturned : whether it is Q that is wrong
+    molecule : index of the molecule concerned; shorter : factor by which the step would have to be shorter to stay
+    within the limit, if known; unturned : whether Q is wrong
     """
 
     def __init__(
@@ -62,19 +62,19 @@ class Finding(SimulationError):
 
 
 class Cause(NamedTuple):
-    """What a finding probably comes from, and what to try."""
+    """The likely cause of a finding, and what to try."""
 
     likely: str
     advice: str
 
 
 def patience(system: System) -> int:
-    """Steps after which molecules are looked at though nobody asks: so many that a look is below 1 % of them."""
+    """Steps between two checks of molecules, so many that a check costs less than 1 % of them."""
     return max(20, PATIENCE // len(system.model.species))
 
 
 def thermal_energy(system: System, kinetic: float) -> float:
-    """kT of this kinetic energy (u Å²/ps²), or the deepest well where that is more: the scale of momenta, u Å²/ps²."""
+    """kT of this kinetic energy, or the deepest well if that is larger: sets the scale of momenta; u Å²/ps²."""
     wells = max((m.epsilon.max() for m in system.species), default=0.0)
     return max(2 * kinetic / max(system.freedom.total, 1), wells)
 
@@ -83,15 +83,15 @@ def thermal_energy(system: System, kinetic: float) -> float:
 def step_finding(
     system: System, limits: Watch, state: State, load: Load, scheme: Scheme, dt: float, thermal: float
 ) -> Finding | None:
-    """What is wrong with the next step of a state: no finite force, too large a kick, too long a way or turn.
+    """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
 
-    load : at this state, or where the last kick was; thermal : see `thermal_energy`
+    load : at this state or at the last kick; thermal : see `thermal_energy`
     """
     for what, values in (("force", load.force), ("torque", load.torque_body)):
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             m = int(bad.argmax())
-            return Finding(f"the {what} on {named(system, m)} is no finite number", m)
+            return Finding(f"the {what} on {named(system, m)} is not finite", m)
     model = system.model
     if limits.kick and thermal > 0:
         size = kicks(model, load, thermal, dt * max(map(abs, scheme.kicks)))
@@ -104,25 +104,25 @@ def step_finding(
         way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
         m, diameter = int(way.argmax()), system.smallest_diameter
         if way[m] > limits.move * diameter:
-            seen = f"{named(system, m)} moves {way[m]:.3g} Å from force to force, {way[m] / diameter:.3g} of the "
-            seen += f"smallest diameter (watch.move = {limits.move:g})"
+            seen = f"{named(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
+            seen += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
             return Finding(seen, m, shorter=way[m] / diameter / limits.move)
     if limits.turn_rad and len(state.rotation):
-        # sites on the axis of a spin do not feel it: what counts is how far the spin takes them, in radii
+        # sites on the axis of a spin do not move: what counts is the move of the sites, in radii
         arms = np.array([axis_distances(m) / (m.radius or 1.0) for m in system.species])
         omega = state.angular_momentum_body * (model.inverse_inertia * arms)[model.species]
         angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
         m = int(angle.argmax())
         if angle[m] > limits.turn_rad:
-            seen = f"{named(system, m)} turns by {angle[m]:.3g} rad from force to force"
+            seen = f"{named(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
             return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
     return None
 
 
 class StepCheck:
-    """Looks at the next step of a run of molecules now and then.
+    """Checks of the next step of a run of molecules.
 
-    The scale of momenta is that of the last good sample, so that has to be remembered.
+    They remember the scale of momenta of the last good sample.
     """
 
     def __init__(self, system: System, limits: Watch):
@@ -140,7 +140,7 @@ class StepCheck:
 
 
 def axis_distances(molecule: Molecule) -> np.ndarray:
-    """How far from each principal axis (3,) the sites of a molecule reach, Å."""
+    """Largest distances (3,) of a molecule's sites from its principal axes, Å."""
     square = molecule.positions_body**2
     return np.sqrt((square.sum(axis=1, keepdims=True) - square).max(axis=0))
 
@@ -148,12 +148,12 @@ def axis_distances(molecule: Molecule) -> np.ndarray:
 def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) -> Finding | None:
     """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
 
-    The kinetic energy that the change is held against is that of the earlier one, and what the potential has given
-    since; that of a thermostat's temperature where that is more.
+    The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
+    energy at a thermostat's temperature if that is larger.
     """
     if limits.orthogonality and not now.orthogonality <= limits.orthogonality:
         seen = f"|QᵀQ - 1| is {now.orthogonality:.2g} (watch.orthogonality = {limits.orthogonality:g})"
-        return Finding(f"a matrix Q is no rotation any more: {seen}", unturned=True)
+        return Finding(f"a matrix Q is no longer a rotation: {seen}", unturned=True)
     grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
     if limits.volume and grown > limits.volume:
         seen = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
@@ -177,24 +177,24 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
 
 
 def named(system: System, molecule: int) -> str:
-    """A molecule by its number (from 1) and species."""
+    """Number (from 1) and species of a molecule."""
     return f"molecule {molecule + 1} ({system.species[system.model.species[molecule]].name})"
 
 
 class Pair(NamedTuple):
-    """Two sites inside one another's core."""
+    """Two sites whose cores overlap."""
 
     first: int
     second: int
     distance: float  # Å
-    share: float  # of their diameter; of the smallest one of the scene where they have none
-    bare: bool  # opposite charges without a repulsion of their own
+    share: float  # of their diameter; of the smallest one of the scene if they have none
+    bare: bool  # opposite charges without repulsion between them
 
 
 def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | None:
-    """The pair of sites deepest inside one another, of this molecule if it has such a pair; None where none is."""
+    """The pair of sites that overlaps most, preferably of this molecule; None without such a pair."""
     if not np.abs(state.position).max() * np.finfo(float).eps < 1e-3 * system.smallest_diameter:
-        return None  # where a coordinate has no digits left for distances
+        return None  # a coordinate is too large to resolve distances
     sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
     near = system.of_sites(lambda m: np.full(len(m.epsilon), BARE if m.epsilon.any() else NAKED))
     acts = any(name.startswith("coulomb") for name in system.terms)
@@ -216,11 +216,11 @@ def explained(
 ) -> str:
     """The finding in full: what was seen, the likely cause, what to try.
 
-    states : where to look for sites inside one another, and what to say of each place; dt, stable : the step taken and
-    the longest stable one, as far as known, ps
+    states : states to search for overlapping sites, each with the words for its moment; dt, stable : the step and, if
+    known, the longest stable one, ps
     """
     if isinstance(error, NotFiniteError):
-        seen = f"{named(system, error.molecule)} is nowhere: {error.fault}"
+        seen = f"{named(system, error.molecule)} is lost: {error.fault}"
         finding = Finding(seen, error.molecule)
     elif isinstance(error, BehindWallError):
         finding = Finding(f"{named(system, error.molecule)} {error.fault}", error.molecule)
@@ -253,13 +253,13 @@ def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stabl
     if pair is not None and pair.bare:
         a, b = system.sites.name[[pair.first, pair.second]]
         return Cause(
-            "a charge on a site without repulsion has fallen onto an opposite one: nothing stops it",
+            "a charge on a site without repulsion has collapsed onto an opposite one",
             f"giving one of these sites sigma_A and epsilon_kJ_mol, or the pair an entry [[forces.pairs]] with sites = "
             f'["{a}", "{b}"]',
         )
     if pair is not None:
         return Cause(
-            "these sites overlap: they were put there, or too long a step carried them there",
+            "these sites overlap: from the start, or because a step was too long",
             f"a start without overlaps, an nvt stage with a short step first, or {shorter}",
         )
     if finding.molecule is not None:
@@ -269,27 +269,27 @@ def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stabl
         if share.min() < THIN:
             return Cause(
                 f"bad inertia: a moment of {species.name} is {species.inertia[share.argmin()]:.2g} u Å², "
-                f"{share.min():.1g} of what its mass would have as far out as its sites are: torques turn it at once",
+                f"{share.min():.1g} of that of its mass at the outermost site, so torques turn it too fast",
                 f"more of its mass on the outer sites, or {shorter}",
             )
     if finding.boiled:
         return Cause(
             "at this temperature and pressure the liquid boils, or it starts far from its density under great pressure",
             "a higher pressure_bar or a lower temperature_K, an nvt stage before the barostat, or watch.volume = false "
-            "for what is a gas",
+            "for a gas",
         )
     if finding.unturned:
         return Cause(
-            "Q was no rotation at the start or was changed from outside: the run itself only multiplies rotations",
+            "Q was not a rotation at the start or was changed from outside: a run only multiplies rotations",
             "the start from which the last good state came; a very long run may raise watch.orthogonality",
         )
     return Cause("timestep_fs is too long for this motion", f"{shorter}, or an nvt stage first")
 
 
 class BodyCheck:
-    """Looks at a body's run now and then.
+    """Checks of the run of a body.
 
-    The scale of its energy is the largest that has moved so far, so that has to be remembered.
+    They remember the largest energy exchanged so far, the scale of energy errors.
     """
 
     def __init__(self, system: BodySystem, limits: BodyWatch):
@@ -310,7 +310,7 @@ class BodyCheck:
         system, limits = self.system, self.limits
         largest = settled(limits.orthogonality)
         if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
-            seen = f"Q is no rotation any more: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            seen = f"Q is no longer a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
             return Finding(seen, unturned=True)
         if system.turns and limits.turn_rad:
             omega = system.pose(float(state.time[0]), state).angular_velocity_body
@@ -328,14 +328,14 @@ class BodyCheck:
             return None
         return Finding(
             f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
-            f"energy that has moved (watch.energy = {limits.energy:g})"
+            f"energy exchanged (watch.energy = {limits.energy:g})"
         )
 
     def explained(self, error: SimulationError, dt: float, stable: float | None) -> str:
         """The finding in full: what was seen, the likely cause, what to try."""
         system = self.system
         if isinstance(error, NotFiniteError):
-            finding = Finding("position or momentum of the body is no finite number any more")
+            finding = Finding("position or momentum of the body is not finite")
         elif isinstance(error, Finding):
             finding = error
         else:
@@ -348,9 +348,9 @@ class BodyCheck:
         inertia = system.inertia
         if finding.unturned:
             cause = Cause(
-                f"nothing but accuracy keeps Q a rotation under {system.method.name}"
+                f"only accuracy keeps Q a rotation under {system.method.name}"
                 if isinstance(system.method, Solver)
-                else "Q was changed from outside: the run itself only multiplies rotations",
+                else "Q was changed from outside: a run only multiplies rotations",
                 f"integrator = 'srkn_6', which keeps Q, or {shorter}",
             )
         elif system.turns and inertia[inertia > 0].min() < THIN * inertia.max():

@@ -1,1 +1,1 @@
-"""What a run writes, all in its own folder: trajectory (MDAnalysis here), log, state, summary, figure."""
+"""Files of a run: trajectory (MDAnalysis is used only here), log, state, summary, figures, reports."""

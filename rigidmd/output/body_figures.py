@@ -1,4 +1,4 @@
-"""The figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of the invariants."""
+"""Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of the invariants."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ DASHED = (0, (5, 4))
 LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "$L_z$", "L_3": "$L_3$"}
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 UP = np.array([0.0, 0.0, 1.0])
-#: Lines of more points than this are pixels in the SVG; where an error of exactly zero is drawn.
+#: Lines with more points than this are rasterised in the SVG; level at which an error of exactly 0 is drawn.
 MOST_POINTS, FLOOR = 10_000, 1e-17
 
 
@@ -27,7 +27,7 @@ def draw_motion(
     invariants: list[str],
     gravity: np.ndarray | None,
 ) -> list[Path]:
-    """Draw the figures these columns allow, each as PNG and SVG; the paths written. Raises OutputError."""
+    """Draw the figures that these columns allow, as PNG and SVG. Returns the paths. Raises OutputError."""
     down = None if gravity is None or not np.any(gravity) else np.asarray(gravity) / np.linalg.norm(gravity)
     figures = {}
     if len(columns["t"]) > 1:
@@ -47,7 +47,7 @@ def draw_motion(
 
 
 def _write(folder: Path, stem: str, name: str, figure) -> list[Path]:
-    """One figure as PNG and SVG, the same bytes for the same run."""
+    """Write one figure as PNG and SVG, with the same bytes for the same run."""
     from matplotlib import rc_context
 
     figure.suptitle(f"{name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
@@ -60,7 +60,7 @@ def _write(folder: Path, stem: str, name: str, figure) -> list[Path]:
 
 
 def _new_figure(title: str, width: float, height: float):
-    """An empty figure; its title is completed with the name of the run when it is written."""
+    """An empty figure; writing completes its title with the name of the run."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -69,7 +69,7 @@ def _new_figure(title: str, width: float, height: float):
 
 
 def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np.ndarray | None):
-    """The body axis on the unit sphere, and seen along z, enlarged where it keeps to a small part of the disc."""
+    """The body axis on the unit sphere and seen along z, enlarged if it stays in a small part of the disc."""
     path = np.stack([sum(columns[f"q{i}{j}"] * axis_body[j - 1] for j in (1, 2, 3)) for i in (1, 2, 3)], axis=-1)
     polar = np.degrees(np.arctan2(np.hypot(path[:, 0], path[:, 1]), path[:, 2]))
     side, word = (1.0, "above") if path[:, 2].mean() > -1e-9 else (-1.0, "below")
@@ -102,7 +102,7 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
 
 
 def _angles_figure(columns: dict[str, np.ndarray]):
-    """The Euler angles against time: φ and ψ counted on through whole turns, θ with a span that means something."""
+    """The Euler angles against time: φ and ψ continuous over whole turns, θ with at least a minimum span."""
     time, theta = columns["t"], np.degrees(columns["theta"])
     phi, psi = _apart(columns)
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
@@ -119,14 +119,14 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     if (speed[1:] * np.diff(time)).max() > np.pi:
         note = "the body turns by more than 180° between samples: turns are not all counted"
     elif np.abs(np.diff(angles[0])).max() > 90:
-        note = "φ and ψ jump where θ passes 0° or 180°: apart they have no meaning there"
+        note = "φ and ψ jump where θ passes 0° or 180°: they are undefined there"
     if note:
         figure.supxlabel(note, fontsize=9, color=WARM, x=0.01, ha="left")
     return figure
 
 
 def _apart(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """φ and ψ; where θ is 0 or 180° and only their sum or difference means something, φ as at the next sample."""
+    """φ and ψ; at θ = 0 or 180°, where only their sum or difference is defined, φ is that of the next sample."""
     phi, psi, theta = (columns[key].copy() for key in ("phi", "psi", "theta"))
     for k in np.flatnonzero(np.sin(theta[:-1]) < 1e-12)[::-1]:
         psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(theta[k]))
@@ -135,7 +135,7 @@ def _apart(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
-    """ω in the body frame on the ellipsoids of energy and momentum, seen from the side it keeps to."""
+    """ω in the body frame on the ellipsoids of energy and momentum, seen from its side."""
     time, omega = columns["t"], np.stack([columns[f"omega_body_{i}"] for i in "123"], axis=-1)
     energies, fastest = omega**2 @ inertia, np.linalg.norm(omega, axis=1).max()
     if fastest == 0:
@@ -168,7 +168,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
 
 
 def _omega_figure(columns: dict[str, np.ndarray]):
-    """ω in the body frame against time, of a body for which it lies on no ellipsoids."""
+    """ω in the body frame against time, if it does not stay on ellipsoids."""
     omega = [columns[f"omega_body_{i}"] for i in "123"]
     fastest = max(np.abs(part).max() for part in omega)
     figure = _new_figure("ω in the body frame", 8, 6.4)
@@ -178,7 +178,7 @@ def _omega_figure(columns: dict[str, np.ndarray]):
 
 
 def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
-    """The centre of mass: its coordinates against time, its path in a vertical plane and from above."""
+    """Coordinates of the centre of mass against time, its path in a vertical plane and from above."""
     place = np.stack([columns[key] for key in "xyz"], axis=-1)
     span = np.ptp(place, axis=0).max()
     least = 1e-11 * span + 1e-13 * np.abs(place).max()
@@ -205,7 +205,7 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
 
 
 def _draw_plane(axis, title: str, place: np.ndarray, right: np.ndarray, up: np.ndarray, least: float) -> None:
-    """The path in one plane: equal scales where they leave it visible, else each its own, and said so."""
+    """The path in one plane, with equal scales if possible; otherwise the title states the distortion."""
     flat = np.stack([place @ right, place @ up], axis=-1)
     span, centre = np.ptp(flat, axis=0), (flat.max(0) + flat.min(0)) / 2
     half = 0.55 * span
@@ -236,7 +236,7 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
             errors[LABELS.get(name, name.replace("_", " "))] = np.where(np.isfinite(error), error, np.nan)
     if not errors:
         return None
-    axis = (figure := _new_figure("errors of what should not change", 8, 4.6)).subplots()
+    axis = (figure := _new_figure("errors of the invariants", 8, 4.6)).subplots()
     size = -(-len(columns["t"]) // 300)
     for color, (label, error) in zip(SERIES * len(errors), errors.items(), strict=False):
         largest = np.fmax.reduceat(error, np.arange(0, len(error), size))
@@ -254,7 +254,7 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
 
 
 def _draw_series(figure, cells, time, series, labels, least: float, shown: float, colors=(COOL,) * 3) -> list:
-    """Panels one above the other against time; what varies by less than `least` gets a span of `shown`, and is flat."""
+    """Panels above one another against time; a curve that varies by less than `least` gets a span of `shown`."""
     panels = []
     for row, (values, label, color) in enumerate(zip(series, labels, colors, strict=True)):
         panel = figure.add_subplot(cells[row])
@@ -287,7 +287,7 @@ def _circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
 
 
 def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: np.ndarray, centre: np.ndarray) -> None:
-    """Ellipsoids (semi-axes, colour) about the origin, lit from the upper left, as an image with clear outlines."""
+    """An image of ellipsoids (semi-axes, colour) about the origin, lit from the upper left."""
     from matplotlib.colors import to_rgb
 
     x, y = (np.linspace(c - h, c + h, int(500 * h / half.max())) for c, h in zip(centre, half, strict=True))
@@ -310,7 +310,7 @@ def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: n
 
 
 def _draw_path(axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, half, centre, color: str) -> None:
-    """A path in space, finer where it is longer, its start a dot; the limits of the picture."""
+    """Draw a path in space with a dot at its start, thinner if longer. Returns the limits of the picture."""
     flat = points @ view[:2].T
     shown, style = _plan(flat, half.max())
     _front_and_back(axis, points[shown], view, depth[shown], (0.95, 0.25), color=color, **style)
@@ -321,7 +321,7 @@ def _draw_path(axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, ha
 
 
 def _front_and_back(axis, points, view: np.ndarray, depth, alphas: tuple[float, float], **style) -> None:
-    """A line whose part towards the eye is strong and whose other part is faint."""
+    """A line that is strong on the side of the eye and faint on the other."""
     flat, front = points @ view[:2].T, depth >= 0
     joined = front.copy()
     joined[:-1] |= front[1:]
@@ -343,14 +343,14 @@ def _triad(axis, view: np.ndarray, names, down: np.ndarray | None = None) -> Non
 
 
 def _plan(flat: np.ndarray, half) -> tuple[np.ndarray, dict]:
-    """Which points of a path to draw, one for each step of about a pixel, and how: the longer the finer."""
+    """Points of a path to draw, about one a pixel, and the line style, thinner for longer paths."""
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).cumsum()])
     shown = np.flatnonzero(np.diff(np.floor(800 * way), prepend=-1.0) > 0)
     return shown, {"lw": max(0.25, 1.7 / (1 + way[-1] / 60)), "rasterized": len(shown) > MOST_POINTS}
 
 
 def _thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:
-    """A long series by the lowest and the highest value of each of its parts: drawn, the same line."""
+    """A long series reduced to the lowest and highest value of each of its parts; its curve looks the same."""
     size = len(time) // bins
     if size < 4:
         return time, values
@@ -361,7 +361,7 @@ def _thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tupl
 
 
 def _range(degrees: np.ndarray) -> str:
-    """A range of degrees in words, digits enough to tell its ends apart."""
+    """A range of degrees in words, with enough digits to distinguish its ends."""
     low, high = degrees.min(), degrees.max()
     if high - low < 1e-5:
         return f"{round(low, 6) + 0.0:.8g}°, constant{f' to {high - low:.0e}°' if high > low else ''}"

@@ -1,4 +1,4 @@
-"""The folder of a run: made once, never overwritten unasked, files in it whole or not there."""
+"""The folder of a run: it is never overwritten without --force, and its files are complete or absent."""
 
 import os
 from collections.abc import Iterable
@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rigidmd.errors import OutputError
 
-#: Files of a run, by what is in them; trajectory and topology are named by the scene.
+#: Files of a run; the scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
 FINAL, LAST_GOOD, ENERGY, SUMMARY = "final.npz", "last_good_state.npz", "energy.png", "summary.json"
-#: Marks a folder as that of a run and lists the files the run may write, one a line: what --force may remove.
+#: Marks the folder of a run and lists the files that the run may write, one a line; --force may remove these.
 MARKER = ".rigidmd-run"
 
 
@@ -27,7 +27,7 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
             for path in inputs:
                 if path.resolve() in doomed:
                     raise OutputError(
-                        f"{path} is read by this run and would be replaced by it; name another folder with -o"
+                        f"{path} is an input of this run and would be replaced; name another folder with -o"
                     )
     parent = folder
     while not parent.exists():
@@ -37,7 +37,7 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
 
 
 def make_folder(folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Make the folder of a run that will write files of these names; of an earlier run in it only what it wrote goes.
+    """Make the folder of a run that will write these files. Of an earlier run only the files that it wrote are removed.
 
     Raises OutputError.
     """
@@ -52,7 +52,7 @@ def make_folder(folder: Path, force: bool, names: Iterable[str], inputs: Iterabl
 
 
 def _written(folder: Path) -> list[str]:
-    """Files that an earlier run in this folder may have written; plain names only, whatever its marker says."""
+    """Files that an earlier run in this folder may have written; only plain names, whatever its marker contains."""
     marker = folder / MARKER
     if not marker.is_file():
         return []

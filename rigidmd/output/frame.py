@@ -1,4 +1,4 @@
-"""A frame of a run, as it is kept where no file holds it."""
+"""A frame of a run in memory."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Frame(NamedTuple):
-    """A time (ps), and where none is on the disk, positions (s, 3) and cell (3, 3), Å."""
+    """A time (ps); without a trajectory file also positions (s, 3) and cell (3, 3), Å."""
 
     time: float
     positions: np.ndarray | None = None

@@ -1,6 +1,6 @@
-"""log.csv: one line an observation, flushed at once, so that a killed run leaves what it had measured.
+"""log.csv: one line a sample, flushed at once, so that a killed run keeps its samples.
 
-Columns as OpenMM's StateDataReporter, then ours.
+The first columns are those of OpenMM's StateDataReporter.
 """
 
 import csv
@@ -10,7 +10,7 @@ from pathlib import Path
 from rigidmd.measure import samples
 from rigidmd.measure.samples import Sample
 
-#: Columns that are written where the scene asks for them.
+#: Columns that are written on request.
 TENSOR = tuple(name for name in samples.COLUMNS if name.startswith("pressure_") and len(name) == len("pressure_xx"))
 
 
@@ -21,7 +21,7 @@ def columns(tensor: bool = True) -> dict[str, str]:
 
 
 class Log:
-    """Writes samples to a CSV file. Numbers with all digits that matter; empty where there is none."""
+    """Writes samples to a CSV file, numbers with all significant digits; missing values are empty."""
 
     def __init__(self, path: Path, tensor: bool):
         self._columns = columns(tensor)

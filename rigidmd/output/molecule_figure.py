@@ -13,16 +13,16 @@ from rigidmd.output.molecule_report import COVALENT, bonds, short_source
 from rigidmd.output.report import COOL, FAINT, INK
 
 ENDINGS = (".png", ".svg", ".pdf")
-#: Colours of the elements, after Corey, Pauling and Koltun, and what has none.
+#: Colours of the elements, after Corey, Pauling and Koltun, and of all others.
 COLOURS = {
     "H": "#f0f0f0", "C": "#5a5f66", "N": "#3f63d6", "O": "#d8392f", "F": "#7cc95a", "S": "#e3bf2b", "Cl": "#3fa34d",
     "Li": "#a374d5", "Na": "#8a4fc9", "K": "#7440b5", "Rb": "#60309c", "Cs": "#4d2384", "Br": "#9c4a2f", "I": "#7a3f8f",
     "Ne": "#8fd3e0", "Ar": "#6fc1d3", "Kr": "#56a9c0", "Xe": "#3f8fa8",
 }  # fmt: skip
 OTHER = "#b0b4ba"
-#: A sphere's radius: this fraction of the covalent radius, or of the Lennard-Jones diameter where there is none.
+#: Radius of a sphere as a fraction of the covalent radius, or else of the Lennard-Jones diameter.
 OF_COVALENT, OF_DIAMETER, LEAST = 0.62, 0.2, 0.22
-#: From where bodies are seen that are not flat: degrees about the vertical, then towards the viewer.
+#: View of bodies that are not flat: degrees about the vertical, then towards the viewer.
 AZIMUTH, LIFT = 25.0, 20.0
 INCHES, FONT = 7.0, 9.0
 
@@ -34,7 +34,7 @@ class _Sphere(NamedTuple):
 
 
 def check_figure(path: Path, force: bool) -> None:
-    """Raise OutputError if a figure could not be written there or would replace another; changes nothing."""
+    """Raise OutputError if a figure cannot be written there or would replace a file; changes nothing."""
     if path.suffix not in ENDINGS:
         raise OutputError(f"{path}: a figure's name ends in one of {' '.join(ENDINGS)}")
     if path.is_dir():
@@ -46,7 +46,7 @@ def check_figure(path: Path, force: bool) -> None:
 
 
 def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
-    """Draw a molecule into a file; its ending chooses the format. Raises OutputError."""
+    """Draw a molecule into a file; the ending sets the format. Raises OutputError."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -88,7 +88,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
 
 
 def _view(m: Molecule) -> np.ndarray:
-    """Rotation (3, 3) from the principal frame to right, up and towards the viewer: flat bodies face the viewer."""
+    """Rotation (3, 3) from the principal frame to right, up and towards the viewer; flat bodies face the viewer."""
     if m.planar or m.kind in ("point", "linear"):
         return np.eye(3)
     a, b = np.radians([AZIMUTH, LIFT])
@@ -124,7 +124,7 @@ def _diameters(axes, m: Molecule, spheres: list[_Sphere]) -> None:
 
 
 def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[tuple]:
-    """Bonds from surface to surface; points of them that no label shall cover."""
+    """Draw bonds from surface to surface. Returns points that labels must not cover."""
     taken = []
     for i, j in bonds(m):
         if m.masses[j] == 0:
@@ -139,7 +139,7 @@ def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[
 
 
 def _order(depth: float) -> float:
-    """What is drawn later: nearer things, within the layer of the molecule."""
+    """Drawing order within the layer of the molecule: nearer things later."""
     return 5.0 + np.tanh(depth / 5.0)
 
 
@@ -166,7 +166,7 @@ def _sphere(axes, m: Molecule, i: int, sphere: _Sphere) -> None:
 
 
 def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tuple]:
-    """Arrows along the axes, a ring for one that points at the viewer; the boxes that no label shall cover."""
+    """Draw arrows along the axes, a ring for one towards the viewer. Returns boxes that labels must not cover."""
     if m.radius == 0:
         return []
     taken = []
@@ -188,7 +188,7 @@ def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tu
 
 
 def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[tuple]) -> None:
-    """Names and charges where there is room: of many directions, outward first, the first that covers nothing."""
+    """Names and charges in the first free direction, tried from outward on."""
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
     for i in sorted(range(len(spheres)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(spheres[i].centre))):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]

@@ -1,4 +1,4 @@
-"""Models in words: the list of all of them, and one with its geometry, its parameters and where they come from."""
+"""Models in words: the list of all, and one with its geometry, parameters and source."""
 
 import re
 import textwrap
@@ -11,9 +11,9 @@ from rigidmd.molecules import GROUPS, Molecule
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 WIDTH = 100
-#: Covalent radii, Å (Cordero et al. 2008, Dalton Trans. 2832), of the elements that rigid models have.
+#: Covalent radii, Å (Cordero et al. 2008, Dalton Trans. 2832), of the elements in rigid models.
 COVALENT = {"H": 0.31, "C": 0.76, "N": 0.71, "O": 0.66, "F": 0.57, "S": 1.05, "Cl": 1.02}
-#: Two atoms this much further apart than their covalent radii are bonded still.
+#: Factor on the sum of covalent radii up to which two atoms are bonded.
 SLACK = 1.25
 
 
@@ -35,7 +35,7 @@ def _row(m: Molecule) -> str:
 
 
 def short_source(m: Molecule) -> str:
-    """Who published it and when."""
+    """Authors and year."""
     found = re.match(r".*?\b(?:19|20)\d\d\b", m.source)
     authors, year = (found[0][:-4].strip(), found[0][-4:]) if found else (m.source, "")
     names = re.split(r", | & ", authors)
@@ -43,7 +43,7 @@ def short_source(m: Molecule) -> str:
 
 
 def molecule_text(m: Molecule) -> str:
-    """One model in full: what it is, its sites in the principal frame, its geometry, its source."""
+    """One model in full: kind, sites in the principal frame, geometry, source."""
     moments = " ".join(f"{x:.5g}" for x in m.inertia)
     lines = [
         f"{m.name}: {m.title}" if m.title else m.name,
@@ -79,10 +79,10 @@ def _sites(m: Molecule) -> list[str]:
 
 
 def _geometry(m: Molecule) -> list[str]:
-    """Lengths and angles of the links, like ones once."""
+    """Lengths and angles of the links; equal ones are counted."""
     stems = [re.sub(r"(?<=\D)\d+$", "", name) for name in m.site_names]
     kind = [stem if stems.count(stem) > 1 else name for stem, name in zip(stems, m.site_names, strict=True)]
-    # charges in the place of a multipole are no geometry: the table of sites says where they are
+    # charges that represent a multipole are left out: the table of sites shows them
     few = (m.masses == 0).sum() <= 2
     links = [(i, j) for i, j in bonds(m) if m.masses[j] > 0 or few]
     lengths = Counter(f"{kind[i]}-{kind[j]} {_distance(m, i, j):.4f} Å" for i, j in links)
@@ -91,7 +91,7 @@ def _geometry(m: Molecule) -> list[str]:
         if len(ends := {*one} ^ {*other}) == 2:
             (corner,) = {*one} & {*other}
             a, b = sorted(ends, key=lambda s: kind[s])
-            # two massless sites stand on an atom like ears; where one is on a bisector, its length says it all
+            # an angle between two massless sites on an atom is listed; a site on a bisector is defined by its length
             ears = kind[a] == kind[b] and abs(_distance(m, a, corner) / _distance(m, b, corner) - 1) < 1e-6
             if ears or m.masses[a] > 0 < m.masses[b]:
                 angles[f"{kind[a]}-{kind[corner]}-{kind[b]} {_angle(m, a, corner, b):.2f}°"] += 1
@@ -104,8 +104,8 @@ def _geometry(m: Molecule) -> list[str]:
 
 
 def bonds(m: Molecule) -> list[tuple[int, int]]:
-    """Links between sites, heavier first: atoms within bonding distance, all parts of a molecule by the shortest links
-    between atoms, and each massless site to its nearest atom."""
+    """Links between sites, heavier site first: atoms within bonding distance, the shortest links that connect separate
+    parts, and each massless site to its nearest atom."""
     atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
     part = {i: i for i in atoms}
     found = []

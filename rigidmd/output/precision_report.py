@@ -1,4 +1,4 @@
-"""What `rigidmd precision` found: a table, a recommendation in words, precision.csv, .png and a page by itself."""
+"""Report of `rigidmd precision`: a table, advice in words, precision.csv, .png and a self-contained page."""
 
 import base64
 import csv
@@ -14,10 +14,10 @@ from rigidmd.output.figure import curve_style, save_figure
 from rigidmd.output.report import FAINT, INK, signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
-#: So that a line of the table fits a terminal.
+#: Shorter titles, so that the table fits a terminal.
 SHORT_TITLES = {"error of ": "", "energy drift in the span": "drift", " per ": "/", "seconds": "s", "spread (%)": "± %",
                 "energy rms": "energy", "orthogonality": "QᵀQ"}  # fmt: skip
-#: A spread of repeated timings that is warned of.
+#: Spread of repeated timings that causes a warning.
 DOUBTFUL = 0.2
 ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
@@ -34,7 +34,7 @@ def headers(found: Precision) -> list[str]:
 
 
 def _kept(found: Precision) -> list[str]:
-    """What else is conserved."""
+    """Other conserved quantities."""
     return list(dict.fromkeys(name for trial in found.trials for name in trial.kept))
 
 
@@ -62,7 +62,7 @@ def average_headers(found: Precision) -> list[str]:
 
 
 def average_row(found: Precision, trial: Trial) -> list:
-    """A line of the averages; biases are against the trial with the smallest energy error."""
+    """A line of the averages; biases are relative to the trial with the smallest energy error."""
     seen, best = trial.averages, found.most_exact.averages
     values = [trial.integrator, trial.timestep]
     for name in ("T_trans", "T_rot", "T_rot - T_trans"):
@@ -76,11 +76,11 @@ def average_row(found: Precision, trial: Trial) -> list:
 
 
 def table_text(found: Precision) -> str:
-    """The tables as a person reads them."""
+    """The tables as text."""
     titles = headers(found)
     for long, short in SHORT_TITLES.items():
         titles = [title.replace(long, short) for title in titles]
-    text = "errors of Q, X, the energy (rms, drift over the span), and what else is conserved\n"
+    text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
     text += _columns([titles, *(row(found, t) for t in found.trials)])
     if found.sampled and (sampled := [t for t in found.trials if t.averages]):
         rows = [_brief_headers(), *(_brief_row(found, t) for t in sampled)]
@@ -95,19 +95,19 @@ def _brief_headers() -> list[str]:
 
 
 def _brief_row(found: Precision, trial: Trial) -> list[str | None]:
-    """The averages that tell one step from another."""
+    """The averages that differ between steps."""
     seen, best = trial.averages, found.most_exact.averages
     cells: list[str | None] = [trial.integrator, f"{trial.timestep:.3g}", signed(*seen["T_trans"]).lstrip("+")]
     gaps = [seen.get(f"T_rot - T_trans{kind}") for kind in ESTIMATORS]
     cells += [gap and signed(*gap) for gap in gaps]
     for name in ("potential", "pressure"):
         (value, error), (right, its_error) = seen[name], best[name]
-        cells.append("(held against)" if trial is found.most_exact else signed(value - right, hypot(error, its_error)))
+        cells.append("(reference)" if trial is found.most_exact else signed(value - right, hypot(error, its_error)))
     return cells
 
 
 def _columns(rows: list[list]) -> str:
-    """Rows as text in columns; those without any value are left out."""
+    """Rows as text in columns; columns without values are omitted."""
     lines = [[_short(cell) for cell in line] for line in rows]
     kept = [k for k in range(len(lines[0])) if any(line[k] not in ("", "-") for line in lines[1:])]
     widths = [max(len(line[k]) for line in lines) for k in kept]
@@ -125,11 +125,11 @@ def _short(cell) -> str:
 
 
 def advice(found: Precision) -> list[str]:
-    """Sentences: the reference, the longest stable steps, and the cheapest integrator for each accuracy."""
+    """Sentences on the reference, the longest stable steps, and the cheapest integrator for each accuracy."""
     s = found.subject
     lines = [
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
-        f"reference: {s.reference} in {found.reference_steps} steps, its own error about {found.reference_error:.0e}",
+        f"reference: {s.reference} in {found.reference_steps} steps, error about {found.reference_error:.0e}",
     ]
     if s.rounding is not None:
         force, torque = s.rounding
@@ -156,12 +156,12 @@ def advice(found: Precision) -> list[str]:
 
 
 def _timing_words(found: Precision) -> list[str]:
-    """How far the seconds can be relied on."""
+    """How reliable the seconds are."""
     timed = [trial for trial in found.trials if not trial.diverged]
     if not timed:
         return []
     if timed[0].spread is None:
-        return ["timed once: how far the seconds would be the same again is not known; see --repeats"]
+        return ["timed once: the spread of the seconds is unknown; see --repeats"]
     doubtful = [(spread, trial) for trial in timed if (spread := trial.spread) is not None and spread > DOUBTFUL]
     if not doubtful:
         return []
@@ -169,13 +169,13 @@ def _timing_words(found: Precision) -> list[str]:
     which = f"{worst.integrator} at {worst.timestep:.3g} {found.subject.time_unit}"
     return [
         f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than {DOUBTFUL:.0%}, "
-        f"those of {which} by {spread:.0%} (± % in the table): was another program running? A quieter machine or "
+        f"those of {which} by {spread:.0%} (± % in the table): was another program running? An idle machine or "
         "more --repeats help"
     ]
 
 
 def _temperature_words(found: Precision) -> list[str]:
-    """What the longest step of velocity Verlet does to the temperatures."""
+    """The effect of the longest step of velocity Verlet on the temperatures."""
     name = "T_rot - T_trans"
     verlet = [t for t in found.trials if f"{name} unbiased" in t.averages]
     if not verlet:
@@ -207,7 +207,7 @@ def _cheapest(found: Precision, error: str, what: str, unit: str) -> list[str]:
 
 
 def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
-    """All files; the paths written."""
+    """Write all files. Returns their paths."""
     with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(headers(found))
@@ -226,7 +226,7 @@ def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
 
 
 def draw(path: Path, found: Precision) -> None:
-    """Log error against log run time, one curve an integrator, the front ringed."""
+    """Log error against log run time, one curve an integrator; the best trials are ringed."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
 
@@ -246,7 +246,7 @@ def draw(path: Path, found: Precision) -> None:
             axis.loglog([t.time / s.span for t in own], [getattr(t, error) for t in own], ms=3.5, lw=1.2, label=name,
                         **curve_style(k))  # fmt: skip
         front = found.front(error)
-        ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": "no other is faster and better"}
+        ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": "none is both faster and better"}
         axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         axis.set_xlabel(f"seconds of computing per {per}")
@@ -262,7 +262,7 @@ def draw(path: Path, found: Precision) -> None:
 
 
 def page(found: Precision, picture: bytes, command: str) -> str:
-    """A page that needs no other file."""
+    """A self-contained page."""
     tables = _html_table(headers(found), [row(found, trial) for trial in found.trials])
     if sampled := [trial for trial in found.trials if trial.averages]:
         tables += f"<h2>Averages over {found.sampled:g} ps</h2>\n"

@@ -1,4 +1,4 @@
-"""How far a run has come: a bar on a terminal or in a notebook, anywhere else a line now and then."""
+"""Progress of a run: a bar on a terminal or in a notebook, elsewhere a line now and then."""
 
 import contextlib
 import sys
@@ -18,7 +18,7 @@ def in_notebook() -> bool:
 
 @contextlib.contextmanager
 def progress_of(total: float, unit: str, shown: bool | None) -> Iterator[Callable[[float], object]]:
-    """A function to call with each advance, in `unit` of time. shown : None is yes in a notebook, no elsewhere."""
+    """A function to call with each advance, in `unit` of time. shown : None shows it only in a notebook."""
     notebook = in_notebook()
     if not (notebook if shown is None else shown):
         yield lambda advance: None
@@ -26,7 +26,7 @@ def progress_of(total: float, unit: str, shown: bool | None) -> Iterator[Callabl
     if not (notebook or sys.stderr.isatty()):
         yield _Lines(total, unit).advance
         return
-    with warnings.catch_warnings():  # without ipywidgets it is a bar of text, which needs no warning
+    with warnings.catch_warnings():  # without ipywidgets a bar of text is shown; no warning is needed
         warnings.filterwarnings("ignore", message=".*IProgress not found")
         from tqdm.auto import tqdm
     form = "{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]"
@@ -42,7 +42,7 @@ class _Lines:
         self._began = self._last = clock.monotonic()
 
     def advance(self, amount: float) -> None:
-        """Count, and say so if the last line is long ago."""
+        """Count, and print a line if the last one is old enough."""
         from tqdm import tqdm
 
         self._done += amount

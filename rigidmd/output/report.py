@@ -1,4 +1,4 @@
-"""The end of a run: summary.json, the same in words, and energy.png."""
+"""Reports of a run: summary.json, the summary as text, and energy.png."""
 
 import json
 from math import floor, log10
@@ -14,8 +14,8 @@ from rigidmd.output.figure import save_figure
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
 POSITIONS = {
-    "unwrapped": "frames hold molecules where they travelled to",
-    "wrapped": "frames hold molecules back in the box; displacements need unwrapped ones",
+    "unwrapped": "molecules follow continuous paths",
+    "wrapped": "molecules are wrapped into the box; displacements need unwrapped frames",
 }
 
 
@@ -28,7 +28,7 @@ def write_summary(path: Path, summary: dict) -> None:
 
 
 def summary_text(summary: dict) -> str:
-    """The summary as a person reads it."""
+    """The summary as text."""
     species = ", ".join(f"{count} {name}" for name, count in summary["species"].items())
     freedom = summary["degrees_of_freedom"]
     lines = [
@@ -46,18 +46,18 @@ def summary_text(summary: dict) -> str:
     )
     if removed := summary["momentum_removed"]:
         lines.append(
-            f"  {'':<16}taken out every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"
+            f"  {'':<16}removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"
         )
     if summary["positions"]:
         lines.append(f"  {'positions':<16}{summary['positions']}: {POSITIONS[summary['positions']]}")
     lines += [f"\n  note: {note}" for note in summary["notes"]]
     if summary["interrupted"]:
-        lines += ["", "  interrupted: the figures are those so far"]
+        lines += ["", "  interrupted: these are the results so far"]
     return "\n".join(lines)
 
 
 def body_summary_text(summary: dict) -> str:
-    """The summary of a single body's run as a person reads it."""
+    """The summary of a single body's run as text."""
     speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
     rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
     if summary["work_J"]:
@@ -74,7 +74,7 @@ def body_summary_text(summary: dict) -> str:
     lines += [f"  {name:<16}{value}" for name, value in rows]
     lines += [f"\n  note: {note}" for note in summary["notes"]]
     if summary["interrupted"]:
-        lines += ["", "  interrupted: the figures are those so far"]
+        lines += ["", "  interrupted: these are the results so far"]
     return "\n".join(lines)
 
 
@@ -91,7 +91,7 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
         parts = _temperatures(stage, "K")
         rows.append(("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({parts})"))
         if parts := _temperatures(stage, "unbiased_K"):
-            rows.append(("", f"{parts} without what the step itself takes from the velocities"))
+            rows.append(("", f"{parts} without the error of the time step"))
     rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
     if stage["pressure_bar"] is not None:
         rows.append(("pressure", f"{stage['pressure_bar']:.0f} ± {stage['pressure_error_bar']:.0f} bar"))
@@ -111,7 +111,7 @@ def _stage_rows(stage: dict) -> list[tuple[str, str]]:
             rows.append(("", f"{signed(value, error)} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
             rows.append(
-                ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in all")
+                ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in total")
             )
         rows.append(
             ("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line")
@@ -128,13 +128,13 @@ def _temperatures(stage: dict, ending: str) -> str:
 
 
 def signed(value: float, error: float) -> str:
-    """value ± error, both to two digits of the error."""
+    """value ± error, rounded to two digits of the error."""
     digits = max(0, 1 - floor(log10(error))) if error > 0 else 3
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
 def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> None:
-    """energy.png: the drift of the last stage, large enough to be seen; energies and temperatures of the whole run."""
+    """energy.png: the drift of the last stage on its own scale; energies and temperatures of the whole run."""
     from matplotlib.figure import Figure
 
     stages = system.scene.stages

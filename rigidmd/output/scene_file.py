@@ -1,4 +1,4 @@
-"""The scene of a run, in its folder, with its defaults spelled out and the files it reads: enough to run it again."""
+"""The scene in the folder of a run, with all defaults and copies of its input files, so that it can run again."""
 
 import shutil
 from pathlib import Path
@@ -11,7 +11,7 @@ from rigidmd.scene import Scene
 
 
 def input_names(scene: Scene) -> dict[str, str]:
-    """What the copies of a scene's input files are called: dotted key -> name; no two alike."""
+    """Names for the copies of a scene's input files: dotted key -> unique name."""
     return {
         key: f"input_{key.removesuffix('.file').replace('molecules.', '')}_{path.name}"
         for key, path in scene.inputs.items()

@@ -1,4 +1,4 @@
-"""What `rigidmd stability` found: a table, what failed in words, stability.csv, stability.md and a page by itself."""
+"""Report of `rigidmd stability`: a table, failures in words, stability.csv, .md and a self-contained page."""
 
 import base64
 import csv
@@ -29,10 +29,10 @@ def _row(finding: Finding, family: str) -> list[str]:
     trials = [t for t in finding.trials if t.family == family]
     limits = [limit for limit in finding.limits if limit.family == family]
     verdicts = Counter(t.verdict for t in trials)
-    # the worst of those that came to an end, by what was allowed
+    # the worst of the finished runs, relative to the allowed error
     ended = [t for t in trials if isfinite(t.outcome.error)]
     worst = max(ended, key=_share, default=None)
-    # the least of its limits, where there are several settings
+    # the least of its limits if there are several settings
     least = min(limits, key=lambda limit: limit.longest, default=None)
     seconds = sum(t.outcome.seconds for t in trials) + sum(limit.seconds for limit in limits)
     return [
@@ -63,7 +63,7 @@ def _short(x: float) -> str:
 
 
 def table_text(findings: list[Finding]) -> str:
-    """The table as a person reads it."""
+    """The table as text."""
     lines = [list(HEADERS), *(line for finding in findings for line in rows(finding))]
     widths = [max(len(line[k]) for line in lines) for k in range(len(HEADERS))]
     return "\n".join(
@@ -75,7 +75,7 @@ def table_text(findings: list[Finding]) -> str:
 
 
 def words(findings: list[Finding]) -> list[str]:
-    """Sentences: what failed, what ended otherwise than expected, and the outcome of all."""
+    """Sentences on failures, unexpected outcomes and the total."""
     silent = [line for finding in findings for line in finding.silent]
     others = [
         f"{f.name}, {t.setting} {t.family}: {t.verdict}, expected {' or '.join(t.expected)}"
@@ -95,12 +95,12 @@ def words(findings: list[Finding]) -> list[str]:
 
 
 def failed(findings: list[Finding]) -> bool:
-    """Whether anything was silently wrong, or crashed."""
+    """Whether anything was silently wrong or crashed."""
     return any(finding.silent for finding in findings)
 
 
 def write_stability(folder: Path, findings: list[Finding], command: str, machine: str) -> list[Path]:
-    """All files; the paths written."""
+    """Write all files. Returns their paths."""
     with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(
@@ -148,7 +148,7 @@ def markdown(findings: list[Finding], command: str, machine: str) -> str:
 
 
 def picture(finding: Finding) -> bytes:
-    """A small figure of a case, PNG: errors over what was varied, and what was conserved over the step."""
+    """A small figure of a case, PNG: errors over the varied quantity, and of conserved quantities over the step."""
     from matplotlib.figure import Figure
 
     varied = len({t.x for t in finding.trials if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
@@ -212,11 +212,11 @@ def _draw_limits(axis, finding: Finding, family: str, color: str) -> None:
         if isfinite(limit.longest) and limit.longest > 0:
             axis.axvline(limit.longest, color=color, lw=0.6, ls=":")
     axis.set_xlabel(f"step ({finding.step_unit}); dotted: longest bounded")
-    axis.set_ylabel("largest error of what is conserved")
+    axis.set_ylabel("largest error of a conserved quantity")
 
 
 def page(findings: list[Finding], command: str, machine: str) -> str:
-    """A page that needs no other file."""
+    """A self-contained page."""
     head = "".join(f"<th>{html.escape(title)}</th>" for title in HEADERS)
     body = "".join(
         "<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in line) + "</tr>\n" for f in findings for line in rows(f)

@@ -26,14 +26,14 @@ from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.output.frame import Frame
 
-#: Least and largest coordinate (Å) that a format holds: whole thousandths of a nm in 32 bits, columns of a text.
+#: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
-#: Spacings of frames that differ by less than this part of the longest are even.
+#: Frames are evenly spaced if intervals differ by less than this fraction of the longest.
 EVEN = 1e-6
 
 
 def universe(system: System | BodySystem, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
-    """An MDAnalysis Universe of all sites, one residue a molecule; one frame with this state."""
+    """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this state."""
     names = system.residue_names
     u = mda.Universe.empty(
         len(system.sites.molecule),
@@ -66,7 +66,7 @@ def set_frame(
 
 
 def dimensions(cell: np.ndarray) -> list[float] | None:
-    """A cell (3, 3) as MDAnalysis wants it; None where there is none."""
+    """A cell (3, 3) in MDAnalysis' form; None without a box."""
     if cell[0, 0] == inf:
         return None
     return [*np.linalg.norm(cell, axis=1), *angles_deg(cell)]
@@ -91,7 +91,7 @@ def from_files(topology: Path, trajectory: Path, times: list[float]) -> mda.Univ
 
 
 def _checked(times: list[float]) -> list[float]:
-    """The times, with a warning where one interval cannot tell them."""
+    """The times, with a warning if they are not evenly spaced."""
     gaps = np.diff(times)
     if len(gaps) and np.ptp(gaps) > EVEN * gaps.max():
         warnings.warn(
@@ -103,7 +103,7 @@ def _checked(times: list[float]) -> list[float]:
 
 
 class _Timed(ProtoReader):
-    """What makes a reader tell the times of the run (ps), evenly spaced or not, whatever its source holds of them."""
+    """Makes a reader return the times of the run (ps), evenly spaced or not, whatever its file holds."""
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
@@ -124,7 +124,7 @@ class _Timed(ProtoReader):
         return self._timed(super()._read_frame(i))
 
     def _read_next_timestep(self, ts=None):
-        # every reader has its own
+        # every reader implements it
         return self._timed(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
 
 
@@ -155,13 +155,13 @@ TIMED = {
 
 
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Names, molecules and first positions: what viewers open beside a trajectory.
+    """Write names, molecules and first positions, which viewers need beside a trajectory.
 
-    Raises SimulationError where the format cannot hold a position.
+    Raises SimulationError if the format cannot hold a position.
     """
     _check_fits(path, system.site_positions(state, wrapped))
     with whole_file(path) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what a format cannot hold (occupancies, ...) is not ours to give
+        warnings.simplefilter("ignore")  # of missing attributes (occupancies, ...)
         sites = universe(system, state, wrapped=wrapped).select_atoms("all")
         sites.write(str(temporary))
 
@@ -177,9 +177,9 @@ def _check_fits(path: Path, positions: np.ndarray) -> None:
 
 
 class TrajectoryFile:
-    """Frames to a file, streamed. The ending chooses the format.
+    """Writes frames to a file as they come. The ending sets the format.
 
-    interval: time between frames (ps); only .dcd needs it, which stores it once for all frames.
+    interval : time between frames (ps); only .dcd uses it, which stores it once for all frames.
     """
 
     def __init__(self, path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool):
@@ -205,15 +205,15 @@ class TrajectoryFile:
                 self._writer.REMARK(f"TIME {time:.6f} PS")
             self._writer.write(self._universe.atoms)
             if self._format == ".pdb" and (box := dimensions(state.cell)):
-                self._writer.CRYST1(box)  # MDAnalysis reads what stands between a model and the next as the model's own
+                self._writer.CRYST1(box)  # MDAnalysis assigns lines between two models to the first
         self._flush()
 
     def _flush(self) -> None:
-        """Bring the frame to the disk: a run that is killed leaves whole frames."""
+        """Flush the frame to disk, so that a killed run leaves whole frames."""
         for name in ("_xyz", "pdbfile"):
             if (file := getattr(self._writer, name, None)) is not None:
                 file.flush()
-        if os.name == "posix":  # XTC and TRR go through C streams that their writers cannot flush: flush them all
+        if os.name == "posix":  # the writers of XTC and TRR cannot flush their C streams: flush all streams
             ctypes.CDLL(None).fflush(None)
 
     def close(self) -> None:

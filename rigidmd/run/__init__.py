@@ -1,4 +1,4 @@
-"""The loop between observations, for molecules and for a single body: everything from a scene to its results."""
+"""Runs of molecules and single bodies, from a scene to its results."""
 
 from rigidmd.run.body import BodySimulation
 from rigidmd.run.loop import Simulation

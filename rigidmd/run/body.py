@@ -1,4 +1,4 @@
-"""A single body: samples at even times, columns at the end, figures."""
+"""Runs of a single body: samples at regular times, columns at the end, figures."""
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
@@ -29,8 +29,8 @@ class BodySimulation(Simulation):
     """A scene of a single body, ready to run. Besides the parameters of `Simulation`:
 
     applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass, and
-        a torque (3,) in N m along the body's axes. It is asked once wherever the body has moved; what depends on the
-        velocity is held for a step, which makes that step of order 1
+        a torque (3,) in N m along the body's axes. It is called once for each position of the body. Forces that
+        depend on the velocity are constant within a step, which reduces its order to 1
     """
 
     time_unit = "s"
@@ -88,7 +88,7 @@ class BodySimulation(Simulation):
         return self._stretches[k]
 
     def _walk(self) -> list[Stretch]:
-        """From break to break of what follows time as told, in steps that end there, none longer than the scene's."""
+        """Stretches between the breaks of given functions of time, in equal steps not longer than the scene's."""
         run = self.scene.run
         stretches, steps = [], 0
         for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
@@ -96,7 +96,7 @@ class BodySimulation(Simulation):
             whole = round(exact)
             if abs(exact - whole) > 1e-9 * max(1.0, exact):
                 whole = ceil(exact)
-            # two breaks that are one to rounding leave nothing between them
+            # nothing lies between two breaks that are equal to rounding
             dt = (end - begin) / whole if whole not in (0, exact) else run.timestep_s
             stretches.append(Stretch(self.system.method, dt, whole, steps))
             steps += whole
@@ -133,11 +133,11 @@ class BodySimulation(Simulation):
         return self._watch.check.explained(error, self.stretch.dt, self._stable)
 
     def write_scene(self, folder: Path) -> None:
-        """Write the scene as it is run."""
+        """Write the scene as it runs."""
         write_scene(folder, self.scene)
 
     def introduction(self) -> str:
-        """One line, before the run."""
+        """One line for the start of a run."""
         system, run = self.system, self.scene.run
         pinned = "" if system.flies else ", pinned"
         return (
@@ -146,11 +146,11 @@ class BodySimulation(Simulation):
         )
 
     def conclusion(self, results: Results) -> str:
-        """The summary as a person reads it."""
+        """The summary as text."""
         return body_summary_text(results.summary)
 
     def start_energy(self) -> dict:
-        """Energies of the start in J, force in N along the lab's axes, torque in N m along the body's."""
+        """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""
         self._prepare()
         load, _ = self.engine.evaluate(self.state)
         seen = motion(self.system, [Snapshot(0.0, self.state)])

@@ -1,4 +1,4 @@
-"""What observes a single body: snapshots, the watch, motion.csv, figures."""
+"""Observers of a single body: snapshots, the watch, motion.csv, figures."""
 
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Sampler(Observer):
-    """Keeps snapshots; their columns are made at the end."""
+    """Keeps snapshots, from which columns are made at the end."""
 
     ends = True
 
@@ -36,25 +36,25 @@ class Sampler(Observer):
 
 
 class BodyWatch(Observer):
-    """Holds the state against the limits of the scene, however seldom samples are taken."""
+    """Checks the state against the limits of the scene, independent of the interval of samples."""
 
     ends = True
 
     def __init__(self, run: "BodySimulation"):
         self.check = BodyCheck(run.system, run.scene.watch)
         every = max(1, round(settled(run.scene.output.interval_s) / run.scene.run.timestep_s))
-        # half a second of computing or less, and LOOKS samples
+        # at most half a second of computing and LOOKS samples
         self.steps = min(BODY_PATIENCE // getattr(run.system.method, "force_evaluations", 1), LOOKS * every)
         self._run = run
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if the state cannot be what the scene means."""
+        """Raise a `Finding` if the state exceeds a limit."""
         if finding := self.check.finding(self._run.state, self._run.stretch.dt):
             raise finding
 
 
 class MotionFiles(Observer):
-    """motion.csv, and the same as arrays."""
+    """motion.csv and motion.npz."""
 
     def __init__(self, sampler: Sampler, npz: bool):
         self._sampler, self._npz = sampler, npz
@@ -80,14 +80,14 @@ class MotionFiles(Observer):
 
 
 class Figures(Observer):
-    """The path of the axis, angles, omega, errors."""
+    """Figures of the axis, angles, omega and errors."""
 
     def files(self) -> list[str]:
         """As PNG and SVG."""
         return [f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "svg")]
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
-        """Draw them, if there is anything to see."""
+        """Draw them if there are enough samples."""
         system, samples = run.system, results.samples
         if not isinstance(samples, Motion) or len(samples) <= 2:
             return

@@ -1,4 +1,4 @@
-"""The one loop between looks, of molecules and of a single body. All steps between two looks are compiled."""
+"""The one loop of runs, for molecules and single bodies. All steps between two looks of observers are compiled."""
 
 import contextlib
 import signal
@@ -33,14 +33,15 @@ if TYPE_CHECKING:
     from rigidmd.run.body import BodySimulation
     from rigidmd.run.molecules import MolecularSimulation
 
-    # a type checker lets nobody call an abstract class, but `Simulation(scene)` makes one of its complete subclasses
+    # A type checker refuses the call of an abstract class, but `Simulation(scene)` makes one of its complete
+    # subclasses.
     Base = object
 else:
     Base = ABC
 
 
 def _as_warning(sentence: str) -> None:
-    """A warning that names the line outside of this package from which it comes."""
+    """Issue a Python warning that names the calling line outside this package."""
     package, level, frame = str(Path(__file__).parent.parent), 1, sys._getframe()
     while frame is not None and frame.f_code.co_filename.startswith(package):
         level, frame = level + 1, frame.f_back
@@ -57,11 +58,11 @@ class Stretch(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """What a run took, in seconds."""
+    """Times of a run, in seconds."""
 
     preparing: float  # compiling, relief of overlaps
-    wall: float  # stretches with all that looks at them
-    computing: list[float]  # steps of each stretch
+    wall: float  # stretches with observers and output
+    computing: list[float]  # the steps of each stretch
 
 
 class Options(TypedDict, total=False):
@@ -79,18 +80,17 @@ class BodyOptions(Options, total=False):
 
 
 class Simulation(Base):
-    """A scene, ready to run: a `MolecularSimulation` or a `BodySimulation`, as the scene is.
+    """A scene, ready to run. The call returns a `MolecularSimulation` or a `BodySimulation`, according to the scene.
 
     Parameters
     ----------
-    scene : what to run
-    folder : where to write; None writes nothing and keeps the frames in memory
+    scene : the scene
+    folder : folder for the files; None writes nothing and keeps the frames in memory
     force : replace an earlier run in that folder
     observers : `Every` objects of your own, called between steps
-    say : called with a sentence when something begins that takes a moment (compiling, relieving)
-    warn : called with a sentence that whoever runs this should know before it is done; the summary has it too. A
-        `RigidMDWarning` by Python's `warnings` when not given
-    applied : of a single body, forces by Python functions: see `BodySimulation`
+    say : called with a sentence before something that takes a moment (compiling, relieving)
+    warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's `warnings`
+    applied : for a single body, forces from Python functions: see `BodySimulation`
     """
 
     state: State
@@ -152,10 +152,10 @@ class Simulation(Base):
         return f"{self.introduction().splitlines()[0]}; {where}"
 
     def run(self, progress: bool | None = None) -> Results:
-        """Run all stretches. Raises OutputError before anything is computed, SimulationError when numbers go bad.
+        """Run all stretches. Raises OutputError before anything is computed, SimulationError if a run has to stop.
 
-        progress : show how far it is: a bar on a terminal or in a notebook, elsewhere a line every 30 s on standard
-            error; in notebooks only when not given
+        progress : show progress: a bar on a terminal or in a notebook, elsewhere a line every 30 s on standard error;
+            default: only in notebooks
         """
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
@@ -193,7 +193,7 @@ class Simulation(Base):
                 write_summary(self.path(SUMMARY), results.summary)
         return results
 
-    # What molecules and bodies have of their own.
+    # Implemented for molecules and for bodies.
 
     system: "System | BodySystem"
     engine: Engine
@@ -202,65 +202,65 @@ class Simulation(Base):
 
     @abstractmethod
     def introduction(self) -> str:
-        """What is about to run, in a line or a few."""
+        """A few lines for the start of a run."""
 
     @abstractmethod
     def conclusion(self, results: Results) -> str:
-        """The summary as a person reads it."""
+        """The summary as text."""
 
     @abstractmethod
     def _reset(self) -> None:
-        """Back to the start, so that every run of a simulation is the same run: sets `engine` and `state`."""
+        """Return to the start, so that repeated runs are identical: sets `engine` and `state`."""
 
     @abstractmethod
     def _prepare(self) -> None:
-        """Everything before the first step, compiling included."""
+        """Do everything before the first step, including compilation."""
 
     @abstractmethod
     def _durations(self) -> list[float]:
-        """How long the stretches of the run are, ps or s."""
+        """Durations of the stretches, ps or s."""
 
     @abstractmethod
     def _enter(self, k: int) -> Stretch:
-        """Make ready for stretch k, and say how it is walked."""
+        """Prepare stretch k and return it."""
 
     @abstractmethod
     def _look(self, moment: Moment) -> Any:
-        """What there is to see at a moment, in internal units; what has a `reading` shows that to observers."""
+        """The observation at a moment, in internal units; observers see its `reading` if it has one."""
 
     @abstractmethod
     def _own_observers(self) -> list[Observer]:
-        """What samples, watches and writes."""
+        """The observers that sample, check and write."""
 
     @abstractmethod
     def _samples(self) -> Any:
-        """What has been sampled."""
+        """The samples of the run."""
 
     @abstractmethod
     def _summary(self, samples: Any, costs: Costs) -> dict[str, Any]:
-        """The figures by which the run is judged."""
+        """The summary."""
 
     @abstractmethod
     def _explain(self, error: SimulationError) -> str:
-        """What was seen, why, what to try."""
+        """An error in full: what was seen, the likely cause, what to try."""
 
     @abstractmethod
     def write_scene(self, folder: Path) -> None:
-        """Write the scene as it is run, with copies of the files that it reads."""
+        """Write the scene as it runs, with copies of the files that it reads."""
 
     def note(self, warning: str) -> None:
-        """Tell a sentence that whoever runs this should know before it is done; the summary has it too."""
+        """Issue a warning; the summary repeats it."""
         self._warnings.append(warning)
         self._warn(warning)
 
     @property
     def notes(self) -> list[str]:
-        """What was told so far."""
+        """The warnings so far."""
         return list(self._warnings)
 
     @np.errstate(over="ignore", invalid="ignore")
     def _failed(self, error: SimulationError, observers: list[Observer]) -> SimulationError:
-        """The error with when it happened and all that can be said about it."""
+        """The error with its step, time and explanation."""
         time, origin = self.state.time
         step = int(self.state.step[ORIGIN]) + round((time - origin) / self.stretch.dt)
         saved = "".join(observer.failed(self) for observer in observers)
@@ -270,8 +270,8 @@ class Simulation(Base):
         """Advance through all stretches; seconds of computing in each."""
         computing: list[float] = []
         durations = self._durations()
-        self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # until there is one, nothing has moved
-        time = 0.0  # in whole steps, without the rounding of their sum
+        self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
+        time = 0.0  # of whole stretches
         with progress_of(sum(durations), self.time_unit, progress) as advanced:
             for k in range(len(durations)):
                 self.stretch = stretch = self._enter(k)
@@ -298,7 +298,7 @@ class Simulation(Base):
                     ]
                     self._show(observers, Moment(self, first + done, time + done * stretch.dt, k), due)
                     shown = last
-                if not shown:  # a signal came while observers looked
+                if not shown:  # a signal arrived while observers were called
                     due = [observer.ends for observer in observers]
                     self._show(observers, Moment(self, first + done, time + done * stretch.dt, k), due)
                 computing.append(seconds)
@@ -309,14 +309,14 @@ class Simulation(Base):
 
     @staticmethod
     def _every(observer: Observer, dt: float) -> int:
-        """Steps between two looks of an observer; 0 for none but the last."""
+        """Steps between two looks of an observer; 0 for the last look only."""
         if observer.interval is not None:
             return max(1, round(observer.interval / dt))
         return observer.steps or 0
 
     @staticmethod
     def _counted(observer: Observer, stretch: Stretch) -> int:
-        """Steps before a stretch from which an observer counts: intervals of time may go on from the one before."""
+        """Steps before a stretch that an observer counts: intervals of time may continue from the previous stretch."""
         return stretch.counted if observer.interval is not None else 0
 
     @staticmethod
@@ -327,9 +327,9 @@ class Simulation(Base):
 
     @contextlib.contextmanager
     def _stops_at_signals(self) -> Iterator[None]:
-        """Ctrl-C or SIGTERM ends the run at the next look, and everything is saved; a second Ctrl-C ends it at once.
+        """Ctrl-C or SIGTERM ends the run at the next look with everything saved; a second Ctrl-C ends it at once.
 
-        A SIGTERM for which the program has a handler of its own is left to that.
+        If the program has its own handler for SIGTERM, that is kept.
         """
         if threading.current_thread() is not threading.main_thread():
             yield

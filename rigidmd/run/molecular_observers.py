@@ -1,4 +1,4 @@
-"""What observes molecules: samples, their limits and their log, the last state, a figure."""
+"""Observers of molecules: samples with their checks and log, the final state, a figure."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class LogFile(Observer):
-    """log.csv: a line for each sample, at once on the disk."""
+    """log.csv: a line for each sample, written to disk at once."""
 
     ends = True
 
@@ -50,7 +50,7 @@ class LogFile(Observer):
 
 
 class Good(NamedTuple):
-    """A moment at which nothing was wrong."""
+    """A state that passed all checks."""
 
     step: int
     time: float
@@ -67,14 +67,14 @@ class Sampler(Observer):
         self.samples = Samples()
         self.last_good: Good | None = None
         self._run, self._check = run, check
-        self._begins: dict[int, int] = {}  # of each stage, the row of the sample at which it began
+        self._begins: dict[int, int] = {}  # stage -> row of the sample at which it began
 
     def files(self) -> list[str]:
-        """What a run that fails leaves."""
+        """The file of a failed run."""
         return [LAST_GOOD]
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if the sample, or the step ahead of it, cannot be what the scene means."""
+        """Raise a `Finding` if the sample or the next step exceeds a limit."""
         run, now, rows = self._run, moment.sample, self.samples.rows
         since = self._begins.setdefault(now.stage, max(0, len(rows) - 1))
         rows.append(now)
@@ -103,7 +103,7 @@ class Sampler(Observer):
 
 
 class StepWatch(Observer):
-    """Checks the next step however seldom samples are taken; it costs no evaluation of forces."""
+    """Checks the next step between samples; this takes no force evaluation."""
 
     ends = True
 
@@ -112,7 +112,7 @@ class StepWatch(Observer):
         self._run, self._check = run, check
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if the step would take a molecule too far."""
+        """Raise a `Finding` if the step exceeds a limit."""
         run, load = self._run, self._run.engine.load
         if load is None:
             return  # no force has been evaluated yet
@@ -121,7 +121,7 @@ class StepWatch(Observer):
 
 
 class FinalState(Observer):
-    """final.npz: the state at the end, every bit of it."""
+    """final.npz: the exact state at the end."""
 
     def files(self) -> list[str]:
         """One."""
@@ -141,7 +141,7 @@ class EnergyFigure(Observer):
         return [ENERGY]
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
-        """Draw it, if there is anything to see."""
+        """Draw it if there are at least two samples."""
         samples = results.samples
         if isinstance(samples, Samples) and len(samples) > 1:
             draw_energy(run.path(ENERGY), run.system, samples, results.summary)

@@ -1,4 +1,4 @@
-"""Molecules: relief of overlaps, stages of all ensembles, samples."""
+"""Runs of molecules: relief of overlaps, stages of all ensembles, samples."""
 
 from dataclasses import replace
 from math import nan
@@ -13,7 +13,7 @@ from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.core.state import HEAT, TAKEN, WORK, State, state_of
-from rigidmd.engines.cpu import Engine, thread_limit
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
@@ -49,31 +49,32 @@ class MolecularSimulation(Simulation):
     ):
         super().__init__(scene, folder, force, **options)
         self._built = build(scene)
-        most = thread_limit()
+        # Numba defines the names of its config at import, out of sight of a type checker
+        most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
         self.threads = min(scene.threads or most, most)
         self._reset()
 
     def start_from(self, state: State) -> None:
-        """Let runs begin at positions and momenta of one's own, as they are: no overlaps are relieved."""
+        """Let runs begin at the given positions and momenta, without relief of overlaps."""
         begun = state_of(*state[:5])
         self._built = replace(self._built, state=begun, from_lattice=False)
         self._reset()
 
     def start(self) -> Relief | None:
-        """Go to the moment before the first step, from which `run` starts; the relief it took to get there."""
+        """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
         self._reset()
         self._prepare()
         return self._relief
 
     def _reset(self) -> None:
-        self.system = self._built  # a run may have decided what its scene leaves open
+        self.system = self._built  # an earlier run may have chosen an integrator
         self.scene = self.system.scene
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
         numba.set_num_threads(self.threads)
 
     def _prepare(self) -> None:
-        """Compile, and move apart what a lattice put too close."""
+        """Compile, and relieve overlaps of a lattice."""
         self._say("compiling (kept on disk: the next run starts at once)")
         _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
@@ -123,7 +124,8 @@ class MolecularSimulation(Simulation):
         if self.scene.stages[k].is_open:
             self._choose(k)
         self._estimate(k)
-        # a pilot leaves other neighbour lists behind: with new ones at every stage, the resolved scene repeats the bits
+        # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
+        # bit.
         self.engine = self.system.engine()
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
         self.state = self.engine.begin(self.state, row)
@@ -135,7 +137,7 @@ class MolecularSimulation(Simulation):
         return Stretch(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
 
     def _estimate(self, k: int) -> None:
-        """Longest stable step (ps) of stage k from where it starts, and a warning where its own is longer."""
+        """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
         stage = self.scene.stages[k]
         if not self.scene.watch.stable_step or not is_worth_it(
             self.system, stage.steps * stage.scheme.force_evaluations
@@ -154,7 +156,7 @@ class MolecularSimulation(Simulation):
             )
 
     def _choose(self, k: int) -> None:
-        """Find integrator and step of a stage on the present state, and put them into the scene."""
+        """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
         stage = self.scene.stages[k]
         self._say("choosing integrator and step by pilot runs")
         integrator, timestep, reason = choose_for_molecules(self.system, self.state, stage)
@@ -253,11 +255,11 @@ class MolecularSimulation(Simulation):
         return watch.explained(self.system, error, states, self.stretch.dt, self._stable.get(self._stage))
 
     def write_scene(self, folder: Path) -> None:
-        """Write the scene as it is run, with copies of the files that it reads."""
+        """Write the scene as it runs, with copies of the files that it reads."""
         write_scene(folder, self.scene)
 
     def introduction(self) -> str:
-        """What is about to run."""
+        """A few lines for the start of a run."""
         system, asked = self.system, self.scene.threads or 0
         more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
         first = (
@@ -267,13 +269,13 @@ class MolecularSimulation(Simulation):
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
-        """The summary as a person reads it."""
+        """The summary as text."""
         return summary_text(results.summary)
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
-        """Energies, virial, pressure and largest force of the start; energies in a unit of `size` u Å²/ps².
+        """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².
 
-        measure_accuracy : also how far Coulomb forces are from those of a longer Ewald sum
+        measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
         """
         relief = self.start()
         seen = observe(self.system, self.engine, self.state)

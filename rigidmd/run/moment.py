@@ -1,4 +1,4 @@
-"""A moment of a run, as observers are shown it."""
+"""A moment of a run, as observers see it."""
 
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class Moment:
-    """What an observer is given: where the run is, its state (read-only), and what can be measured there.
+    """The argument of observers: position in the run, state (read-only) and observation.
 
     step : steps since the start; time : ps, or s for a single body; stage : index of the stage that led here
-    state : of molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), of a body in SI units
+    state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in SI units
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
@@ -29,22 +29,22 @@ class Moment:
 
     @cached_property
     def _seen(self) -> Any:
-        """What there is to see, in internal units; evaluated at the first use and shared by all observers."""
+        """The observation in internal units, evaluated at the first use and shared by all observers."""
         return self._run._look(self)
 
     @cached_property
     def sample(self) -> "Sample":
-        """The line of the log of this moment; of molecules."""
+        """The line of the log; for molecules only."""
         return cast("MolecularSimulation", self._run).sample_of(self)
 
     @property
     def observation(self) -> Any:
-        """What can be measured: a `Reading` of molecules, in the units of the log; a `Pose` of a body, in SI units."""
+        """The observation: a `Reading` for molecules, in the units of the log; a `Pose` for a body, in SI units."""
         return getattr(self._seen, "reading", self._seen)
 
     @property
     def site_positions(self) -> np.ndarray:
-        """Positions (s, 3) of all sites, lab frame, Å, as they travelled."""
+        """Positions (s, 3) of all sites, lab frame, Å, not wrapped."""
         return self._run.system.site_positions(self.state)
 
 

@@ -1,9 +1,9 @@
-"""Observers: all that looks at a run between its steps. They read its state and never write it.
+"""Observers look at a run between its steps. They read its state and never change it.
 
-Each is asked the same few things, whatever it does: `files` it may write, `begin`, `see` a moment, `end`. It sees every
-`interval` of time, counted in steps of each stretch, or every so many `steps`, for what is to be looked at however
-rarely results are wanted; and, if it is one that `ends`, the last moment of every stretch. None depends on being before
-or behind another: what several of them need, a moment or the run has.
+All have the same methods: `files` it may write, `begin`, `see` a moment, `end`. An observer sees every `interval` of
+time, counted in steps of each stretch, or every `steps` steps, independent of the interval of results. If its `ends` is
+true, it also sees the last moment of every stretch. No observer depends on the order of observers: data that several of
+them need belong to the moment or the run.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,35 +22,35 @@ if TYPE_CHECKING:
 
 
 class Observer:
-    """An observer that does nothing; others do some of it."""
+    """Base class; its methods do nothing."""
 
     interval: float | None = None  # ps, or s for a single body
     steps: int | None = None
     ends = False
 
     def files(self) -> list[str]:
-        """Names of all files that it may write into the folder of the run."""
+        """Names of all files that it may write."""
         return []
 
     def begin(self, run: "Simulation") -> None:
-        """Before the first step; the folder is there."""
+        """Called before the first step; the folder exists."""
 
     def see(self, moment: Moment) -> None:
         """Look. Raises SimulationError to stop the run."""
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        """After the last step, or where the run was interrupted: write what is left to write."""
+        """Called after the last step or an interruption: complete the files."""
 
     def close(self) -> None:
-        """Whatever happened: let go of files."""
+        """Called in any case: close files."""
 
     def failed(self, run: "Simulation") -> str:
-        """The run stops with an error: save what is good; a sentence that says where, or nothing."""
+        """Called if the run stops with an error: save results. Returns a sentence that names the file, or nothing."""
         return ""
 
 
 class Every(Observer):
-    """An observer of one's own: call `function(moment)` every `interval` ps (s for a single body)."""
+    """Calls `function(moment)` every `interval` ps (s for a single body)."""
 
     def __init__(self, interval: float, function: Callable[[Moment], object]):
         self.interval = interval
@@ -62,7 +62,7 @@ class Every(Observer):
 
 
 class SceneFile(Observer):
-    """scene.toml: the scene as it was run, with copies of the files that it reads."""
+    """scene.toml: the scene as it runs, with copies of the files that it reads."""
 
     def __init__(self, names: Iterable[str] = ()):
         self._copies = list(names)
@@ -72,7 +72,7 @@ class SceneFile(Observer):
         return [SCENE, *self._copies]
 
     def begin(self, run: "Simulation") -> None:
-        """Write it; a run writes it once more where a stage has decided what the scene left open."""
+        """Write it. A run writes it again after choosing an integrator for a stage."""
         if run.folder is not None:
             run.write_scene(run.folder)
 

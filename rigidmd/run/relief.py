@@ -1,4 +1,4 @@
-"""Overlap relief: molecules that a lattice put too close are moved apart before the first step."""
+"""Relief of overlaps: molecules that are too close on a lattice are moved apart before the first step."""
 
 from math import inf
 from typing import NamedTuple
@@ -14,24 +14,24 @@ from rigidmd.measure.kicks import kicks
 from rigidmd.mechanics.rotation import from_vector
 
 MOST_STEPS = 2000
-LONGEST_MOVE = 0.1  # of the smallest distance that matters (the scale given), a step
+LONGEST_MOVE = 0.1  # in a step, as a fraction of `scale`
 
 
 class Relief(NamedTuple):
-    """What the relief did and what is left to do."""
+    """Result of a relief."""
 
     steps: int
-    excess: float  # largest kick of a first step over its thermal momentum; fine at 1 or below
+    excess: float  # largest kick of the first step over the thermal momentum; good at 1 or below
 
 
 def relieve(
     model: Model, engine: Engine, state: State, radius: np.ndarray, scale: float, thermal: float, dt: float
 ) -> Relief:
-    """Steepest descent with a bounded move, in place, until the first step is no longer violent.
+    """Steepest descent with bounded moves, in place, until the kicks of the first step are no longer too large.
 
-    radius (species,): how far from its centre a molecule reaches (Å), which turns angles into moves; scale: the
-    smallest Lennard-Jones diameter (Å). A move that lowers the energy lengthens the next by a fifth, another is taken
-    back and halved.
+    radius (species,) : radius of each molecule (Å), which converts angles to moves; scale : the smallest Lennard-Jones
+    diameter (Å). After a move that lowers the energy the next is longer by a fifth; any other move is undone and
+    halved.
     """
     load, tallies = engine.evaluate(state)
     left = float(kicks(model, load, thermal, dt).max())
@@ -43,7 +43,7 @@ def relieve(
     free = mobile(model)
     turning = (model.inertia > 0)[model.species][: len(state.rotation)]
     for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
-        # Each molecule along its own force, none further than `length`: overlaps do not slow down everybody else.
+        # Each molecule moves along its own force by at most `length`, so overlaps do not slow down the others.
         push = load.force * free[:, None] / np.abs(load.force[free]).max()
         turn = load.torque_body * turning / arm / np.abs(load.force[free]).max()
         reach = np.linalg.norm(push, axis=1)

@@ -1,4 +1,4 @@
-"""What a run leaves."""
+"""Results of a run."""
 
 from dataclasses import dataclass, field
 from html import escape
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 @dataclass(repr=False)
 class Results:
-    """What a run leaves: samples as arrays, a summary, the final state, the files.
+    """Results of a run: samples as arrays, summary, final state, files.
 
-    results["energy"] is a column of the samples as an array, in the unit that log.csv has (kJ/mol of the whole system,
-    K, bar, Å, ps), of a body in SI units; `units` names all columns with their units.
+    results["energy"] is a column of the samples as an array, in the unit of log.csv (kJ/mol of the whole system, K,
+    bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their units.
 
-    summary : figures with units in their keys, as in summary.json
-    state : the last one, of molecules in Å, Å/ps and u Å²/ps, of a body in SI units
-    files : what was written
-    interrupted : whether a signal ended the run before its time; signal : which one, 2 of Ctrl-C, 15 of SIGTERM
+    summary : values with units in their keys, as in summary.json
+    state : the final one, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units
+    files : paths of the files written
+    interrupted : whether a signal ended the run early; signal : its number, 2 for Ctrl-C, 15 for SIGTERM
     """
 
     system: "System | BodySystem"
@@ -65,22 +65,22 @@ class Results:
         return f"{'interrupted, ' if self.interrupted else ''}{len(self.samples)} samples, {files}"
 
     def _range(self, columns: list[str]) -> str:
-        """First and last value of a column that stands alone."""
+        """First and last value of a scalar column."""
         values = self[columns[0]]
         if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
             return ""
         return " ... ".join(escape(x) if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])
 
     def __getitem__(self, column: str) -> np.ndarray:
-        """A column of the samples as an array (n,), in the unit that `units` says: results["energy"].
+        """A column of the samples as an array (n,), in its unit of `units`: results["energy"].
 
-        Of a body that turns results["Q"] are its rotation matrices (n, 3, 3). Raises KeyError with all names.
+        For a body that turns, results["Q"] holds its rotation matrices (n, 3, 3). Raises KeyError with all names.
         """
         return self.samples[column]
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of every column, by its name; "1" of plain numbers, empty of words."""
+        """Name -> unit of each column; "1" for numbers, empty for words."""
         return {name: column.unit for name, column in self.samples.described.items()}
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -95,8 +95,8 @@ class Results:
     def universe(self) -> "MDAnalysis.Universe":
         """The trajectory as an MDAnalysis Universe: from the files if there are any, else from memory.
 
-        Lengths in Å, times in ps: every frame has the time of the run, whatever the file can hold. Of a body a second
-        is shown as a picosecond. Warns where frames are not evenly spaced. Raises ValueError where there is none.
+        Lengths in Å, times in ps; every frame has its time in the run, even if the file cannot hold it. For a body a
+        second becomes a picosecond. Warns if frames are not evenly spaced. Raises ValueError without a trajectory.
         """
         from rigidmd.output import trajectory
 

@@ -1,4 +1,4 @@
-"""The value of a run: `Scene.read(path)` gives the scene of molecules or of a single body."""
+"""Scenes: `Scene.read(path)` returns the scene of molecules or of a single body."""
 
 from typing import Any
 
@@ -14,9 +14,9 @@ __all__ = ["BodyScene", "MolecularScene", "Scene", "parse_override", "schema"]
 
 
 def schema() -> dict[str, Any]:
-    """The JSON schema of scene files: with a table [body] of a single body, without one of molecules.
+    """The JSON schema of scene files: of a single body with a table [body], of molecules without one.
 
-    By the condition an editor holds a file against the kind of scene that it is, and says what is wrong there.
+    With this condition an editor checks a file as the kind of scene that it is.
     """
     scenes: list[tuple[type[BaseModel], JsonSchemaMode]] = [
         (kind, "validation") for kind in (BodyScene, MolecularScene)
@@ -26,7 +26,7 @@ def schema() -> dict[str, Any]:
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "A scene of rigidmd",
-        "description": "Molecules that move, or a single body: what `rigidmd run` takes.",
+        "description": "Moving molecules or a single body, as `rigidmd run` takes them.",
         "type": "object",
         "if": {"required": ["body"]},
         "then": {"$ref": "#/$defs/BodyScene"},
@@ -36,7 +36,7 @@ def schema() -> dict[str, Any]:
 
 
 class _TomlSchema(GenerateJsonSchema):
-    """JSON schema of what TOML can hold: no null. Defaults are those that JSON can hold, and of keys, not tables."""
+    """JSON schema for TOML, which has no null. Only keys have defaults, and only those that JSON can hold."""
 
     def nullable_schema(self, schema) -> JsonSchemaValue:
         return self.generate_inner(schema["schema"])

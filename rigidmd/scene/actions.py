@@ -1,4 +1,4 @@
-"""What acts on a single body, as tables of its scene: fields, forces, friction, fluids, frames, wheels. SI units."""
+"""Tables of a scene that act on a single body: fields, forces, friction, fluids, frames, wheels. SI units."""
 
 from itertools import pairwise
 from math import inf
@@ -23,14 +23,14 @@ class Gravity(Section):
 
 
 class Timed(Section):
-    """What may be constant, in a window of time, or a table of values that straight lines join."""
+    """Quantities that are constant, limited to a window of time, or interpolated linearly in a table."""
 
     times_s: Times | None = None
-    """Times of the values, increasing; then each quantity is a list of as many values"""
+    """Increasing times; each quantity is then a list of as many values"""
     from_s: NonNegative | None = None
-    """When it begins"""
+    """Begin"""
     to_s: NonNegative | None = None
-    """When it ends"""
+    """End"""
 
     @field_validator("times_s")
     @classmethod
@@ -41,7 +41,7 @@ class Timed(Section):
         return times
 
     def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
-        """What is wrong between the times and these quantities; a single value is of type `entry`."""
+        """Faults between the times and these quantities; a single value is of type `entry`."""
         faults, times = [], self.times_s
         if times is not None and (self.from_s is not None or self.to_s is not None):
             faults.append("from_s and to_s would do nothing beside times_s")
@@ -61,21 +61,21 @@ class Timed(Section):
 
     @property
     def window(self) -> tuple[float, float]:
-        """When it begins and ends."""
+        """Begin and end."""
         return self.from_s or 0.0, inf if self.to_s is None else self.to_s
 
 
 class Applied(Timed):
-    """A force and a torque from outside."""
+    """An external force and torque."""
 
     axes: Literal["lab", "body"] = "lab"
-    """Along which axes they are given: they stay fixed in the lab, or turn with the body"""
+    """Axes of the components: fixed in the lab, or turning with the body"""
     force_N: Vector | tuple[Vector, ...] | None = None
     """Force"""
     torque_N_m: Vector | tuple[Vector, ...] | None = None
-    """Torque, besides that of the force"""
+    """Torque in addition to that of the force"""
     at_m: Vector | None = None
-    """Where the force acts, body axes, from the centre of mass or the pivot; there when not given"""
+    """Point of action, body axes, from the centre of mass or the pivot; default: that point itself"""
 
     @model_validator(mode="after")
     def _does_something(self):
@@ -99,7 +99,7 @@ class Friction(Section):
 
 
 class Fluid(Section):
-    """A fluid at rest around the body: resistance, buoyancy, the fluid it carries along. Along the body's axes."""
+    """A fluid at rest around the body: resistance, buoyancy, added mass. Along the body's axes."""
 
     linear_resistance_kg_s: NonNegativeVector = (0.0, 0.0, 0.0)
     """Force per velocity"""
@@ -110,11 +110,11 @@ class Fluid(Section):
     quadratic_rotational_resistance_N_m_s2: NonNegativeVector = (0.0, 0.0, 0.0)
     """Torque per angular velocity squared"""
     density_kg_m3: Positive | None = None
-    """Of the fluid: displaced and added mass of a sphere or ellipsoid follow"""
+    """Density of the fluid, from which displaced and added mass of a sphere or ellipsoid follow"""
     displaced_mass_kg: NonNegative | None = None
     """Mass of the fluid displaced: buoyancy is its weight"""
     centre_of_buoyancy_m: Vector | None = None
-    """Where buoyancy acts, body axes, from the centre of mass or the pivot; the centre of mass when not given"""
+    """Point where buoyancy acts, body axes, from the centre of mass or the pivot; default: the centre of mass"""
     added_mass_kg: NonNegativeVector | None = None
     """Mass of fluid carried along each axis"""
     added_inertia_kg_m2: NonNegativeVector | None = None
@@ -122,21 +122,21 @@ class Fluid(Section):
 
 
 class Frame(Timed):
-    """Axes that turn and an origin that is accelerated; motion is told relative to them."""
+    """A frame with turning axes or an accelerated origin; the motion is relative to it."""
 
     angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
     """Of the frame, along its own axes"""
     angular_acceleration_rad_s2: Vector | None = None
     """Of the frame, along its own axes, constant from the start"""
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
-    """Of the frame's origin, along the frame's axes; a field against it acts on the body"""
+    """Of the frame's origin, along the frame's axes; the body feels the opposite acceleration"""
 
     @model_validator(mode="after")
     def _does_something(self):
         timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
         faults = self.timing_faults(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
-            faults.append("from_s and to_s mean nothing here; use times_s")
+            faults.append("from_s and to_s are not supported here; use times_s")
         if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
             faults.append("angular_acceleration_rad_s2 and times_s contradict each other")
         if not any(timed.values()) and self.angular_acceleration_rad_s2 is None:
@@ -147,12 +147,12 @@ class Frame(Timed):
 
 
 class Wheel(Timed):
-    """A rotor on an axis fixed in the body, whose inertia holds all of the wheel but its own about that axis."""
+    """A rotor on an axis fixed in the body. The inertia of the body includes the wheel, except that about this axis."""
 
     axis: Vector
-    """Its axis, body axes; only the direction counts"""
+    """Direction of the axis, body axes, of any length"""
     momentum_kg_m2_s: Number = 0.0
-    """Its angular momentum along the axis at the start, relative to the lab"""
+    """Initial angular momentum along the axis, relative to the lab"""
     motor_torque_N_m: Number | tuple[Number, ...] | None = None
     """Torque of its motor on the wheel; the body feels the opposite"""
 
@@ -160,7 +160,7 @@ class Wheel(Timed):
     def _turns(self):
         faults = self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
         if not any(self.axis):
-            faults.append("axis is zero, which is no direction")
+            faults.append("axis is zero, which is not a direction")
         idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
         if self.motor_torque_N_m is None and idle:
             faults.append(f"{', '.join(idle)} would do nothing without motor_torque_N_m")
@@ -170,9 +170,9 @@ class Wheel(Timed):
 
 
 class ChangingInertia(Timed):
-    """Principal moments that follow time as told, along the same axes; mass and centre of mass stay.
+    """Principal moments as given functions of time, along fixed body axes; mass and centre of mass do not change.
 
-    About the centre of mass, which is also the pivot of a body that is pinned.
+    About the centre of mass, which must be the pivot of a pinned body.
     """
 
     inertia_kg_m2: tuple[PositiveVector, ...]
@@ -184,7 +184,7 @@ class ChangingInertia(Timed):
         if self.times_s is None:
             faults = ["times_s is missing"]
         if self.from_s is not None or self.to_s is not None:
-            faults.append("from_s and to_s mean nothing here; use times_s")
+            faults.append("from_s and to_s are not supported here; use times_s")
         for k, moments in enumerate(self.inertia_kg_m2):
             if why := impossible(np.diag(moments)):
                 faults.append(f"no body has the inertia of entry {k}: {why}")

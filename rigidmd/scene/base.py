@@ -1,4 +1,4 @@
-"""A scene: one frozen, validated value from which everything a run does follows. How one is read."""
+"""A scene: one frozen, validated value that determines a run completely. Reading one."""
 
 import os
 import re
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 class Scene(Section):
-    """Everything a run does follows from this value. Read one with `Scene.read(path)`.
+    """The complete description of a run. Read one with `Scene.read(path)`.
 
     A scene with a table [body] is a `BodyScene`, any other a `MolecularScene`.
     """
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=100)] = "scene"
-    """What to call the run; the file's name when not given"""
+    """Name of the run; default: that of the file"""
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
@@ -38,7 +38,7 @@ class Scene(Section):
 
     @property
     def in_short(self) -> str:
-        """What it is, in a line."""
+        """One line about it."""
         return self.name
 
     @property
@@ -52,17 +52,17 @@ class Scene(Section):
 
     @property
     def inputs(self) -> dict[str, Path]:
-        """Every file it reads besides itself: dotted key -> path."""
+        """Every further file that it reads: dotted key -> path."""
         return {}
 
     @classmethod
     def strange_paths(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        """Faults: files named in a scene that are not in its folder."""
+        """Faults: files of a scene that lie outside its folder."""
         return []
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
-        """Faults between tables that may have faults of their own, which would hide them."""
+        """Faults between tables. They are found even if a table has faults of its own."""
         return []
 
     @classmethod
@@ -106,7 +106,7 @@ class Scene(Section):
         for key, value in (overrides or {}).items():
             faults += _override(data, key, value)
             if value is None and key.rpartition(".")[2].isdigit():
-                text = ""  # without an entry, those after it have other numbers than in the text
+                text = ""  # entries after a removed one have other numbers than in the text
             else:
                 overridden.append(key)
         faults += kind.contradictions(data, text)
@@ -123,7 +123,7 @@ class Scene(Section):
         return scene
 
     def _missing_files(self, text: str, overridden: Iterable[str]) -> list[str]:
-        """Faults: files it names that are not there, by line and key."""
+        """Faults: missing files, by line and key."""
         faults = []
         for key, path in self.inputs.items():
             if path.is_file():
@@ -137,7 +137,7 @@ class Scene(Section):
 
 
 def file_name(name: str, endings: tuple[str, ...]) -> str:
-    """A name with one of these endings that leads out of no folder. Raises ValueError."""
+    """A plain file name with one of these endings. Raises ValueError."""
     if not re.fullmatch(r"[\w\-][\w.\-]*", name):
         raise ValueError(f"is {name!r}, must be a plain file name without a folder")
     if name.startswith("input_"):
@@ -148,7 +148,7 @@ def file_name(name: str, endings: tuple[str, ...]) -> str:
 
 
 def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
-    """The kind of scene that has these tables, or the only one that knows any of them."""
+    """The kind of scene with these tables; None if no table belongs to either kind."""
     for kind, marker in ((body, "body"), (molecules, "molecules")):
         if marker in data:
             return kind
@@ -158,7 +158,7 @@ def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"
 
 
 def _override(data: dict, key: str, value: Any) -> list[str]:
-    """Set one dotted key in nested tables and lists, or remove it by None, in place; a list of faults."""
+    """Set one dotted key in nested tables and lists in place; None removes it. Returns faults."""
     if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".")
@@ -170,7 +170,7 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
             if not part.isdigit() or int(part) >= len(target):
                 return [f"--set {key}: {here} has entries 0 to {len(target) - 1}, not {part!r}"]
         elif not table:
-            return [f"--set {key}: {here} is no table"]
+            return [f"--set {key}: {here} is not a table"]
         elif value is None and part not in target:
             there = meant(part, target) or f"; there are {', '.join(target)}"
             return [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
@@ -187,7 +187,7 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """KEY=VALUE of the command line: the value as TOML would read it, or else as text; None if empty.
+    """KEY=VALUE of the command line: the value is read as TOML, or else as text; None if empty.
 
     Raises SceneError.
     """

@@ -1,6 +1,6 @@
 """The scene of a single body: a top, a gyroscope, a satellite, a falling stone. SI units throughout.
 
-The equations hold no constant of nature, so numbers in any other consistent units serve as well.
+The equations contain no constant of nature, so any other consistent units work as well.
 """
 
 from collections.abc import Iterator
@@ -40,17 +40,17 @@ from rigidmd.validation import Flag, Number, Positive, Section, Vector, line_of
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
 
-#: A rotation matrix given with fewer than about nine digits is refused unless it is to be projected.
+#: A rotation matrix with fewer than about nine digits is refused without `project`.
 LARGEST_ORTHOGONALITY_ERROR = 1e-9
 FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
 
 
 class Solid(Section):
-    """A homogeneous solid; axis 3 is its axis of symmetry, a cone stands on its tip."""
+    """A homogeneous solid; axis 3 is its axis of symmetry; a cone stands on its tip."""
 
     shape: Literal[tuple(SOLIDS)]  # type: ignore[valid-type]
-    """What it is"""
+    """Its shape"""
     radius_m: Positive | None = None
     """Of a cylinder, cone, sphere, disk, ring"""
     height_m: Positive | None = None
@@ -83,14 +83,14 @@ class PointMass(Section):
     mass_kg: Positive
     """Mass"""
     position_m: Vector
-    """Body axes, from any origin; from the pivot where the body is pinned"""
+    """Body axes, from any origin; from the pivot if the body is pinned"""
 
 
 class BodyTable(Section):
-    """The body: mass, inertia, and where it is pinned, if it is. Without inertia it is a point."""
+    """The body: mass, inertia and pivot. Without inertia it is a point."""
 
     mass_kg: Positive | None = None
-    """Mass; the sum of those of points when they are given"""
+    """Mass; with points it is their sum"""
     solid: Solid | None = None
     """Inertia of a homogeneous solid"""
     points: tuple[PointMass, ...] | None = Field(default=None, min_length=1)
@@ -98,11 +98,11 @@ class BodyTable(Section):
     inertia_kg_m2: NonNegativeVector | None = None
     """Principal moments, along the body's axes"""
     inertia_tensor_kg_m2: Matrix | None = None
-    """Inertia tensor along the body's axes, products of inertia with the sign they have in the tensor"""
+    """Inertia tensor along the body's axes; off-diagonal entries with the sign of the tensor"""
     inertia_about: Literal["centre_of_mass", "pivot"] = "centre_of_mass"
-    """Which point the inertia given is about"""
+    """Reference point of the given inertia"""
     pinned: Flag = False
-    """One point of the body stays where it is"""
+    """One point of the body is fixed"""
     centre_of_mass_m: Vector | None = None
     """From the pivot, body axes; of a pinned body"""
 
@@ -115,7 +115,7 @@ class BodyTable(Section):
         if self.points is None and self.mass_kg is None:
             faults.append("mass_kg is missing")
         if self.points is not None and self.mass_kg is not None:
-            faults.append("mass_kg would do nothing: points have their masses")
+            faults.append("mass_kg would do nothing: the points have masses")
         if not self.pinned and self.centre_of_mass_m is not None:
             faults.append("centre_of_mass_m is that of a pinned body, from its pivot; this one is not pinned")
         if self.points is not None and self.centre_of_mass_m is not None:
@@ -151,27 +151,27 @@ class BodyTable(Section):
 
     @property
     def tensor(self) -> np.ndarray | None:
-        """The inertia tensor (3, 3) given by moments or as a tensor, about the point it is given about."""
+        """The inertia tensor (3, 3) from moments or tensor, about the point of `inertia_about`."""
         if self.inertia_tensor_kg_m2 is not None:
             return np.array(self.inertia_tensor_kg_m2)
         return None if self.inertia_kg_m2 is None else np.diag(self.inertia_kg_m2)
 
 
 class BodyStart(Section):
-    """The first moment. Attitude and motion are relative to the frame where there is one."""
+    """The start. Attitude and motion are relative to the frame if there is one."""
 
     euler_angles_deg: Vector | None = None
     """phi, theta, psi (3-1-3): Q = Rz(phi) Rx(theta) Rz(psi)"""
     yaw_pitch_roll_deg: Vector | None = None
     """yaw, pitch, roll (3-2-1): Q = Rz(yaw) Ry(pitch) Rx(roll)"""
     quaternion_wxyz: Quaternion | None = None
-    """Quaternion, of any length but zero"""
+    """Quaternion of any length except zero"""
     rotation: Matrix | None = None
     """Rows of Q, body to lab: x_lab = Q x_body"""
     attitude_matrix: Matrix | None = None
-    """Rows of T = Q^T, lab to body, as texts on satellites have it"""
+    """Rows of T = Q^T, lab to body, the convention for satellites"""
     project: Flag = False
-    """Take the nearest rotation to the matrix given"""
+    """Replace the given matrix by the nearest rotation"""
     euler_rates_rad_s: Vector | None = None
     """phi', theta', psi'"""
     angular_velocity_body_rad_s: Vector | None = None
@@ -200,24 +200,24 @@ class BodyStart(Section):
             sense = np.linalg.det(matrix)
             if self.project and (sense <= 0 or error > FURTHEST_FROM_ROTATION):
                 faults.append(
-                    f"the matrix is no rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is "
+                    f"the matrix is not a rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is "
                     f"{error:.2g}, must be below {FURTHEST_FROM_ROTATION:g}"
                 )
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
                 what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"
                 faults.append(
-                    f"the matrix is no rotation: {what}, must be below {LARGEST_ORTHOGONALITY_ERROR:g}; "
-                    "project = true takes the nearest one"
+                    f"the matrix is not a rotation: {what}, must be below {LARGEST_ORTHOGONALITY_ERROR:g}; "
+                    "project = true uses the nearest one"
                 )
         if self.quaternion_wxyz is not None and not any(self.quaternion_wxyz):
-            faults.append("quaternion_wxyz is zero, which is no rotation")
+            faults.append("quaternion_wxyz is zero, which is not a rotation")
         if self.euler_rates_rad_s is not None:
             if self.euler_angles_deg is None:
                 faults.append("euler_rates_rad_s needs euler_angles_deg")
             elif self.euler_angles_deg[1] % 180 == 0:
                 faults.append(
                     f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' turn about "
-                    "one and the same line there; give angular_velocity_body_rad_s"
+                    "the same axis there; give angular_velocity_body_rad_s"
                 )
         if faults:
             raise ValueError("; ".join(faults))
@@ -249,27 +249,27 @@ class BodyStart(Section):
 
 
 class Run(Section):
-    """How long, and how."""
+    """Duration and integrator."""
 
     duration_s: Positive
-    """How long"""
+    """Duration"""
     timestep_s: Positive
-    """Time step; of dop853 and radau, which choose their own, where they are looked at; with auto, the longest"""
+    """Time step; with dop853 and radau, which choose their own, the time between looks; with auto the longest step"""
     integrator: Literal[(*SCHEMES, AUTO, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
-    """A scheme of flows; auto: the one, and its step, that keep the error asked for with the fewest forces; or a
-    general solver of the textbook's equations: rk4, dop853, radau"""
+    """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest force evaluations; or
+    a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None
     """With auto: rms error of the energy, as a fraction of the largest kinetic energy"""
     trajectory_error: Positive | None = None
-    """With auto: largest error of Q (of X in m, of a point) at the end"""
+    """With auto: largest error of Q at the end; for a point that of X in m"""
     rotor: Rotor | None = None
-    """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
+    """Free rotation by the split or the exact flow; default: the one that the integrator needs"""
     formulation: Literal[tuple(FORMULATIONS)] | None = None  # type: ignore[valid-type]
-    """Variables of the attitude under rk4, dop853 and radau; matrix when not given"""
+    """Variables of the attitude for rk4, dop853 and radau; default: matrix"""
     relative_tolerance: Annotated[float, Strict(), Field(ge=1e-13, lt=1)] | None = None
-    """Of dop853 and radau; 1e-10 when not given"""
+    """Of dop853 and radau; default: 1e-10"""
     absolute_tolerance: Positive | None = None
-    """Of dop853 and radau, in parts of the size that each variable has in the run; 1e-10 when not given"""
+    """Of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
 
     @model_validator(mode="after")
     def _nothing_idle(self):
@@ -295,32 +295,32 @@ class Run(Section):
 
     @property
     def is_open(self) -> bool:
-        """Whether integrator and step are still to be chosen."""
+        """Whether integrator and step are still open."""
         return self.integrator == AUTO
 
     @property
     def steps(self) -> int:
-        """Number of steps: the duration in steps, rounded."""
+        """Number of steps, rounded."""
         return round(self.duration_s / self.timestep_s)
 
 
 class BodyOutput(Section):
-    """What is written, all into the run's own folder."""
+    """Files in the folder of the run."""
 
     interval_s: Positive | None = None
-    """Time between samples, in motion.csv and the trajectory; a two-thousandth of the duration when not given"""
+    """Time between samples, in motion.csv and the trajectory; default: a two-thousandth of the duration"""
     npz: Flag = False
-    """Write motion.npz too, the same columns as arrays"""
+    """Also write motion.npz, the same columns as arrays"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory of the body's points for viewers; the ending chooses the format; false for none"""
+    """Trajectory of points of the body for viewers; the ending sets the format; false for none"""
     topology: str = "topology.gro"
     """File that viewers need beside the trajectory (.gro or .pdb)"""
     trajectory_A_per_m: Positive | None = None
-    """Ångström in the trajectory for a metre; so that the body has a radius of 10 Å when not given. A second is a ps"""
+    """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second becomes a ps"""
     figures: Flag = True
     """Draw the motion"""
     axis: Vector | None = None
-    """Body axis whose path is drawn; towards the centre of mass, or the axis of symmetry, or axis 3 when not given"""
+    """Body axis whose path is drawn; default: towards the centre of mass, else the axis of symmetry, else axis 3"""
 
     @field_validator("trajectory")
     @classmethod
@@ -337,7 +337,7 @@ class BodyOutput(Section):
         if self.topology == self.trajectory:
             raise ValueError(f"topology and trajectory are both {self.topology}; name them apart")
         if self.axis is not None and not any(self.axis):
-            raise ValueError("axis is zero, which is no direction")
+            raise ValueError("axis is zero, which is not a direction")
         return self
 
 
@@ -376,7 +376,7 @@ class BodyScene(Scene):
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
-        """Faults between tables that may have faults of their own."""
+        """Faults between tables."""
         found = [
             (keys, f"is {x:g}, must be 0 or between 1e-100 and 1e100") for keys, x in _numbers(data) if not _fits(x)
         ]
@@ -384,19 +384,19 @@ class BodyScene(Scene):
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))
         if body.get("pinned") is True:
             found += [
-                (["start", key], "the body is pinned at a point and cannot be moved: leave it out")
+                (["start", key], "the body is pinned at a point and cannot be moved: omit it")
                 for key in ("position_m", "velocity_m_s")
                 if key in start
             ]
             found += [
-                (["fluid", key], "the body is pinned at a point: no force of translation acts on it")
+                (["fluid", key], "the body is pinned at a point: no such force acts on it")
                 for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
                 if isinstance(fluid.get(key), list | tuple) and any(fluid[key])
             ]
         ways = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
         if "changing_inertia" in data and any(key in body for key in ways):
             key = next(key for key in ways if key in body)
-            found.append((["body", key], "changing_inertia says the inertia: leave out one of them"))
+            found.append((["body", key], "changing_inertia defines the inertia: omit one of them"))
         if "fluid" in data and "frame" in data:
             found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
         return [f"{_line(keys, text)}{'.'.join(map(str, keys))}: {fault}" for keys, fault in found]
@@ -444,5 +444,5 @@ def _numbers(data: Any, keys: tuple = ()) -> Iterator[tuple[list, float]]:
 
 
 def _fits(x: float) -> bool:
-    """Whether squares and products of a number stay numbers; what is no finite number is told elsewhere."""
+    """Whether squares and products of a number stay finite. Infinities and NaN are reported elsewhere."""
     return not np.isfinite(x) or x == 0 or 1e-100 <= abs(x) <= 1e100

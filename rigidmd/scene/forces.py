@@ -1,4 +1,4 @@
-"""Of the scene of molecules: what acts between their sites."""
+"""Tables of a scene of molecules: forces between sites."""
 
 from math import inf
 from typing import Annotated, Literal
@@ -12,7 +12,7 @@ Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
-#: Keys of `Forces` that only some kinds of electrostatics know.
+#: Keys of `Forces` for some kinds of electrostatics only.
 ELECTROSTATIC_KEYS = {
     "reaction_field_permittivity": ("reaction_field",),
     "damping_per_A": ("damped_shifted_force",),
@@ -32,7 +32,7 @@ class UnlikePair(Section):
     """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
 
     sites: tuple[str, str]
-    """The two kinds: a site's name, else an element; `SPECIES.NAME` for those of one species"""
+    """The two kinds: a site name or else an element; `SPECIES.NAME` for sites of one species"""
     sigma_A: Positive
     """Lennard-Jones diameter"""
     epsilon_kJ_mol: NonNegative
@@ -40,53 +40,53 @@ class UnlikePair(Section):
 
 
 class Forces(Section):
-    """What acts between sites of different molecules."""
+    """Forces between sites of different molecules."""
 
     cutoff_A: Positive | None = None
-    """Cut-off between sites; 9 Å in a periodic box, none without one"""
+    """Cut-off between sites; default: 9 Å in a periodic box, none without one"""
     truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
-    """How forces end at the cut-off, Lennard-Jones and charges alike; smooth_switch for integrators of high order. The
-    energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. What ewald and
-    pme leave to pairs ends as ewald_truncation says"""
+    """How Lennard-Jones and Coulomb forces end at the cut-off; smooth_switch suits integrators of high order. The
+    energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. The real-space
+    part of ewald and pme ends according to ewald_truncation"""
     switch_start_A: Positive | None = None
-    """Where force_switch and switch begin: 1 Å before the cut-off, or at 0.9 of it if that is longer, when not given;
-    and smooth_switch, at 0.6 of the cut-off"""
+    """Where force_switch and switch begin; default: 1 Å before the cut-off, or at 0.9 of it if that is larger. Where
+    smooth_switch begins; default: at 0.6 of the cut-off"""
     mixing: Mixing = "lorentz-berthelot"
     """Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = ()
     """Parameters of particular pairs, in place of the mixing rule"""
     tail_correction: Flag = False
-    """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` is with it, `virial` without"""
+    """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` includes it, `virial` does not"""
     electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
-    """How charges act: ewald and pme with all periodic images, the others within the cut-off; none ignores them"""
+    """Coulomb forces: ewald and pme act on all periodic images, the others within the cut-off; none ignores charges"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Of damped_shifted_force; 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
-    """Of ewald and pme: rms error of the force on a site, over that between two charges e at 1 Å; sets what follows.
-    1e-5 when not given"""
+    """Of ewald and pme: rms error of the force on a site, relative to the force between two charges e at 1 Å; sets the
+    keys below; default: 1e-5"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
-    """Of ewald: largest |n| of k = 2 pi n/L, for all axes or each, of the cell as box or file describe it"""
+    """Of ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or file"""
     ewald_k2_max: Count | None = None
-    """Of ewald: largest n_x² + n_y² + n_z² besides"""
+    """Of ewald: also largest n_x² + n_y² + n_z²"""
     ewald_k_radius_per_A: Positive | None = None
     """Of ewald: largest length of k"""
     ewald_truncation: Literal["plain", "shift"] | None = None
-    """Of ewald and pme: whether the energy of what they leave to pairs, erfc(alpha r)/r, is shifted to 0 at the
-    cut-off; forces are the same. When not given: plain where `truncation` is plain, else shift. coulomb_self then also
-    holds -erfc(alpha R)/(2 R) times the square of each molecule's charge, R the cut-off: nothing for neutral ones"""
+    """Of ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the cut-off; forces are the
+    same. Default: plain if `truncation` is plain, else shift. With shift, coulomb_self also includes
+    -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cut-off R, which is 0 for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
-    """Of pme: order of the B-splines, 4 is cubic"""
+    """Of pme: order of the B-splines; 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """Of pme: grid points along each edge of the cell as box or file describe it; three equal ones if it leans by more
-    than half an edge, as another cell stands for it then"""
+    """Of pme: grid points along each edge of the cell of box or file; three equal numbers if it leans by more than half
+    an edge, because an equivalent cell replaces it then"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.6
-    """Extra radius of the neighbour list; speed only, never the result"""
+    """Extra radius of the neighbour list; affects only the speed"""
 
     @model_validator(mode="after")
     def _nothing_idle(self):
@@ -102,10 +102,10 @@ class Forces(Section):
             raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
         settled = self.gives_waves or (self.pme_grid is not None and self.pme_order is not None)
         if settled and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
-            raise ValueError("ewald_accuracy would do nothing: alpha and what goes with it are all given")
+            raise ValueError("ewald_accuracy would do nothing: alpha and the waves are given")
         return self
 
     @property
     def gives_waves(self) -> bool:
-        """Whether the scene says which waves an Ewald sum takes."""
+        """Whether the scene sets the waves of an Ewald sum."""
         return self.ewald_k_max is not None or self.ewald_k_radius_per_A is not None

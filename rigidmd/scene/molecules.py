@@ -22,31 +22,31 @@ Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 
 
 class Throughout(Section):
-    """What holds for all stages."""
+    """Settings for all stages."""
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
-    """Time between removals of the total momentum; false for never. When not given: 1 ps with pme, whose forces do not
-    add up to zero exactly, and never otherwise. Its energy is booked like the heat of a thermostat"""
+    """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose forces do not add up
+    to zero exactly, else never. The energy removed is booked like the heat of a thermostat"""
 
 
 class Output(Section):
-    """What is written, all into the run's own folder."""
+    """Files in the folder of the run."""
 
     log_interval_ps: Interval = 0.05
     """Time between lines of log.csv"""
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory file; the ending chooses the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
+    """Trajectory file; the ending sets the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: str = "topology.gro"
     """File with names and first positions that viewers need beside the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
-    """unwrapped: as molecules travelled, from which displacements follow; wrapped: centres of mass inside the box.
-    Molecules are whole in both"""
+    """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box. Molecules are whole in
+    both"""
     velocities: Flag | None = None
-    """Write velocities; where the format holds them when not given"""
+    """Write velocities; default: if the format holds them"""
     figure: Flag = True
     """Draw energy.png"""
 
@@ -73,14 +73,14 @@ class Output(Section):
 
 
 class MolecularScene(Scene):
-    """Molecules that move."""
+    """A scene of moving molecules."""
 
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
-    """Everything random follows from it"""
+    """Seed of all random numbers"""
     precision: Literal["double", "mixed"] = "double"
-    """Arithmetic of the forces between sites; mixed: single, summed and moved in double"""
+    """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in double"""
     threads: Count | None = None
-    """Threads; all cores when not given. Results do not depend on it"""
+    """Number of threads; default: all cores. Results do not depend on it"""
     structure: Structure | None = None
     box: Box = Box()
     molecules: tuple[Molecules, ...] = Field(min_length=1)
@@ -103,7 +103,7 @@ class MolecularScene(Scene):
 
     @property
     def in_short(self) -> str:
-        """Species, where they come from, stages."""
+        """Species, their origin and stages."""
         species = ", ".join(f"{entry.count or ''} {entry.label}".strip() for entry in self.molecules)
         origin = "" if self.structure is None else f" of {self.structure.file}"
         stages = ", ".join(f"{stage.label} {stage.duration_ps:g} ps" for stage in self.stages)
@@ -111,7 +111,7 @@ class MolecularScene(Scene):
 
     @property
     def inputs(self) -> dict[str, Path]:
-        """Every file it reads besides itself: dotted key -> path."""
+        """Every further file that it reads: dotted key -> path."""
         found = {} if self.structure is None else {"structure.file": self.path(self.structure.file)}
         for k, species in enumerate(self.molecules):
             for key in SPECIES_FILES:
@@ -131,9 +131,9 @@ class MolecularScene(Scene):
             if self.box.lengths_A is None and self.box.density_g_cm3 is None:
                 faults.append("box needs lengths_A or density_g_cm3, or there must be a structure file")
         elif self.box.density_g_cm3 is not None:
-            faults.append("box.density_g_cm3 and a structure file contradict each other: leave one out")
+            faults.append("box.density_g_cm3 and a structure file contradict each other: omit one")
         elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
-            faults.append("structure.repeat repeats the file's cell: leave out box.lengths_A and periodic = false")
+            faults.append("structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false")
         if self.start.temperature_K is None and self.stages[0].temperature_K is None:
             from_file = self.structure is not None and self.structure.velocities
             if not from_file:
@@ -141,14 +141,13 @@ class MolecularScene(Scene):
         if self.start.temperature_K is not None and self.structure is not None and self.structure.velocities:
             faults.append("start.temperature_K would do nothing: the velocities are read from the structure file")
         if self.start.temperature_K == 0 and self.stages[0].thermostat_kind in ("velocity_rescaling", "nose_hoover"):
-            faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot warm what is at rest")
+            faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest")
         faults += self._barostat_faults()
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
-            faults.append("forces.tail_correction is that of a liquid all around; with frozen molecules leave it out")
+            faults.append("forces.tail_correction assumes a uniform liquid: omit it with frozen molecules")
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
             faults.append(
-                "run.remove_momentum_interval_ps: frozen molecules hold the others, and no total momentum is kept; "
-                "leave it out"
+                "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen molecules; omit it"
             )
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
@@ -160,20 +159,20 @@ class MolecularScene(Scene):
         return self
 
     def _barostat_faults(self) -> list[str]:
-        """What cannot be with a pressure that is kept."""
+        """Faults of stages with a barostat."""
         faults = []
         for k, stage in enumerate(self.stages):
             if not stage.has_barostat:
                 continue
             where = f"stages.{k}: {stage.ensemble} changes the box,"
             if not self.box.periodic:
-                faults.append(f"{where} and box.periodic is false")
+                faults.append(f"{where} but box.periodic is false")
             if any(species.frozen for species in self.molecules):
-                faults.append(f"{where} and frozen molecules hold it: make them move, or keep the volume")
+                faults.append(f"{where} but frozen molecules do not move: release them, or keep the volume")
             if self.fields.walls:
-                faults.append(f"{where} and fields.walls stand where they are: keep the volume")
+                faults.append(f"{where} but fields.walls do not move: keep the volume")
             if self.fields.restraints:
-                faults.append(f"{where} and fields.restraints hold molecules where they are: keep the volume")
+                faults.append(f"{where} but fields.restraints fix positions: keep the volume")
         return faults
 
     def _uneven_frames(self) -> list[str]:
@@ -197,7 +196,7 @@ class MolecularScene(Scene):
 
     @classmethod
     def strange_paths(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        """Files named in a scene that are not in its folder."""
+        """Files of a scene that lie outside its folder."""
         named = []
         if isinstance(structure := data.get("structure"), dict):
             named.append(("structure.file", structure.get("file")))

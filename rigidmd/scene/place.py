@@ -1,4 +1,4 @@
-"""Of the scene of molecules: where they are at the start."""
+"""Tables of a scene of molecules: positions at the start."""
 
 from math import cos, pi, radians, sqrt
 from typing import Annotated
@@ -16,7 +16,7 @@ Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 
 
 class Structure(Section):
-    """Where the molecules are at the start, from a file."""
+    """Positions at the start from a file."""
 
     file: str
     """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, or `final.npz` of an
@@ -24,14 +24,14 @@ class Structure(Section):
     frame: Annotated[int, Strict()] | None = None
     """Which of several structures in the file: 1 is the first, -1 the last; needed where there are several"""
     repeat: tuple[Count, Count, Count] = (1, 1, 1)
-    """How many times the file's cell stands side by side along a, b, c: from a crystal's cell to a crystal"""
+    """Repetitions of the file's cell along a, b, c, to make a crystal of its unit cell"""
     velocities: Flag = False
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
     """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
     atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
-    """Of LAMMPS' data files: what each atom type is, { 1 = "O", 2 = "H" }, by a site's name or an element, X without
-    mass. When not given, labels in the file tell, and else masses"""
+    """Of LAMMPS' data files: the site name or element of each atom type, { 1 = "O", 2 = "H" }; X has no mass. Default:
+    labels in the file, else masses"""
 
     @model_validator(mode="after")
     def _has_types(self):
@@ -46,11 +46,11 @@ class Box(Section):
     lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
     """Edges; one number for a cube"""
     angles_deg: tuple[Angle, Angle, Angle] | None = None
-    """Angles between b and c, c and a, a and b; right angles when not given"""
+    """Angles between b and c, c and a, a and b; default: right angles"""
     density_g_cm3: Positive | None = None
     """Mass density, from which the edge of a cube follows"""
     periodic: Flag = True
-    """False: no box; molecules in vacuum"""
+    """False: no box, molecules in vacuum"""
 
     @model_validator(mode="after")
     def _one_size(self):
@@ -59,12 +59,12 @@ class Box(Section):
         if self.angles_deg is not None and self.lengths_A is None:
             raise ValueError("angles_deg needs lengths_A")
         if self.angles_deg is not None and not _span_a_volume(*map(radians, self.angles_deg)):
-            raise ValueError("angles_deg: three edges cannot stand at these angles")
+            raise ValueError("angles_deg: three edges cannot form these angles")
         return self
 
     @property
     def cell(self) -> np.ndarray | None:
-        """Rows (3, 3) a along x, b in the xy plane and c, Å; None where the scene does not say."""
+        """Rows (3, 3) a along x, b in the xy plane and c, Å; None if the scene does not set it."""
         if self.lengths_A is None:
             return None
         a, b, c = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
@@ -75,12 +75,12 @@ class Box(Section):
 
 
 def _span_a_volume(alpha: float, beta: float, gamma: float) -> bool:
-    """Whether edges at these angles to one another (radians) can stand, and not in one plane."""
+    """Whether three edges can form these angles (radians) without lying in one plane."""
     return 2 * max(alpha, beta, gamma) < alpha + beta + gamma < 2 * pi
 
 
 class Start(Section):
-    """The first moment."""
+    """The start."""
 
     temperature_K: NonNegative | None = None
     """Temperature of the momenta that are drawn; that of the first stage when not given"""

@@ -1,4 +1,4 @@
-"""Of the scene of molecules: which they are."""
+"""Tables of a scene of molecules: species."""
 
 import re
 from pathlib import Path
@@ -16,25 +16,25 @@ ResidueNumber = Annotated[int, Strict(), Field(ge=0)]
 
 
 class Molecules(Section):
-    """A species and how many of it."""
+    """A species and its number of molecules."""
 
     model: str | None = None
-    """A model that comes with rigidmd; `rigidmd models` lists them"""
+    """A shipped model; `rigidmd models` lists them"""
     file: str | None = None
-    """A molecule in a .toml file like those models, or a geometry in any file ASE reads, with `sites` for its atoms"""
+    """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with `sites` for its atoms"""
     name: str | None = None
-    """What to call the species; the model's or file's name when not given"""
+    """Name of the species; default: that of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
-    """The sites of a molecule of one's own; with a geometry `file`, their parameters by atom name or element"""
+    """Sites of your own molecule; with a geometry `file`, their parameters by atom name or element"""
     parameters: str | None = None
-    """A .toml file with entries like those of `sites`, which several molecules may share: what they do not say
-    themselves, by atom name or element"""
+    """A .toml file with entries like those of `sites`, which several molecules may share. It supplies missing keys by
+    atom name or element"""
     masses_u: dict[str, Positive] | None = Field(default=None, min_length=1)
-    """Other masses of sites, by name or element: other isotopes, { H = 2.014 } for heavy water"""
+    """Masses of sites by name or element, for other isotopes: { H = 2.014 } for heavy water"""
     residue_names: tuple[SiteName, ...] | None = None
-    """Residue names by which structure files may call this species"""
+    """Residue names of this species in structure files"""
     count: Count | None = None
-    """How many; needed unless there is a structure file"""
+    """Number of molecules; required without a structure file"""
     frozen: Flag | tuple[ResidueNumber, ...] | str = False
     """They stay put and act on the others; not on one another, so the potential energy lacks that constant. True for
     all, or numbers of some, [1, 2, 5] or "1-10, 15": all residues of such a number in the structure file; where its
@@ -73,19 +73,19 @@ class Molecules(Section):
         if self.file is not None and not whole and self.sites is None and self.parameters is None:
             raise ValueError("a geometry file needs sites, or a file of parameters, for its atoms")
         if self.sites is not None and self.file is None and self.name is None:
-            raise ValueError("a molecule of one's own needs a name")
+            raise ValueError("your own molecule needs a name")
         return self
 
     @property
     def label(self) -> str:
-        """Its name, or that of its model or file."""
+        """Its name, else that of its model or file."""
         return self.name or self.model or Path(self.file or "").stem
 
 
 def checked_numbers(numbers: tuple[int, ...] | str) -> tuple[int, ...] | str:
     """Numbers of molecules, [1, 2, 5] or "1-10, 15", as they are. Raises ValueError."""
     if numbers == ():
-        raise ValueError("is empty: list the numbers of molecules, or leave it out")
+        raise ValueError("is empty: list the numbers of molecules, or omit it")
     if isinstance(numbers, str):
         if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", numbers):
             raise ValueError(f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")

@@ -1,4 +1,4 @@
-"""Of the scene of molecules: a stretch of time under one ensemble and one step."""
+"""Tables of a scene of molecules: stages, each with one ensemble and one time step."""
 
 from typing import Annotated, Any, Literal
 
@@ -41,46 +41,46 @@ USED = {
     "compressibility_per_bar": {"npt", "nph"},
 }
 
-#: Names that users of other programs ask for, and what to say.
+#: Names from other programs -> advice.
 REFUSED = {
     "berendsen": "'berendsen' samples no ensemble: its fluctuations are too small and heat flows into the slowest "
     "motions",
-    "parrinello_rahman": "Parrinello-Rahman is not here; cell_rescaling samples the same ensemble without its swings",
-    "mttk": "MTTK is not here; cell_rescaling samples the same ensemble without its swings",
+    "parrinello_rahman": "Parrinello-Rahman is not available; cell_rescaling samples the same ensemble",
+    "mttk": "MTTK is not available; cell_rescaling samples the same ensemble",
     "c_rescale": "C-rescale is called cell_rescaling here",
     "v_rescale": "V-rescale is called velocity_rescaling here",
 }
 
 
 class Stage(Section):
-    """A stretch of time under one ensemble and one step."""
+    """A part of a run with one ensemble and one time step."""
 
     name: str | None = None
-    """What to call it; the ensemble's name when not given"""
+    """Name of the stage; default: that of the ensemble"""
     ensemble: Ensemble = "nve"
-    """nve keeps energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and
+    """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and
     pressure"""
     duration_ps: Positive
     """How long"""
     timestep_fs: Positive = 2.0
     """Time step"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
-    """Temperature of the thermostat; two for one that changes evenly over the stage, [300, 240]"""
+    """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
     thermostat: Thermostat | None = None
     """velocity_rescaling: the stochastic one of Bussi et al.; langevin: friction and noise; nose_hoover: one chain for
-    translation and one for rotation; andersen: collisions. When not given: langevin with baoab, else
+    translation and one for rotation; andersen: collisions. Default: langevin with baoab, else
     velocity_rescaling"""
     thermostat_time_ps: Positive | None = None
-    """Time constant: of velocity_rescaling (0.1 ps when not given), period of nose_hoover (0.5 ps), mean time between
-    two collisions of a molecule with andersen (1 ps)"""
+    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or mean time between two
+    collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
-    """Of langevin, on translation; 1 when not given"""
+    """Of langevin, on translation; default: 1"""
     friction_rotation_per_ps: Positive | None = None
-    """Of langevin, on rotation; that on translation when not given"""
+    """Of langevin, on rotation; default: that on translation"""
     nose_hoover_links: Links = 3
     """Links of each Nose-Hoover chain"""
     pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
-    """Pressure of the barostat; two for one that changes evenly over the stage, [1, 1000]; three for that along each
+    """Pressure of the barostat; two for a linear change over the stage, [1, 1000]; three for one along each
     axis; six for the tensor xx, yy, zz, xy, xz, yz"""
     pressure_coupling: Coupling = "isotropic"
     """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z apart; anisotropic: three
@@ -89,25 +89,25 @@ class Stage(Section):
     """Of npt. cell_rescaling: stochastic cell rescaling, made exact by a Metropolis test, when not given; monte_carlo:
     random changes of the volume. nph has a piston without friction"""
     barostat_time_ps: Positive | None = None
-    """Time constant of cell_rescaling, period of the piston of nph; 1 ps when not given"""
+    """Time constant of cell_rescaling, period of the piston of nph; default: 1 ps"""
     barostat_interval_ps: Positive | None = None
-    """Of npt, time between two moves of the box; 0.05 of barostat_time_ps when not given"""
+    """Of npt, time between two moves of the box; default: 0.05 of barostat_time_ps"""
     compressibility_per_bar: Positive | None = None
-    """How the volume answers the pressure; sets speed, not what is sampled. That of water, 4.5e-5, when not given"""
+    """Compressibility; it sets the speed of the box, not the ensemble. Default: that of water, 4.5e-5"""
     integrator: Literal[(*SCHEMES, *WITH_BATH, AUTO)] = "velocity_verlet"  # type: ignore[valid-type]
-    """Scheme of kicks and drifts; baoab: with the thermostat in the middle of the drift, the one of langevin when not
-    given; auto: the one, and its step, that keep the error asked for with the fewest forces"""
+    """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
+    scheme and step that keep the requested error with the fewest force evaluations"""
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy, in kT per degree of freedom"""
     trajectory_error: Positive | None = None
-    """With auto: largest error of Q (of X in Å, of points) at the end of the pilot run, ten radians of libration"""
+    """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten radians of libration"""
     rotor: Rotor | None = None
-    """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
+    """Free rotation by the split or the exact flow; default: the one that the integrator needs"""
 
     @model_validator(mode="before")
     @classmethod
     def _goes_together(cls, data: Any):
-        """Langevin and BAOAB each bring the other."""
+        """Set langevin for baoab and baoab for langevin."""
         if isinstance(data, dict) and data.get("ensemble") in ("nvt", "npt"):
             if data.get("thermostat") == "langevin" and "integrator" not in data:
                 return data | {"integrator": "baoab"}
@@ -133,7 +133,7 @@ class Stage(Section):
         if idle := [key for key, where in USED.items() if self._is_given(key) and not where & self._parts]:
             faults.append(f"{', '.join(idle)} would do nothing {self._where(idle)}")
         if self.integrator in WITH_BATH and not self.has_thermostat:
-            faults.append(f"{self.integrator} has its place for a thermostat, and {self.ensemble} has none")
+            faults.append(f"{self.integrator} contains a thermostat, but {self.ensemble} has none")
         if self.has_barostat:
             faults += self._pressure_faults()
         if fault := rotor_fault(self.integrator, self.rotor):
@@ -160,7 +160,7 @@ class Stage(Section):
         return {self.ensemble, self.thermostat_kind, self.barostat_kind}
 
     def _where(self, idle: list[str]) -> str:
-        """Where keys would do nothing."""
+        """With which settings keys would do nothing, in words."""
         known = [USED[key] for key in idle]
         of_ensemble = any(where <= {"nvt", "npt", "nph"} for where in known) or not self.has_thermostat
         if of_ensemble:
@@ -172,19 +172,19 @@ class Stage(Section):
         faults, given, coupling = [], self.pressure_bar, self.pressure_coupling
         several = len(given) if isinstance(given, tuple) else 1
         if self.integrator == AUTO:
-            faults.append("integrator = 'auto' chooses for a constant volume: name one for a stage with a pressure")
+            faults.append("integrator = 'auto' is for constant volume: name an integrator for a stage with a pressure")
         apart = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
         if apart or (coupling == "isotropic" and several == 3):
             faults.append(f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}")
         if several == 6 and coupling != "flexible":
             faults.append(f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}")
         if self.ensemble == "nph" and (coupling != "isotropic" or several > 2):
-            faults.append("nph has an isotropic pressure only")
+            faults.append("nph allows only an isotropic pressure")
         if self.ensemble == "nph" and self.integrator in SCHEMES and SCHEMES[self.integrator].exact_rotor:
             plain = [name for name, scheme in SCHEMES.items() if not scheme.exact_rotor]
             faults.append(f"nph needs an integrator made of Verlet steps: {', '.join(plain)}")
         if self.barostat == "monte_carlo" and (coupling != "isotropic" or several > 2):
-            faults.append("barostat = 'monte_carlo' has an isotropic pressure only; cell_rescaling has others")
+            faults.append("barostat = 'monte_carlo' allows only an isotropic pressure; cell_rescaling allows others")
         return faults
 
     @property
@@ -194,11 +194,11 @@ class Stage(Section):
 
     @property
     def is_open(self) -> bool:
-        """Whether integrator and step are still to be chosen."""
+        """Whether integrator and step are still open."""
         return self.integrator == AUTO
 
     def decided(self, integrator: str, timestep_fs: float) -> "Stage":
-        """This stage with what a pilot has chosen."""
+        """This stage with the choice of pilot runs."""
         none = {"energy_error_kT": None, "trajectory_error": None}
         return self.model_copy(update={"integrator": integrator, "timestep_fs": timestep_fs} | none)
 

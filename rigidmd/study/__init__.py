@@ -1,1 +1,1 @@
-"""What runs many runs: precision, stability."""
+"""Studies that consist of many runs: precision, stability."""

@@ -1,4 +1,4 @@
-"""What `rigidmd precision` measures on the start of a scene: sensible integrators at sensible steps."""
+"""`rigidmd precision`: suitable integrators at suitable time steps on the start of a scene."""
 
 from collections.abc import Callable
 
@@ -11,16 +11,16 @@ from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.validation import meant
 
-#: Tried when no others are asked for: the common one, the best of each kind, and of a body what textbooks do.
+#: Default integrators: the common one, the best of each kind, and for a body the textbook solvers.
 USUAL = (
     "velocity_verlet", "two_stage", "suzuki_4", "pefrl", "chin_4a", "srkn_4", "kahan_li_6", "srkn_6", "kahan_li_8",
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
 )  # fmt: skip
-#: Time steps per force evaluation, in those of the scene.
+#: Time steps per force evaluation, relative to the scene's.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
-#: What a spinning body turns in a force evaluation on the middle of the ladder.
+#: Rotation of a spinning body per force evaluation in the middle of the ladder.
 RADIANS = 0.1
-#: The same of what does not turn, in steps of its scene, which are taken to be fine.
+#: The same for a body that does not turn, in steps of its scene, which are assumed to be suitable.
 AT_REST = 8.0
 AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
 
@@ -36,12 +36,11 @@ def precision(
 ) -> Precision:
     """Error against run time of integrators at time steps, on the start of a scene.
 
-    integrators : names; when not given, the scene's own and those that make sense for it, with what was left out in
-    `left_out`. rk4, dop853 and radau are in the scene's formulation, matrix when it has none; with _matrix, _quaternion
-    or _euler_angles after the name in that one. timesteps : fs for molecules, s for a body,
-    the same for all; when not given, steps that cost the same number of forces, around the scene's own. span : ps or s.
-    averages : ps of which molecules' temperatures, energy and pressure are averaged besides. Molecules start where the
-    last stage starts, the earlier stages run before; no thermostat acts.
+    integrators : names; default: the scene's own and those that suit it, the others are in `left_out`. rk4, dop853 and
+    radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion or _euler_angles sets another.
+    timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost around the scene's own.
+    span : ps or s. averages : ps over which molecules' temperatures, energy and pressure are also averaged. Molecules
+    start where the last stage starts, after the earlier stages have run; no thermostat acts.
     """
     known = (*SCHEMES, *COMPARATORS)
     integrators = list(dict.fromkeys(_named(name, scene) for name in integrators or []))
@@ -74,7 +73,7 @@ def precision(
 
 
 def _named(name: str, scene: MolecularScene | BodyScene) -> str:
-    """The method that a name stands for on a scene."""
+    """The method of a name on a scene."""
     solver, _, form = name.partition("_")
     if solver in SOLVERS and isinstance(scene, BodyScene):
         form = form or scene.run.formulation
@@ -83,12 +82,12 @@ def _named(name: str, scene: MolecularScene | BodyScene) -> str:
 
 
 def _own(scene: MolecularScene | BodyScene) -> str:
-    """The method that a scene itself asks for."""
+    """The scene's own method."""
     return _named(scene.run.integrator if isinstance(scene, BodyScene) else scene.stages[-1].integrator, scene)
 
 
 def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, float]:
-    """The subject, and the time step of the scene for one force evaluation (fs)."""
+    """The subject, and the scene's time step per force evaluation (fs)."""
     last = scene.stages[-1]
     simulation = MolecularSimulation(scene)
     if len(scene.stages) > 1:

@@ -1,4 +1,4 @@
-"""The battery: all cases, in the order in which they are run."""
+"""The battery: all cases in their order."""
 
 import time as clock
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def chosen(names: list[str] | None) -> list[Case]:
 
 
 def battery(names: list[str] | None = None, quick: bool = False, say: Callable[[str], None] = lambda name: None):
-    """Findings of the cases of these names (all of them when not given), one after the other; say(name) before each."""
+    """Findings of the named cases (default: all) in order; say(name) announces each."""
     for one in chosen(names):
         say(one.name)
         finding = Finding(one.name, one.group, one.sentence, *one.titles)

@@ -1,4 +1,4 @@
-"""Free bodies of every shape, at every speed: what only turns, and how exactly."""
+"""Free bodies of every shape at every speed: accuracy of pure rotation."""
 
 from math import log
 
@@ -20,15 +20,15 @@ from rigidmd.study.stability.runs import (
 )
 
 OMEGA = (0.7, 1.0, -0.4)
-#: The span of a free body, s, at about a radian a second, and its step.
+#: Span and step of a free body, s; it turns by about a radian a second.
 SPAN, STEP = 20.0, 0.05
-#: Stated errors of Q after that span. The split rotor is of order 2 in its step, kahan_li_6 on it of order 6.
+#: Allowed errors of Q after that span. The split rotor is of order 2 in its step, kahan_li_6 with it of order 6.
 ALLOWED = {SPLIT: 5e-4, "kahan_li_6": 1e-7}
 EXACTLY = 1e-10
 
 
 def free(inertia, omega=OMEGA) -> dict:
-    """A body pinned at its centre of mass: nothing but turning."""
+    """A body pinned at its centre of mass, which can only turn."""
     return {
         "body": {"mass_kg": 1.0, "inertia_kg_m2": [float(i) for i in inertia], "pinned": True},
         "start": {"angular_velocity_body_rad_s": [float(w) for w in omega]},
@@ -42,10 +42,10 @@ def exponents(first: int, last: int, quick: bool) -> list[int]:
 
 
 def sweep(find: Finding, quick: bool, settings: list[tuple[str, float, tuple, tuple]]) -> None:
-    """Each (words, x, moments, omega) turned by each family for a span, held against DOP853."""
+    """Each (words, x, moments, omega) turned by each family for a span, compared with DOP853."""
     for words, x, inertia, omega in settings:
         truth = solved(inertia, omega, SPAN)
-        # L is kept to its own rounding, so omega about an axis with little inertia only to that over the inertia
+        # L is exact to rounding, so omega about an axis with little inertia only to that divided by the inertia
         rounding = 4 * np.finfo(float).eps * np.sqrt(SPAN / STEP) * max(inertia) / min(inertia)
         for family in families(quick):
             outcome = run_body(free(inertia, omega), STEP, SPAN, family, away_from(truth))
@@ -79,7 +79,7 @@ def near_linear(find: Finding, quick: bool) -> None:
 
 @case(2, x="relative difference of two moments", error="error of Q after 20 s")
 def near_symmetric(find: Finding, quick: bool) -> None:
-    """Two moments that differ by 1e-1 to 1e-16 of themselves, all three in nearly a sphere."""
+    """Two moments that differ by 1e-1 to 1e-16, relatively; all three in nearly a sphere."""
     gaps = [10.0**k for k in exponents(1, 16, quick)]
     sweep(find, quick, [(f"oblate, {g:.0e}", g, (1.0, 1.0 + g, 1.5), OMEGA) for g in gaps])
     sweep(find, quick, [(f"sphere, {g:.0e}", g, (1.0, 1.0 + g, 1.0 + 0.3 * g), OMEGA) for g in gaps])
@@ -88,7 +88,7 @@ def near_symmetric(find: Finding, quick: bool) -> None:
 
 @case(2, x="factor on the inertia", error="largest |Q - Q of the body itself|")
 def inertia_scale(find: Finding, quick: bool) -> None:
-    """One and the same body with its inertia scaled by 1e-15 to 1e15: the same motion to rounding."""
+    """The same body with its inertia scaled by 1e-15 to 1e15: the same motion to rounding."""
     inertia = np.array([1.0, 1.7, 2.4])
     truth = solved(inertia, OMEGA, SPAN)
     for scale in (1e-15, 1e15) if quick else (1e-90, 1e-45, 1e-15, 1e15, 1e45, 1e90):
@@ -99,7 +99,7 @@ def inertia_scale(find: Finding, quick: bool) -> None:
 
 @case(3, x="angle of omega off the axis (rad)", error="error of Q after 20 s")
 def along_axes(find: Finding, quick: bool) -> None:
-    """L along each principal axis exactly, and off it by 1e-16 to 1e-2; no L at all."""
+    """L exactly along each principal axis, and off it by 1e-16 to 1e-2; L = 0."""
     inertia = (1.0, 2.0, 2.6)
     for k in range(3):
         aside = np.roll([0.0, 0.6, 0.8], k)
@@ -117,9 +117,9 @@ def along_axes(find: Finding, quick: bool) -> None:
 
 @case(3, x="omega off the middle axis, relative", error="error of the time of the first flip, relative")
 def intermediate_axis(find: Finding, quick: bool) -> None:
-    """Spin about the middle axis, off by 1e-3 to 1e-12: the first flip comes when theory says, and many follow.
+    """Spin about the middle axis, off by 1e-3 to 1e-12: the time of the first flip agrees with theory; many follow.
 
-    Only the first is compared: later ones come sooner, because rounding of omega leaves the body 1e-8 off the axis.
+    Only the first is compared: later flips are earlier, because rounding of omega leaves the body 1e-8 off the axis.
     """
     i1, i2, i3 = 1.0, 2.0, 3.0
     rate = ((i2 - i1) * (i3 - i2) / (i1 * i3)) ** 0.5
@@ -161,14 +161,14 @@ def fast_spin(find: Finding, quick: bool) -> None:
         truth = solved(inertia, omega, span)
         for family in (f for f in families(quick) if f != "kahan_li_6"):
             error = invariants if family == SPLIT else away_from(truth)
-            # DOP853 itself is good to about 1e-13 for each radian
+            # the error of DOP853 itself is about 1e-13 per radian
             outcome = run_body(data, angle, span, family, error)
             find.add(f"{angle:g} rad a step", outcome, 1e-12 * max(span, 100.0), family, angle, angle)
 
 
 @case(12, x="steps", error="error of |L|, relative")
 def long_run(find: Finding, quick: bool) -> None:
-    """One body for 1e8 steps: how the errors of |L|, of QᵀQ and of the energy grow.
+    """One body for 1e8 steps: growth of the errors of |L|, of QᵀQ and of the energy.
 
     A random walk grows as steps^0.5, a drift as steps^1; the exponent is that of a line through the logarithms of the
     root mean square over windows.
@@ -190,7 +190,7 @@ def long_run(find: Finding, quick: bool) -> None:
 
 
 def growth(errors: np.ndarray) -> str:
-    """How errors (t,) at even times grow, in words: size at the end and exponent of their growth."""
+    """Growth of errors (t,) at regular times, in words: final size and exponent."""
     errors = np.abs(errors[1:])
     edges = np.unique(np.geomspace(8, len(errors), 9).astype(int))
     rms = np.array([np.sqrt(np.mean(errors[:edge] ** 2)) for edge in edges])

@@ -1,4 +1,4 @@
-"""Boxes as small as allowed, places as far as can be, densities from vacuum to three times a liquid's."""
+"""The smallest boxes, the most distant positions, and densities from vacuum to three times that of a liquid."""
 
 import resource
 from pathlib import Path
@@ -57,8 +57,8 @@ def tight_boxes(find: Finding, quick: bool) -> None:
 
 @case(10, x="shift (Å)", error="energy and force against the unshifted, relative")
 def far_away(find: Finding, quick: bool) -> None:
-    """Molecules on a face, and whole boxes away by 1e3 to 1e300 Å: the same forces to the digits left, or refused."""
-    edge = 16.0  # a power of two: whole boxes away is exact as long as the digits last
+    """Molecules on a face, and shifted by whole boxes of 1e3 to 1e300 Å: the same forces to rounding, or refused."""
+    edge = 16.0  # a power of two, so that shifts by whole boxes are exact while digits last
     data = molecules_scene(
         [{"model": "spce", "count": 40}], {"lengths_A": edge}, 0.5, 10, SPLIT, 298.0, None, WATER_FORCES
     )
@@ -81,7 +81,7 @@ def far_away(find: Finding, quick: bool) -> None:
     for shift in (1e3, 1e7, 1e12, 1e300) if quick else [10.0**k for k in (3, 5, 7, 9, 11, 13, 15, 18, 20, 100, 300)]:
         boxes = np.round(shift / edge) * edge
         away = np.where(np.arange(len(state.position))[:, None] % 2, boxes, 0.0)
-        # positions are known there to eps times the distance, forces are some ten times as steep as an inverse Å
+        # positions have an error of eps times the distance; forces vary relatively by about ten per Å
         left = 1e3 * np.finfo(float).eps * shift
         expected = (RIGHT,) if left < 1e-3 else RIGHT_OR_REFUSED
         find.add(
@@ -110,11 +110,11 @@ def densities(find: Finding, quick: bool) -> None:
 
 
 def a_million_points() -> Outcome:
-    """The memory that `rigidmd check` foretells for a million argon atoms against what a step takes; relative error."""
+    """The memory that `rigidmd check` predicts for a million argon atoms against that of a step; relative error."""
     data = molecules_scene([{"model": "argon", "count": 1_000_000}], {"density_g_cm3": 1.4}, 1.0, 1, SPLIT, 90.0)
     data["stages"][0].pop("rotor")
     small = data | {"molecules": [{"model": "argon", "count": 1000}]}
-    run_molecules(small)  # compiled, so that the compiler's memory is not counted
+    run_molecules(small)  # compile first, so that the compiler's memory is not counted
     foretold = float(describe(Scene.from_dict(data)).rsplit("memory: about ", 1)[1].split(" MB")[0])
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     outcome = run_molecules(data)

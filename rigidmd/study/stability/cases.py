@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from rigidmd.measure.stability import Finding
 
-#: What a case does to its finding; quick: fewer settings and integrators.
+#: A case adds trials to its finding; quick : fewer settings and integrators.
 Attempt = Callable[[Finding, bool], None]
 
 
@@ -16,14 +16,14 @@ class Case(NamedTuple):
     group: int
     sentence: str
     attempt: Attempt
-    titles: tuple[str, str, str]  # of x, of the error, unit of steps
+    titles: tuple[str, str, str]  # of x and of the error; unit of steps
 
 
 CASES: dict[str, Case] = {}
 
 
 def case(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[Attempt], Attempt]:
-    """Put a function among the cases, under its own name and with the first line of its docstring."""
+    """Register a function as a case under its own name, with the first line of its docstring."""
 
     def enter(attempt: Attempt) -> Attempt:
         sentence = (attempt.__doc__ or "").strip().splitlines()[0].rstrip(".")

@@ -1,4 +1,4 @@
-"""Molecules that meet too hard, too close, or with nothing to keep them apart."""
+"""Molecules that collide too fast, are too close, or lack repulsion."""
 
 import tempfile
 from math import sqrt
@@ -30,7 +30,7 @@ SIGMA, EPSILON = 3.2, 80.0
 
 
 def bent(off_line: float = 0.5, name: str = "bent", mass: float = 12.0) -> dict:
-    """Three equal sites 1 Å apart, the middle one so far (Å) off the line of the others."""
+    """Three equal sites 1 Å apart, the middle one at this height (Å) off the line of the others."""
     site = {"mass_u": mass, "sigma_A": SIGMA, "epsilon_K": EPSILON}
     return {
         "name": name,
@@ -62,7 +62,7 @@ def head_on(find: Finding, quick: bool) -> None:
     for temperature in (1e2, 1e6) if quick else (1e2, 1e3, 1e4, 1e5, 1e6):
         speed = 2 * sqrt(3 * BOLTZMANN * temperature / 36.0)
         species, state = pair_of(6.0, speed)
-        way = 8.0 / speed * 1000  # fs to meet and part
+        way = 8.0 / speed * 1000  # fs, to collide and separate
 
         def at(step: float, family: str, species=species, state=state, way=way) -> Outcome:
             data = molecules_scene(species, BOX, step, max(1, round(way / step)), family, 0.0, None, FORCES)
@@ -78,7 +78,7 @@ def head_on(find: Finding, quick: bool) -> None:
 
 @case(7, x="distance over sigma", error="energy error over the energy of the start", step="fs")
 def overlaps(find: Finding, quick: bool) -> None:
-    """Two molecules released at 0.5 sigma, 0.1 sigma and 0: refused or relieved, or carried through, never made up."""
+    """Two molecules released at 0.5 sigma, 0.1 sigma and 0: refused, relieved or computed correctly."""
     for ratio in (0.5, 0.1, 0.0):
         data = molecules_scene([bent() | {"count": 2}], BOX, 0.01, 400, SPLIT, 10.0, None, FORCES)
         species, state = pair_of(ratio * SIGMA, 0.0)
@@ -101,7 +101,7 @@ def overlaps(find: Finding, quick: bool) -> None:
 
         def at(step: float, family=family) -> Outcome:
             scene = molecules_scene(species, BOX, step, max(1, round(50 / step)), family, 0.0, None, FORCES)
-            unwatched = scene | {"watch": {"kick": False}}  # the first kick is what is tried here
+            unwatched = scene | {"watch": {"kick": False}}  # this case tests the first kick
 
             def run() -> Outcome:
                 results = simulate(unwatched, state)
@@ -115,7 +115,7 @@ def overlaps(find: Finding, quick: bool) -> None:
 
 
 def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
-    """A scene started from a file with the molecules of a state, as a user would."""
+    """A scene that starts from a file with the molecules of a state."""
 
     def run() -> Outcome:
         with tempfile.TemporaryDirectory() as folder:
@@ -133,7 +133,7 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
 
 @case(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
 def bare_charges(find: Finding, quick: bool) -> None:
-    """A charge without repulsion beside one of the other sign: they fall onto each other, and that is told."""
+    """A charge without repulsion beside an opposite one: they collapse, and the run reports it."""
     ion = {"mass_u": 10.0, "sigma_A": SIGMA, "epsilon_K": EPSILON}
     bare = {
         "name": "bare",
@@ -157,12 +157,12 @@ def bare_charges(find: Finding, quick: bool) -> None:
 
 @case(1, x="height of the middle site (Å)", error="energy error over kinetic energy", step="fs")
 def near_linear_molecules(find: Finding, quick: bool) -> None:
-    """Molecules bent ever less, 0.5 Å to 1e-15 and exactly straight, at 300 K: right, or refused as hardly bent."""
+    """Molecules bent by 0.5 Å to 1e-15 Å and exactly straight, at 300 K: right, or refused as hardly bent."""
     heights = [0.5, 1e-2, 1e-5, 0.0] if quick else [0.5] + [10.0**-k for k in range(1, 16)] + [0.0]
     for height in heights:
         for family in families(quick):
             step, steps = 1.0, 200
-            # the spin about the axis is faster as the moment is smaller, and turns the middle site, that far off it
+            # the smaller the moment about the axis, the faster the spin that turns the middle site
             data = molecules_scene([bent(height) | {"count": 27}], BOX, step, steps, family, 300.0, None, FORCES)
             find.add(f"{height:.0e} Å", run_molecules(data), 0.02, family, max(height, 1e-16), step, (RIGHT, REFUSED))
 

@@ -1,4 +1,4 @@
-"""Friction, fluids and the thermostat from hardly any to so much that a step is a million times their own time."""
+"""Friction, fluids and the thermostat, from very weak to a step of a million of their time constants."""
 
 from math import expm1, sqrt
 
@@ -29,7 +29,7 @@ def strengths(quick: bool) -> list[float]:
 
 
 def decay(column: str, known: np.ndarray):
-    """Error of a column against a decay, relative to its start; infinite where it overshoots: turns round or grows."""
+    """Error of a column against a decay, relative to its start; infinite if it changes sign or grows."""
 
     def error(results) -> float:
         found = results[column]
@@ -52,7 +52,7 @@ def friction(find: Finding, quick: bool) -> None:
         dry = spinning | {"friction": {"dry_N_m": [0.0, 0.0, c]}}
         for family in QUICK[:2] if quick else QUICK:
             if family == "srkn_4":
-                continue  # with resistance its order would be 2; scenes refuse it
+                continue  # its order would be 2 with resistance, so scenes refuse it
             for words, data, known in (
                 ("viscous", viscous, np.exp(-c * at)),
                 ("dry", dry, np.maximum(0.0, 1.0 - c * at)),
@@ -87,12 +87,12 @@ def fluid(find: Finding, quick: bool) -> None:
         def fall(results, speed=speed) -> float:
             return abs(results["vz"][-1] / speed - 1)
 
-        # a kick, a drift, a kick: with a constant force and no dependence on position, exact
+        # kick, drift, kick are exact for a constant force
         find.add(f"falling, {c:.0e}", run_point(falling, fall), 1e-13, family, c, 1.0)
 
 
 def run_point(data: dict, error) -> Outcome:
-    """`run_body` of a point, which has no rotor to choose."""
+    """`run_body` for a point, which has no rotor."""
     from rigidmd.study.stability import runs
 
     def run() -> Outcome:
@@ -107,7 +107,7 @@ def run_point(data: dict, error) -> Outcome:
 
 @case(6, x="dt / time constant", error="kinetic energy, standard errors from the canonical mean")
 def thermostat(find: Finding, quick: bool) -> None:
-    """The thermostat with dt / tau from 1e-12 to 1e6: no more heat than its share, the canonical mean when strong."""
+    """The thermostat with dt / tau from 1e-12 to 1e6: little heat when weak, the canonical mean when strong."""
     state = liquid("spce", 298.0, 1.0, 500)
     freedom = 6 * WATERS - 3
     for ratio in (1e-12, 1e6) if quick else [10.0**k for k in range(-12, 7, 3)]:
@@ -137,7 +137,7 @@ def thermostat(find: Finding, quick: bool) -> None:
 
 
 def outcome_of(data: dict, state, error) -> Outcome:
-    """Of a run with a thermostat, whose heat is taken from what is conserved."""
+    """Error of the conserved energy of a run with a thermostat."""
     results = simulate(data, state)
     told = np.abs(results["drift"]).max() / results["kinetic"][0]
     return Outcome(float(error(results)), float(told))

@@ -1,4 +1,4 @@
-"""Scenes made in code, run as a user runs them, and what came of them."""
+"""Scenes made in code, their runs and outcomes."""
 
 import time as clock
 from collections.abc import Callable
@@ -16,7 +16,8 @@ from rigidmd.run import Simulation
 from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene, Scene
 
-#: Integrator families: the common one on both rotors, a symplectic Nystrom scheme, a composition on the split rotor.
+#: Integrator families: the common one with both rotors, a symplectic Nystrom scheme, a composition with the split
+#: rotor.
 FAMILIES = {
     "velocity_verlet": {"integrator": "velocity_verlet", "rotor": "split"},
     "velocity_verlet, exact rotor": {"integrator": "velocity_verlet", "rotor": "exact"},
@@ -34,19 +35,19 @@ TEXTBOOK = {
 
 
 def families(quick: bool) -> tuple[str, ...]:
-    """Those that every case is tried with."""
+    """The families for every case."""
     return QUICK if quick else tuple(FAMILIES)
 
 
 def attempt(run: Callable[[], Outcome]) -> Outcome:
-    """The outcome of a run; an error of ours becomes its message, any other a crash."""
+    """The outcome of a run. An error of rigidmd becomes its message, any other a crash."""
     began = clock.perf_counter()
     try:
         with np.errstate(all="ignore"):
             outcome = run()
     except RigidMDError as error:
         outcome = Outcome(message=str(error))
-    except Exception as error:  # what must not happen is what is looked for
+    except Exception as error:  # any other error is a failure of the engine
         outcome = Outcome(crash=f"{type(error).__name__}: {error}")
     return outcome._replace(seconds=clock.perf_counter() - began)
 
@@ -62,7 +63,7 @@ def body_scene(data: dict, step: float, duration: float, family: str, samples: i
 def run_body(
     data: dict, step: float, duration: float, family: str, error: Callable[[Results], float], samples: int = 50
 ) -> Outcome:
-    """A body moved for a duration (s), with error(results) against what is known."""
+    """A run of a body for a duration (s), with error(results) against the known answer."""
 
     def run() -> Outcome:
         results = Simulation(Scene.from_dict(body_scene(data, step, duration, family, samples))).run()
@@ -75,7 +76,7 @@ def run_body(
 
 
 def last_rotation(results: Results) -> np.ndarray:
-    """Q (3, 3) at the end, of the body's own axes."""
+    """Q (3, 3) of the body's own axes at the end."""
     return np.array([[results[f"q{i}{j}"][-1] for j in (1, 2, 3)] for i in (1, 2, 3)])
 
 
@@ -91,14 +92,14 @@ def invariants(results: Results) -> float:
 
 
 def everything_kept(results: Results) -> float:
-    """Largest relative error of all that is conserved, and of Q's orthogonality."""
+    """Largest relative error of all conserved quantities and of Q's orthogonality."""
     return max(invariants(results), results.summary["largest_relative_error"].get("energy", 0.0))
 
 
 def solved(inertia, omega, span: float) -> np.ndarray:
-    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion: it shares nothing with the flows.
+    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion, independent of the flows.
 
-    Good to about 1e-13 a radian.
+    Its error is about 1e-13 per radian.
     """
     i1, i2, i3 = (float(i) for i in inertia)
     k1, k2, k3 = (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3
@@ -129,7 +130,7 @@ def molecules_scene(
     forces: dict | None = None,
     looks: int = 25,
 ) -> dict:
-    """The tables of a scene of molecules: one stage of so many steps (fs), seen `looks` times, no files."""
+    """The tables of a scene of molecules: one stage of `steps` steps (fs), sampled `looks` times, no files."""
     stage = {"duration_ps": step * steps / 1000, "timestep_fs": float(step)} | FAMILIES[family]
     if thermostat is not None:
         stage |= {"ensemble": "nvt"} | thermostat
@@ -152,7 +153,7 @@ def molecular(data: dict) -> MolecularScene:
 
 
 def simulate(data: dict, state: State | None = None) -> Results:
-    """Run a scene of molecules, from a state of its own where one is given."""
+    """Run a scene of molecules, from a given state if there is one."""
     simulation = Simulation(molecular(data))
     if state is not None:
         simulation.start_from(state)
@@ -160,7 +161,7 @@ def simulate(data: dict, state: State | None = None) -> Results:
 
 
 def energy_error(results: Results, scale: float = 0.0) -> float:
-    """Largest change of what is conserved, relative to the kinetic energy of the start (or a scale, kJ/mol)."""
+    """Largest change of the conserved energy, relative to the initial kinetic energy (or a scale, kJ/mol)."""
     wrong = np.abs(results["drift"])
     size = scale or results["kinetic"][0]
     return float(wrong.max() / size) if np.isfinite(wrong).all() and size > 0 else inf
@@ -172,7 +173,7 @@ def run_molecules(
     error: Callable[[Results], float] | None = None,
     scale: float = 0.0,
 ) -> Outcome:
-    """A run of molecules; its error is that of the energy unless `error` says what else."""
+    """A run of molecules; its error is that of the energy unless `error` computes another."""
 
     def run() -> Outcome:
         results = simulate(data, state)
@@ -183,7 +184,7 @@ def run_molecules(
 
 
 def only_built(data: dict) -> Outcome:
-    """A scene that should be refused before it runs; it counts as run, with no answer, if it is not."""
+    """A scene that must be refused before it runs; otherwise it counts as run without a right answer."""
 
     def run() -> Outcome:
         Simulation(Scene.from_dict(data)).run()
@@ -198,7 +199,7 @@ WATERS = 64
 
 @cache
 def liquid(model: str, temperature: float, step: float, steps: int) -> State:
-    """Water that has been at a temperature (K) for so many steps (fs), from the lattice."""
+    """A state of water after these steps (fs) at a temperature (K), from a lattice."""
     heat = {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
     data = molecules_scene(water(model), WATER_BOX, step, steps, SPLIT, temperature, heat, WATER_FORCES)
     with np.errstate(all="ignore"):
@@ -206,7 +207,7 @@ def liquid(model: str, temperature: float, step: float, steps: int) -> State:
 
 
 def water(model: str) -> list[dict]:
-    """A box of it; TIP4P of 1983 is no model of the package, its sites are given."""
+    """A box of TIP4P of 1983, whose sites are given because it is not a shipped model."""
     return [
         {"name": "tip4p", "sites": TIP4P, "count": WATERS} if model == "tip4p" else {"model": model, "count": WATERS}
     ]

@@ -1,4 +1,4 @@
-"""Tops at the places where tops are hard: the vertical, and the threshold of sleep."""
+"""Tops where they are difficult: at the vertical, and at the threshold of sleep."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ from rigidmd.mechanics.rotation import from_vector
 from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.runs import EXACT, FAMILIES, SPLIT, TEXTBOOK, away_from, families, run_body
 
-#: The benchmark of Bruls & Cardona: 150 rad/s, through the lowest point within 2.6e-13; centre of mass at 0.5 s from 40
-#: digits.
+#: The benchmark of Bruls & Cardona: 150 rad/s, within 2.6e-13 of the lowest point; centre of mass at 0.5 s computed
+#: with 40 digits.
 FAST_TOP = {
     "body": {
         "mass_kg": 15.0,
@@ -19,7 +19,7 @@ FAST_TOP = {
     "start": {"angular_velocity_body_rad_s": [0.0, 150.0, -4.61538]},
     "gravity": {},
 }
-#: Nearly all of its energy is spin: a tenth of the potential energy's share of it.
+#: Nearly all of its energy is spin, so the bound is a tenth of the share of potential energy.
 SWING = 0.1 * 15 * 9.81 / 5435.7
 CENTRE_AT_HALF = np.array([-0.7024682970565856, -0.02116518470192333, -0.7114002576517344])
 
@@ -65,7 +65,7 @@ NUDGE = 1e-9
 
 @case(5, x="distance from the threshold of sleep, relative", error="log of the largest tilt, against theory")
 def sleeping_top(find: Finding, quick: bool) -> None:
-    """The sleeping top at 1 +- 1e-6 (and more) of its threshold: below it falls, above it stays.
+    """The sleeping top at 1 +- 1e-6 (and more) of its threshold: below it falls, above it stays upright.
 
     Upright at rest but for omega_1 = e: theta = e t sinh(r t)/(r t) with r² = M g l/I1 - (L3/2 I1)², the sine above.
     """
@@ -88,7 +88,7 @@ def sleeping_top(find: Finding, quick: bool) -> None:
 
 @case(5, error="error of Q")
 def poles(find: Finding, quick: bool) -> None:
-    """theta exactly 0 and pi, in every formulation: right, or refused where Euler angles have no rates."""
+    """theta exactly 0 and pi in every formulation: right, or refused if Euler angles have no rates there."""
     spin, span = 5.0, 3.0
     for theta in (0.0, 180.0):
         data = UPRIGHT | {

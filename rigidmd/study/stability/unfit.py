@@ -1,4 +1,4 @@
-"""Input that is no input: bodies that are none, numbers that are none."""
+"""Invalid bodies and numbers."""
 
 import copy
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from rigidmd.study.stability.runs import EXACT, SPLIT, body_scene, molecules_sce
 
 @case(13, error="energy error over kinetic energy", step="fs")
 def strange_molecules(find: Finding, quick: bool) -> None:
-    """Sites on one another, straight ones given in space, no mass, negative mass, mass in one place only."""
+    """Coinciding sites, a straight molecule along a diagonal, no mass, negative mass, mass at one point only."""
 
     def scene(change) -> dict:
         kind = bent() | {"count": 8}
@@ -27,10 +27,10 @@ def strange_molecules(find: Finding, quick: bool) -> None:
             site["mass_u"] = value
 
     unfit = {
-        "two sites on one place": lambda s: place(s, 1, [-1.0, 0.0, 0.0]),
+        "two coinciding sites": lambda s: place(s, 1, [-1.0, 0.0, 0.0]),
         "two sites 1e-9 Å apart": lambda s: place(s, 1, [-1.0, 1e-9, 0.0]),
-        "all sites on one place": lambda s: [place(s, k, [0.0, 0.0, 0.0]) for k in range(3)],
-        "no mass at all": lambda s: masses(s, 0.0, 0.0, 0.0),
+        "all sites coinciding": lambda s: [place(s, k, [0.0, 0.0, 0.0]) for k in range(3)],
+        "no mass": lambda s: masses(s, 0.0, 0.0, 0.0),
         "negative mass": lambda s: masses(s, 12.0, -1.0, 12.0),
         "all mass in one site": lambda s: masses(s, 0.0, 12.0, 0.0),
         "massless site off a line of masses": lambda s: masses(s, 12.0, 0.0, 12.0),

@@ -1,4 +1,4 @@
-"""Water from 0 K to 1e5 K, the steps it bears, and how temperatures are shared."""
+"""Water from 0 K to 1e5 K, its longest steps, and equipartition."""
 
 from math import hypot
 
@@ -24,7 +24,7 @@ from rigidmd.study.stability.runs import (
 )
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
-#: Steps (fs) at which water is tried; the first is nominal.
+#: Steps (fs) for water; the first is nominal.
 STEPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
 #: Published: TIP4P at 300 K becomes unstable near 10 fs (Davidchack 2010, J. Comput. Phys. 229, 9323).
 PUBLISHED = 10.0
@@ -35,7 +35,7 @@ FREEDOM = 6 * WATERS - 3
 def water_steps(find: Finding, quick: bool) -> None:
     """Water at 0 K, 10 K, 298 K, 1000 K and 1e5 K: right at a short step, and the longest step that is bounded."""
     for temperature in (298.0,) if quick else (0.0, 10.0, 298.0, 1000.0, 1e5):
-        # a hundredth of an ångström at thermal speed, but no longer than librations bear
+        # a hundredth of an ångström at thermal speed, but stable for librations
         step = min(0.5, 0.5 * (1000.0 / max(temperature, 1.0)) ** 0.5)
         state = frozen() if temperature == 0 else warm("spce", temperature, step)
         scale = 0.5 * FREEDOM * BOLTZMANN / KJ_PER_MOL * max(temperature, 1.0)
@@ -71,7 +71,7 @@ def tip4p_steps(find: Finding, quick: bool) -> None:
 
 
 def moved(model: str, step: float, steps: int, family: str, state: State, scale: float) -> Outcome:
-    """NVE of water from a state."""
+    """An NVE run of water from a state."""
     return run_molecules(
         molecules_scene(water(model), WATER_BOX, step, steps, family, 0.0, None, WATER_FORCES), state, scale=scale
     )
@@ -87,7 +87,7 @@ def warm(model: str, temperature: float, step: float) -> State:
 
 
 def frozen() -> State:
-    """Water at rest in a minimum of its energy: cooled, then stopped again and again."""
+    """Water at rest in a minimum of its energy: cooled, then stopped repeatedly."""
     state = warm("spce", 10.0, 0.5)
     for _ in range(200):
         state.velocity[:] = 0.0
