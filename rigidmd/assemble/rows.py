@@ -1,4 +1,4 @@
-"""Rows of stages: the integrator of a stage with the thermostat and barostat that act in it."""
+"""Rows of stages: integrator, thermostat and barostat of a stage as flows."""
 
 from math import inf
 from typing import NamedTuple
