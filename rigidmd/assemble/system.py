@@ -76,9 +76,9 @@ class System:
 
     @property
     def tied_to_places(self) -> list[str]:
-        """Names of the terms whose energy depends on where in the lab molecules are: none can follow a box that
-        changes its size. A field on molecules without a net charge is not among them."""
-        return [name for name in self.external if self.terms[name].tied_to_places]
+        """Names of the terms whose energy depends on positions in the lab, which exclude a barostat. A field on
+        molecules without a net charge is not among them."""
+        return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
 
     @property
     def removes_momentum_every(self) -> float | None:
