@@ -1,1 +1,1 @@
-"""From a scene to what runs: species, start, terms (`system`); ASE reads structure files here and nowhere else."""
+"""From a scene to what runs: species, start, terms (`system`). Only this room uses ASE, to read structure files."""

@@ -1,4 +1,4 @@
-"""Structure files read through ASE, and what it needs before or after for .pdb, .xyz and LAMMPS data."""
+"""Structure files read through ASE, with corrections before or after for .pdb, .xyz and LAMMPS data."""
 
 import io
 import re
@@ -16,14 +16,14 @@ from rigidmd.errors import StructureError
 if TYPE_CHECKING:
     from ase import Atoms as AseAtoms
 
-# ASE's velocity unit (Å sqrt(u/eV)) in Å/ps.
+#: ASE's unit of velocity, sqrt(eV/u), in Å/ps.
 ASE_VELOCITY = 98.22694788464063
-#: A column of velocities in extended XYZ that ASE keeps as it stands: programs differ in its units.
+#: Columns of velocities in extended XYZ that ASE does not convert, as programs differ in their units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
 
 def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list[AseAtoms]":
-    """ASE's structures in a file or in text."""
+    """The structures in a file or text. Raises StructureError."""
     import ase.io.formats
 
     try:
@@ -34,13 +34,13 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
         raise StructureError(
             str(path), ["its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"]
         ) from None
-    except Exception as error:  # ASE's readers raise whatever their parsing trips over, ImportError to IndexError
+    except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
         raise StructureError(str(path), [f"ASE cannot read it: {type(error).__name__}: {error}"]) from None
     return [atoms for atoms in found if len(atoms)]
 
 
 def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=None, notes=()) -> Atoms:
-    """ASE's atoms in our units; names and elements as given, else by ASE's symbols."""
+    """Atoms from ASE's, in our units. Names and elements that are not given are ASE's symbols."""
     symbols = atoms.get_chemical_symbols()
     notes = list(notes)
     if any(share < 1 for site in atoms.info.get("occupancy", {}).values() for share in site.values()):
@@ -98,7 +98,7 @@ def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 
 def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
-    """One model through ASE, its lines made what ASE expects: some element in each, residues counted."""
+    """One model through ASE, in lines as ASE expects them: an element in each, residues numbered anew."""
     if len(places := {line[16:17] for line in body} - {"", " "}) > 1:
         raise StructureError(str(path), [f"has alternate locations {', '.join(sorted(places))}; keep one of them"])
     names, elements, residue, lines = [], [], [], []
@@ -119,12 +119,12 @@ def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
 
 
 def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
-    """The frames of a plain or extended .xyz through ASE, which wants elements where files often have names."""
+    """The frames of a plain or extended .xyz through ASE, which needs elements where many files have names."""
     labels, at = [], 0
     while at < len(lines) and lines[at].strip():
         count = lines[at].strip()
         if not count.isdigit() or at + 2 + int(count) > len(lines):
-            break  # ASE says what is wrong with it
+            break  # ASE raises the error
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
         column = _species_column(properties.group(1)) if properties else 0
         for k in range(at + 2, at + 2 + int(count)):
@@ -159,7 +159,7 @@ def _species_column(properties: str) -> int | None:
 
 
 def read_lammps(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    """LAMMPS data through ASE. Its first line may say the units; real and metal differ in velocities only."""
+    """LAMMPS data through ASE. The first line may name the units; real and metal differ only in velocities."""
     text = "\n".join(lines) + "\n"
     listed, labels = _lammps_types(lines)
     if not listed and not labels and atom_types is None and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
@@ -176,7 +176,7 @@ def read_lammps(path: Path, lines: list[str], atom_types: dict[str, str] | None)
 
 
 def _lammps_types(lines: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Of LAMMPS data the atom types in the section Masses, and what labels, or words after masses, call types."""
+    """The atom types in the section Masses of LAMMPS data, and names of types from labels or one-word comments."""
     listed, labels, words, section = [], {}, {}, ""
     for line in lines[1:]:
         data, _, comment = line.partition("#")
@@ -195,7 +195,7 @@ def _lammps_types(lines: list[str]) -> tuple[list[str], dict[str, str]]:
 def _lammps_atoms(
     path: Path, atoms, listed: list[str], labels: dict[str, str], atom_types: dict[str, str] | None, units_known: bool
 ) -> Atoms:
-    """Types as names, by what the scene or else the file calls them; molecules as residues."""
+    """Atoms named by type, as the scene or else the file names the types; molecules are residues."""
     types = [str(t) for t in atoms.arrays["type"]]
     if atom_types is not None:
         present = sorted({*types, *listed}, key=int)

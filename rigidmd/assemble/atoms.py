@@ -1,4 +1,4 @@
-"""The atoms of a structure file, and which elements their names and masses tell."""
+"""The atoms of a structure file, and elements from names and masses."""
 
 import re
 from typing import NamedTuple
@@ -7,16 +7,16 @@ import numpy as np
 
 SAME_MASS = 0.01  # masses that differ by less than this fraction are those of one element
 HEAVY_HYDROGEN = {"D": 2.014101777844, "T": 3.01604928132}  # u, AME2020; ASE has no symbols for them
-#: Names of sites without mass: M of four-site waters, L of five-site ones, and what programs call them.
+#: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs give them.
 MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM|VS|XX?|Q)\d*", re.IGNORECASE)
 
 
 class Atoms(NamedTuple):
-    """What a file says of n atoms, in our units."""
+    """The n atoms of a file, in Å, ps and u."""
 
     names: list[str]
-    elements: list[str]  # "" where the format has names only; X without mass, D and T for heavy hydrogen
-    residue: list[tuple]  # (number or None, name, ...), what tells it from its neighbours; () where the format has none
+    elements: list[str]  # "" if the format has only names; X for massless sites, D and T for heavy hydrogen
+    residue: list[tuple]  # (number or None, name, ...), differs between neighbours; () without residues
     position: np.ndarray  # (n, 3) Å
     velocity: np.ndarray | None  # (n, 3) Å/ps; rows of NaN for atoms without one
     cell: np.ndarray | None  # (3, 3), rows a, b, c, Å
@@ -25,7 +25,7 @@ class Atoms(NamedTuple):
 
 
 def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
-    """The element that an atom's name begins with, one of `vocabulary` if possible; X if massless, "" if none."""
+    """The element at the start of an atom's name, one of `vocabulary` if possible; X for massless sites, "" if none."""
     letters = re.split(r"[^A-Za-z]", name.lstrip("0123456789 "), maxsplit=1)[0]
     one, two = letters[:1].upper(), letters[:2].capitalize()
     if len(two) == 2 and (letters[:2] == two or letters.upper() in ("CL", "BR")) and is_element(two):
@@ -43,7 +43,7 @@ def is_element(symbol: str) -> bool:
 
 
 def element_of_mass(mass: float) -> str:
-    """The element, or heavy hydrogen, that weighs so much (u); "" if none does: several atoms as one, say."""
+    """The element, or heavy hydrogen, of this mass (u); "" if there is none, as for united atoms."""
     from ase.data import atomic_masses, chemical_symbols
 
     known = {e: float(m) for e, m in zip(chemical_symbols, atomic_masses, strict=True) if e != "X"} | HEAVY_HYDROGEN

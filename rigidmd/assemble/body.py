@@ -1,4 +1,4 @@
-"""A scene of a single body becomes what runs: flight, rotor, frame, resistance, terms, the first state."""
+"""The system of a scene of a single body: flight, rotor, frame, resistance, terms, first state."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ LARGEST_IN_GRO = 9e4  # Å: eight columns in nm
 
 
 class Pose(NamedTuple):
-    """Where a body is and how it moves, for a Python function that applies a force. Relative to the frame."""
+    """Position, attitude and velocities of a body, relative to the frame, for Python functions that apply forces."""
 
     time: float  # s
     position: np.ndarray  # (3,) centre of mass, m
@@ -52,7 +52,7 @@ class Pose(NamedTuple):
 
 @dataclass
 class BodySystem:
-    """What a scene of a body becomes. The engine moves it along its principal axes; `axes` leads back to the scene's.
+    """The system of a single body. The engine uses its principal axes; `axes` leads back to those of the scene.
 
     axes (3, 3): the principal axes as columns, in the body's axes. inertia (3,): principal moments at the start, kg m²,
     about the pivot or the centre of mass, added inertia of a fluid included; centre (3,): centre of mass from there, in
@@ -95,7 +95,7 @@ class BodySystem:
 
     @property
     def method(self) -> Scheme | Solver:
-        """What moves it."""
+        """Its integrator."""
         run = self.scene.run
         if run.is_open:
             return SCHEMES["velocity_verlet"]
@@ -109,19 +109,19 @@ class BodySystem:
         )
 
     def engine(self) -> Engine:
-        """A new engine for it at time 0, which calls the Python functions that apply forces."""
+        """A new engine for this body at time 0, which calls the Python functions that apply forces."""
         kind = OdeEngine if self.scene.run.integrator in SOLVERS else Engine
         return kind(*self.during(0.0), applied={name: self._asker(f) for name, f in self.applied.items()})
 
     def breaks(self) -> list[float]:
-        """Times within the run at which something that follows time as told jumps or bends."""
+        """Times within the run at which a prescribed function of time has a jump or a kink."""
         parts = (*self.body, *self.terms.values())
         times = {float(t) for part in parts for value in part if isinstance(value, Course) for t in value.times}
         run = self.scene.run
         return sorted(t for t in times if 0 < t < run.steps * run.timestep_s)
 
     def during(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
-        """Body and terms with what holds from a time to the next break."""
+        """Body and terms as they are from a time to the next break."""
         flight, rotor, frame, resistance = self.body
         body = Body(_at(flight, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
         return body, {name: _at(term, time) for name, term in self.terms.items()}
@@ -135,7 +135,7 @@ class BodySystem:
                 raise SimulationError(
                     f"t = {time:g} s: an applied function gave {told!r}, must give force and torque of 3 numbers each"
                 ) from None
-            if not self.flies:  # it acts at the centre of mass, which is not the pivot
+            if not self.flies:  # the force acts at the centre of mass, the torque is about the pivot
                 torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
             if not (np.isfinite(force).all() and np.isfinite(torque).all()):
                 raise SimulationError(f"t = {time:g} s: an applied function gave what is no finite number: {told!r}")
@@ -186,7 +186,7 @@ class BodySystem:
             return value_at(rotor.inertia, times), value_at(rotor.momentum, times)
         return np.broadcast_to(self.inertia, (len(times), 3)), np.zeros((len(times), 3))
 
-    # What trajectories ask of a system: points as sites, ångström for metres, picoseconds for seconds.
+    # The interface for trajectories: points as sites, Å for metres, ps for seconds.
 
     @property
     def scale(self) -> float:
@@ -292,7 +292,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
 
 
 def _at(part: Part, time: float) -> Part:
-    """A part of a body with each of its courses as it goes on from a time."""
+    """A part of a body with each of its courses continued from a time."""
     courses = {key: during(value, time) for key, value in part._asdict().items() if isinstance(value, Course)}
     return part._replace(**courses)
 
@@ -319,7 +319,7 @@ def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> Sta
 
 
 def _left_out(system: BodySystem) -> list[str]:
-    """What is not compiled, and why."""
+    """What is not compiled for this body, and why."""
     out = ["box, neighbour lists, pair forces, threads: there is one body"]
     if not system.flies:
         out.append("translation: the body is pinned")

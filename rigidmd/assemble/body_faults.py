@@ -1,4 +1,4 @@
-"""What a scene asks of a single body that this body cannot do, or that would do nothing to it."""
+"""Faults of scenes of a single body: keys that this body cannot follow, or that would have no effect on it."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from rigidmd.scene import BodyScene
 def unfit(
     scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
 ) -> list[str]:
-    """What a scene asks of a body that this body cannot do, or what would do nothing to it."""
+    """Keys that this body cannot follow, or that would have no effect on it."""
     faults, body, fluid = [], scene.body, scene.fluid
     turning, principal = bool(moments.any()), np.array_equal(axes, np.eye(3))
     if not turning:
@@ -47,7 +47,7 @@ def unfit(
 
 
 def _idle_of_points(scene: BodyScene) -> list[str]:
-    """Keys about turning, which a point does not do."""
+    """Keys of rotation, which a point does not have."""
     start, none = scene.start, type(scene.start)()
     named = [f"start.{key}" for key in type(start).model_fields if getattr(start, key) != getattr(none, key)]
     idle = [key for key in named if key not in ("start.position_m", "start.velocity_m_s")]
@@ -66,7 +66,7 @@ def _idle_of_points(scene: BodyScene) -> list[str]:
 
 
 def _needs_principal_axes(scene: BodyScene) -> list[str]:
-    """What acts along the body's axes must find them principal, unless it is the same along all."""
+    """Keys given along the body's axes, which must be principal axes unless all three values are equal."""
     faults = []
     for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
         for key in type(section).model_fields if section else ():
@@ -82,7 +82,7 @@ def _needs_principal_axes(scene: BodyScene) -> list[str]:
 
 
 def unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bool) -> list[str]:
-    """Torques that nothing resists."""
+    """Torques about axes without inertia."""
     if entry.torque_N_m is None and entry.at_m is None:
         return []
     if not turning:
@@ -96,7 +96,7 @@ def unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bo
 
 
 def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
-    """Integrators that would not be what they are for this body. has_functions : Python functions apply forces."""
+    """Integrators that cannot move this body, or not to their order. has_functions : Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
     braked = not isinstance(resistance, NoResistance)
     if run.is_open:

@@ -1,4 +1,4 @@
-"""The parts of a single body from the tables of its scene: inertia, fluid, rotor, frame, resistance, forces."""
+"""Parts of a single body from the tables of its scene: inertia, fluid, rotor, frame, resistance, forces."""
 
 from itertools import permutations
 
@@ -16,7 +16,7 @@ from rigidmd.scene import BodyScene
 from rigidmd.scene.actions import Timed
 from rigidmd.validation import settled
 
-#: Principal moments from a tensor that differ by less than this fraction of the largest differ by rounding.
+#: Principal moments of a tensor are equal if they differ by less than this fraction of the largest.
 ROUNDING = 1e-13
 
 
@@ -52,7 +52,7 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
 
 
 def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
-    """Centre and tips of the axes (7, 3) of the homogeneous ellipsoid of this inertia tensor; of a point, its place."""
+    """Centre and vertices (7, 3) of the homogeneous ellipsoid with this inertia tensor; one point without inertia."""
     moments, axes = np.linalg.eigh(tensor)
     half = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
     if not half.any():
@@ -62,7 +62,7 @@ def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
 
 
 def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal moments (3,) and axes (3, 3) as columns, right-handed, each as near to the body's own as can be."""
+    """Principal moments (3,) and right-handed axes (3, 3) as columns, each as close to the body's axis as possible."""
     rounding = ROUNDING * np.abs(tensor).max()
     if (np.abs(tensor - np.diag(np.diag(tensor))) <= rounding).all():
         moments, axes = np.diag(tensor).copy(), np.eye(3)
@@ -77,7 +77,7 @@ def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _even(moments: np.ndarray) -> np.ndarray:
-    """Moments that differ by rounding made equal to the last bit, which the rotor turns exactly; rounded zeros zero."""
+    """Moments with differences by rounding removed: equal to the last bit, so that the rotor is exact, or zero."""
     rounding = ROUNDING * moments.max()
     moments = np.where(moments < rounding, 0.0, moments)
     for i, j in ((0, 1), (1, 2), (2, 0)):
@@ -121,7 +121,7 @@ def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, a
 
 
 def _course(timed: Timed, values) -> Course:
-    """The course of a constant, of a window of time, or of a table."""
+    """The course of a value: constant, within a window of time, or from a table."""
     if timed.times_s is not None:
         return table(timed.times_s, values)
     if timed.from_s is not None or timed.to_s is not None:
@@ -184,7 +184,7 @@ def _turned(course: Course, matrix: np.ndarray) -> Course:
 
 
 def _force(force: Course, torque: Course, point: np.ndarray, follows_body: bool):
-    """A force that never changes in the lab has an energy; any other keeps an account of its work."""
+    """The term of a force: a constant one in the lab has a potential energy, of any other the work is recorded."""
     if not follows_body and is_steady(force) and is_steady(torque) and not torque.constant.any():
         return SteadyForce(force.constant[0], point)
     return Drive(force, torque, point, follows_body)

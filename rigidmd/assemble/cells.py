@@ -1,25 +1,25 @@
-"""Periodic cells as files give them: any lattice vectors, oriented in any way. Rows a, b, c, lab frame, Å."""
+"""Periodic cells of any shape and orientation, as files give them. Rows a, b, c, lab frame, Å."""
 
 from itertools import product
 
 import numpy as np
 
-#: Cosine up to which two edges count as at right angles: files print angles to 0.01 degrees, vectors to 1e-5 or better.
+#: Edges with a cosine up to this are at right angles: files print angles to 0.01 degrees, vectors to 1e-5 or better.
 RIGHT = np.radians(1e-3)
-#: A cell whose vectors lie closer to the standard orientation than this fraction of its longest edge is left as it is.
+#: A cell within this fraction of its longest edge of the standard orientation is not rotated.
 ORIENTED = 1e-6
 
-#: A cell may lean by this fraction of an edge more than half of it and stay as it is: 36 cos 60° is 18.000000000000004,
-#: and files print vectors to 1e-4 Å, angles to 0.01 degrees. Lists of neighbours are right for any lean.
+#: Tilt beyond half an edge, as a fraction of the edge, that is tolerated: 36 cos 60° is 18.000000000000004, and files
+#: print vectors to 1e-4 Å, angles to 0.01 degrees. Neighbour lists are correct for any tilt.
 HALF_AS_PRINTED = 1e-4
-#: How much longer a cut-off another choice of edges must allow before a cell is turned for it.
+#: Factor by which another choice of edges must raise the longest possible cut-off before the cell is rotated for it.
 ROOMIER = 1.1
 
 
 def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) that turns it so.
+    """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) to that orientation.
 
-    The new rows are R times the old ones; of a left-handed cell c is turned round, which leaves the lattice as it is.
+    The new rows are R times the old ones. Of a left-handed cell c changes sign, which leaves the lattice the same.
     """
     cell = cell * np.array([1, 1, np.sign(np.linalg.det(cell))])[:, None]
     longest = np.abs(cell).max()
@@ -31,7 +31,7 @@ def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reduced(cell: np.ndarray) -> np.ndarray:
-    """The same lattice by a cell (3, 3) in standard orientation that leans by no more than half an edge, as printed."""
+    """A cell (3, 3) of the same lattice, in standard orientation, with tilts up to half an edge (to printed digits)."""
     cell = cell.copy()
     for k, along in ((2, 1), (2, 0), (1, 0)):
         edges = cell[k, along] / cell[along, along]
@@ -41,12 +41,12 @@ def reduced(cell: np.ndarray) -> np.ndarray:
 
 
 def basis_of(cell: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """Integers U (3, 3): the edges of a cell (3, 3) are U times those of a given cell of the same lattice."""
+    """Integers U (3, 3) with cell = U given, for two cells (3, 3) of one lattice."""
     return np.rint(cell @ np.linalg.inv(given)).astype(int)
 
 
 def same_lattice(cell: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
-    """Whether two cells (3, 3) describe one lattice, but for a fraction of the longest component of the second."""
+    """Whether two cells (3, 3) describe one lattice, to a fraction of the largest component of the second."""
     basis = basis_of(cell, other)
     whole = round(abs(np.linalg.det(basis))) == 1
     return whole and bool(np.abs(basis @ other - cell).max() <= tolerance * np.abs(other).max())
@@ -59,7 +59,7 @@ def edges_in_words(cell: np.ndarray) -> str:
 
 
 def basis_in_words(basis: np.ndarray) -> str:
-    """The edges a', b', c' that are not a, b, c, as "c' = c - a"."""
+    """The edges a', b', c' that differ from a, b, c, as "c' = c - a"."""
     told = []
     for k, row in enumerate(basis):
         parts = [(n, i) for i, n in enumerate(row) if n]
@@ -71,9 +71,10 @@ def basis_in_words(basis: np.ndarray) -> str:
 
 
 def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the cells (3, 3) of a lattice one with room for a long cut-off, and the rotation (3, 3) that it needs.
+    """The cell (3, 3) of a lattice that allows the longer cut-off, and the rotation (3, 3) to its standard orientation.
 
-    The cell as it is but for lean, unless the shortest edge of the upright brick gets much longer by another choice.
+    The given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cut-off: half the smallest
+    of a_x, b_y, c_z.
     """
     from ase.geometry import minkowski_reduce
 
@@ -84,7 +85,7 @@ def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def right_angled(cell: np.ndarray) -> bool:
-    """Whether the edges of a cell (3, 3) are at right angles to one another, as far as files tell."""
+    """Whether the edges of a cell (3, 3) are at right angles, to the digits that files print."""
     unit = cell / np.linalg.norm(cell, axis=1)[:, None]
     return bool(np.abs((unit @ unit.T)[np.triu_indices(3, 1)]).max() <= RIGHT)
 
@@ -98,7 +99,7 @@ def angles_deg(cell: np.ndarray) -> np.ndarray:
 def pairs_within(
     position: np.ndarray, cell: np.ndarray | None, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs i, j of points (n, 3) within a radius, images in any cell (3, 3) included, and their distances."""
+    """Pairs i, j of points (n, 3) within a radius, periodic images in any cell (3, 3) included, and their distances."""
     from scipy.spatial import KDTree
 
     points, owner = position, np.arange(len(position))
@@ -106,7 +107,7 @@ def pairs_within(
         inverse = np.linalg.inv(cell)
         inside = position @ inverse
         inside -= np.floor(inside)
-        margin = radius * np.linalg.norm(inverse, axis=0)  # in fractions of the distances between opposite faces
+        margin = radius * np.linalg.norm(inverse, axis=0)  # in fractional coordinates
         shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
         owners, images = [], []
         for shift in shifts:

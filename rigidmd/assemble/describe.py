@@ -1,4 +1,4 @@
-"""A system in words: what would happen if it ran, and what was left out."""
+"""A system in words: how it would run, and what was left out."""
 
 from collections.abc import Iterator
 from math import inf
@@ -22,7 +22,7 @@ from rigidmd.validation import settled
 
 
 def describe(scene: MolecularScene | BodyScene) -> str:
-    """What a scene would do, in words. Raises as building it does."""
+    """How a scene would run, in words. Raises what building its system raises."""
     if isinstance(scene, MolecularScene):
         return _molecules(build(scene))
     text = _body(build_body(scene))
@@ -128,7 +128,7 @@ def _term(system: System, name: str, term: NamedTuple) -> str:
 
 
 def array_bytes(value) -> int:
-    """Bytes of all arrays in nested tuples, each array once."""
+    """Bytes of all arrays in nested tuples; each array counts once."""
     if isinstance(value, System):
         # The state four times: the start, the one that moves, the last good one, forces and torques.
         fixed = (value.engine().room(value.state), value.model, value.sites)

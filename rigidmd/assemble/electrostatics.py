@@ -1,4 +1,4 @@
-"""Charges of a resolved scene become terms: the law of pairs, what images add, constants of rigid molecules."""
+"""The electrostatics of a resolved scene: pair law, reciprocal part, constants of rigid molecules."""
 
 from collections.abc import Callable
 from math import inf, pi
@@ -28,10 +28,10 @@ from rigidmd.scene import MolecularScene
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 from rigidmd.validation import settled
 
-#: A sum of charges smaller than this share of the sum of their sizes is rounding.
+#: A net charge below this fraction of the sum of |q| is rounding.
 NEUTRAL = 1e-10
-#: Of the error of real space, what polynomials in single precision may be off by between unit charges. With it the
-#: measured error of PME on 4096 waters, 3.3e-5 e²/Å², is what it was with all terms.
+#: Error that polynomials in single precision may have between unit charges, as a fraction of the real-space error. With
+#: it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as with all terms of the polynomials.
 FIT_SHARE = 0.02
 
 Grid = tuple[int, int, int]
@@ -54,7 +54,7 @@ class Charged(NamedTuple):
 
     @property
     def summed(self) -> Charges:
-        """All charges, as estimates of errors need them."""
+        """All charges, in the form that error estimates need."""
         return charges_of(
             [
                 (int((self.species_index == k).sum()), m.charges[c], m.positions_body[c])
@@ -63,7 +63,7 @@ class Charged(NamedTuple):
         )
 
     def each(self, what: Callable[[np.ndarray, np.ndarray], float]) -> float:
-        """Sum over molecules that move of what(charges (s,) in energy units, positions (s, 3)) of one."""
+        """Sum of what(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen."""
         total = 0.0
         for k, (m, c) in enumerate(zip(self.species, self.chosen, strict=True)):
             count = int(((self.species_index == k) & ~self.frozen).sum())
@@ -72,11 +72,11 @@ class Charged(NamedTuple):
 
 
 class Electrostatics(NamedTuple):
-    """What charges add to a system."""
+    """The contributions of charges to a system."""
 
     terms: dict[str, NamedTuple]
     constants: dict[str, float]  # u Å²/ps²
-    pressure: float = 0.0  # u/(Å ps²), that no motion changes
+    pressure: float = 0.0  # a constant part of the pressure, u/(Å ps²)
     force_error: float | None = None  # estimated rms error of the force on a site, u Å/ps²; with Ewald sums
     notes: tuple[str, ...] = ()
 
@@ -84,9 +84,9 @@ class Electrostatics(NamedTuple):
 def electrostatics(
     scene: MolecularScene, charged: Charged, space: Space, state: State, basis: np.ndarray, grid: Grid | None
 ) -> Electrostatics:
-    """What the charges of a resolved scene add. Raises SceneError.
+    """The contributions of the charges of a resolved scene. Raises SceneError.
 
-    basis (3, 3) : integers, the edges of the box in those of the cell that was described, whose waves a scene counts
+    basis (3, 3) : integers, the edges of the box in those of the described cell, to which ewald_k_max refers
     grid : of PME, along the edges of the box
     """
     forces, cutoff = scene.forces, scene.forces.cutoff_A or inf
@@ -108,15 +108,15 @@ def electrostatics(
 
 
 class _Ewald(NamedTuple):
-    """What an Ewald sum has besides alpha, and the errors that it leaves."""
+    """Truncation errors and waves of an Ewald sum."""
 
     real_error: float  # e²/Å², see ewald_errors
     wave_error: float
-    waves: vectors.Waves | None  # of Ewald; of PME those that tell what frozen molecules do to one another
+    waves: vectors.Waves | None  # with PME only for the interactions of frozen molecules
 
 
 def _waves(scene: MolecularScene, charged: Charged, space: Space, basis: np.ndarray, grid: Grid | None) -> _Ewald:
-    """Waves and errors of a resolved scene."""
+    """Waves and truncation errors of a resolved scene."""
     forces, volume, cell = scene.forces, space.volume, cell_of(space)
     alpha, cutoff, charges = settled(forces.ewald_alpha_per_A), settled(forces.cutoff_A), charged.summed
     beyond = real_error(charges, alpha, cutoff, volume)
@@ -167,8 +167,8 @@ def _ewald(
         how = f"grid {' x '.join(map(str, grid))}, splines of order {order}"
     terms = {"coulomb_real": between_pairs(law), "coulomb_reciprocal": over}
     constants = {
-        # The shift counts all charges inside a charge's cut-off, itself and its molecule among them, which together are
-        # about neutral; pairs inside a molecule and the charge itself, no pairs of the loop, are this constant.
+        # The shift applies to all charges within the cut-off of a charge, its own molecule and itself included, which
+        # together are nearly neutral. The pair loop leaves out the latter; this constant adds them.
         "coulomb_self": charged.each(
             lambda q, x: corrections.self_energy(q, alpha) - 0.5 * law.shift * float(q.sum()) ** 2
         ),
@@ -212,7 +212,7 @@ def _of_frozen(
     permittivity: float,
     state: State,
 ) -> tuple[float, float]:
-    """Energy and pressure that take out what frozen molecules do to one another in sums over images: constants.
+    """Constant energy and pressure that cancel the interactions of frozen molecules in sums over images.
 
     charge (s,) : 0 for sites that move
     """

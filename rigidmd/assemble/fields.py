@@ -1,4 +1,4 @@
-"""What acts on molecules from outside becomes terms; and a start between walls, where there are some."""
+"""Terms of external fields, and a start between walls."""
 
 from math import inf, pi, radians
 from typing import NamedTuple
@@ -27,14 +27,14 @@ WELL = (2 / 5) ** (1 / 6)
 
 
 class Parts(NamedTuple):
-    """Of a system, what fields are made for."""
+    """The parts of a system that fields depend on."""
 
     species: list[Molecule]
     model: Model
     space: Space
     cutoff: float  # between sites, Å
     state: State  # the start
-    number: np.ndarray  # (n,) by which a scene may pick molecules
+    number: np.ndarray  # (n,) numbers by which a scene may select molecules
 
 
 def field_terms(scene: MolecularScene, parts: Parts) -> dict[str, NamedTuple]:
@@ -98,13 +98,13 @@ def _walls(walls: Walls, k: int, parts: Parts, moves: np.ndarray, faults: list[s
 
 
 def _acted_on(walls: Walls, species: list[Molecule], moves: np.ndarray) -> list[np.ndarray]:
-    """Offsets (sites, 3) of what walls act on in each species, body frame, Å; none of what is frozen."""
+    """Offsets (sites, 3) of the points of each species that walls act on, body frame, Å; none of frozen species."""
     offsets = [np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0] for m in species]
     return [own if free else own[:0] for own, free in zip(offsets, moves, strict=True)]
 
 
 def _gap_faults(scene: MolecularScene, parts: Parts, moves: np.ndarray) -> list[str]:
-    """Walls that do not fit into a periodic box, or not well enough to part what is between them from its images."""
+    """Faults: walls that do not fit into a periodic box, or do not keep molecules apart from their images."""
     fields, space = scene.fields, parts.space
     if not fields.walls or isinstance(space, Unbounded):
         return []
@@ -129,7 +129,7 @@ def _gap_faults(scene: MolecularScene, parts: Parts, moves: np.ndarray) -> list[
 
 
 def _protrusion(walls: Walls, species: list[Molecule], moves: np.ndarray) -> float:
-    """How far sites that act may stand out beyond those that walls act on, Å."""
+    """How far interacting sites may reach beyond the points that walls act on, Å."""
     found = 0.0
     for m, own in zip(species, _acted_on(walls, species, moves), strict=True):
         acting = m.positions_body[(m.epsilon > 0) | (m.charges != 0)]
@@ -177,7 +177,7 @@ def _restraints(scene: MolecularScene, k: int, parts: Parts, faults: list[str]) 
 def start_lattice(
     scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """n points (n, 3) on a lattice in a box with edges (3,); between walls, far enough from them, where there are some.
+    """n points (n, 3) on a lattice in a box with edges (3,), between its walls and far enough from them.
 
     Raises SceneError.
     """
@@ -200,7 +200,7 @@ def start_lattice(
 
 
 def _free(walls: Walls, species: list[Molecule]) -> tuple[float, float]:
-    """Between which positions centres of mass may be however molecules are turned, Å."""
+    """Range of positions of centres of mass that is free for every orientation, Å."""
     reach = max(
         np.linalg.norm(own, axis=1).max(initial=0.0) for own in _acted_on(walls, species, np.ones(len(species), bool))
     )
@@ -209,7 +209,7 @@ def _free(walls: Walls, species: list[Molecule]) -> tuple[float, float]:
 
 
 def between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) moved by whole edges across the walls to where these are; as they are without walls or box."""
+    """Positions (n, 3) moved by whole edges to between the walls; unchanged without walls or box."""
     if not isinstance(space, Orthorhombic):
         return position
     moved = position.copy()
@@ -220,7 +220,7 @@ def between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> 
 
 
 def fields_in_words(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict[str, str]:
-    """What each term of the fields is, by its name."""
+    """Description of each term of the fields, by its name."""
     fields, words = scene.fields, {}
     if "electric_field" in terms:
         words["electric_field"] = f"{_vector(settled(fields.electric_V_per_nm))} V/nm"
@@ -259,14 +259,14 @@ def _vector(values: tuple[float, ...]) -> str:
 
 
 def fields_left_out(terms: dict[str, NamedTuple]) -> list[str]:
-    """Kinds of fields that are not compiled."""
+    """Kinds of fields that the scene does not have."""
     kinds = {"electric_field": "electric field", "gravity": "gravity", "walls": "walls", "restraints": "restraints"}
     missing = [words for name, words in kinds.items() if not any(term.startswith(name) for term in terms)]
     return [f"{', '.join(missing)}: not asked for in [fields]"] if missing else []
 
 
 def field_notes(scene: MolecularScene) -> list[str]:
-    """What a user of these fields has to know."""
+    """Notes on these fields."""
     if scene.fields.walls and scene.forces.electrostatics in ("ewald", "pme"):
         return [
             f"fields.walls: {scene.forces.electrostatics} sums over the images beyond the walls too, so the layer "

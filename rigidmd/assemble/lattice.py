@@ -1,10 +1,10 @@
-"""A start from nothing but a count and a box: molecules on a lattice, turned at random."""
+"""A start on a lattice."""
 
 import numpy as np
 
 
 def lattice(n: int, edges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """n points (n, 3) in an upright box with edges (3,), on a nearly cubic lattice; its places are drawn at random."""
+    """n points (n, 3) on a nearly cubic lattice in a rectangular box with edges (3,), drawn at random."""
     shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
     while shape.prod() < n:
         shape[np.argmax(edges / shape)] += 1

@@ -1,4 +1,4 @@
-"""Which atoms are which molecule: by residues where a file has them, else by bonding distance; fitted by templates."""
+"""Which atoms form which molecule: by residues, or else by bonding distance. Rigid templates are fitted to them."""
 
 from collections import Counter
 from itertools import groupby
@@ -12,46 +12,46 @@ from rigidmd.assemble.cells import pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
 
-#: Atoms of a molecule are bonded up to this multiple of the template's longest bond between two like them; hydrogen
-#: bonds of water are 1.6 times its bonds or longer.
+#: Atoms are bonded up to this multiple of the template's longest bond between such atoms. Hydrogen bonds of water are
+#: at least 1.6 times its bonds.
 BOND_REACH = 1.25
-#: Partial assignments tried before a molecule's atoms count as fitting in no order.
+#: Partial assignments tried before the search for an order of atoms gives up.
 MOST_TRIES = 20_000
-#: u; what engines that know no massless sites give them instead is less.
+#: u; engines without massless sites give them a mass below this.
 NO_MASS = 0.1
 MOST_LISTED = 6  # atoms of a molecule that a message lists
 
 
 class Fit(NamedTuple):
-    """Rigid templates laid onto m molecules of s massive sites."""
+    """Rigid templates fitted to m molecules of s massive sites."""
 
     centre: np.ndarray  # (m, 3) Å
     rotation: np.ndarray  # (m, 3, 3)
-    deviation: np.ndarray  # (m,) largest of an atom, Å
-    square: np.ndarray  # (m,) mean square of all atoms, Å²
+    deviation: np.ndarray  # (m,) largest distance of an atom from the template, Å
+    square: np.ndarray  # (m,) mean square of these distances, Å²
 
 
 class Matched(NamedTuple):
-    """The molecules of a file, in its order."""
+    """The molecules of a file, in the order of the file."""
 
     species: np.ndarray  # (n,)
-    atoms: list[np.ndarray]  # of each molecule, in the order of its massive sites
+    atoms: list[np.ndarray]  # atoms of each molecule, in the order of its massive sites
     centre: np.ndarray  # (n, 3) Å
     rotation: np.ndarray  # (n, 3, 3)
     deviation: np.ndarray  # (n,) Å
     square: np.ndarray  # (n,) Å²
-    massless: Counter  # how many atoms without mass the file has, by name
+    massless: Counter  # number of massless atoms in the file, by name
     notes: list[str]
-    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
+    number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
 
 
 def massive(molecule: Molecule) -> np.ndarray:
-    """The sites of a molecule that are atoms: those with mass."""
+    """The sites of a molecule that have mass, and so are atoms."""
     return np.flatnonzero(molecule.masses > 0)
 
 
 def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float) -> Matched | list[str]:
-    """The molecules among the atoms, or every reason why they are none.
+    """The molecules that the atoms form, or every reason why they form none.
 
     cell: lattice (3, 3) across whose faces molecules may be split, or None. tolerance: see Scene.structure.
     """
@@ -79,16 +79,16 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
 
 
 def _labels(molecule: Molecule) -> list[str]:
-    """What makes atoms exchangeable: the element of each site, its name where it has none."""
+    """Label of each site: its element, or else its name. Atoms of one label are interchangeable."""
     return [e if e != "X" else name for e, name in zip(molecule.elements, molecule.site_names, strict=True)]
 
 
 def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """The element of every atom (or what stands for it in the templates), X for massless ones; with "?" a mere guess.
+    """The label of every atom: its element, or a site's name; X for massless ones. With "?" it is a guess.
 
-    An element that the file gives is believed. A name is that of a site, or begins with an element of the scene, or
-    tells nothing that counts. Where the file gives masses, a name that is that of a site or an element counts for more
-    than they do, and they for more than how any other name begins.
+    An element in the file is accepted. A name counts if it is that of a site or begins with an element of the scene. If
+    the file gives masses, the name of a site or element precedes the mass, and the mass precedes the beginning of any
+    other name.
     """
     by_name, by_mass = {}, []
     for molecule in species:
@@ -103,7 +103,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
 
     def isotope(element: str) -> str:
-        """Hydrogen that the scene does not tell from its own counts as its own: heavy water starts like light."""
+        """Isotopes of hydrogen that the scene lacks count as the one that it has: light water from a file of heavy."""
         return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
 
     def kind(name: str, element: str, mass: float, residue: tuple) -> str:
@@ -139,9 +139,9 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
-    """Atoms connected by bonds as long as those of the templates, in file order; massless ones stay out.
+    """Groups of atoms connected by bonds as long as those of the templates, in file order, without massless ones.
 
-    Bonds of a template: the shortest set of distances that holds it together.
+    The bonds of a template are the edges of its minimum spanning tree.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
@@ -170,14 +170,14 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
 
 class _Candidate(NamedTuple):
     species: int
-    order: list[int]  # places in the run, in the order of the massive sites
+    order: list[int]  # positions in the run, in the order of the massive sites
     nameless: bool
 
 
 def _attempt(
     atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
 ) -> Matched | list[str]:
-    """Each run of atoms as one molecule. Runs that look alike are dealt with together. how: told of runs at fault."""
+    """Each run of atoms as one molecule. Runs of one composition are fitted together. how: words for messages."""
     alike = {}
     for number, run in enumerate(runs):
         residue = atoms.residue[run[0]]
@@ -231,7 +231,7 @@ def _composition(molecule: Molecule) -> str:
 
 
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
-    """A run as this species: sites by name if all names are its own, else by element; or None."""
+    """A run as a molecule of this species, or None. Atoms go by name if all names are its own, else by element."""
     sites = massive(molecule)
     labels = [_labels(molecule)[s] for s in sites]
     places = [i for i, kind in enumerate(kinds) if kind != "X"]
@@ -253,7 +253,7 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
 
 
 def _place(atoms, kinds, runs, members, candidates, species, cell, tolerance, found: Matched, faults: dict) -> None:
-    """Fit like runs to their candidates; write into `found`, or into `faults`."""
+    """Fit runs of one composition to their candidates; write into `found` or `faults`."""
     fits = []
     for c in candidates:
         order = np.array(runs)[:, c.order]
@@ -285,9 +285,9 @@ def _place(atoms, kinds, runs, members, candidates, species, cell, tolerance, fo
 def _fit_in_any_order(
     position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: np.ndarray, tolerance: float
 ) -> Fit:
-    """The fit of molecules by their atoms `order` (m, s), which is put right in place where another order fits.
+    """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits.
 
-    allowed (s, s): whether a site may be an atom of the order given.
+    allowed (s, s): whether a site may be each atom of the given order.
     """
     limit = tolerance * molecule.radius
     points = _whole(position[order], cell)
@@ -298,18 +298,18 @@ def _fit_in_any_order(
         if better is None:
             bad = bad[1:]
             continue
-        again = _fit(points[bad][:, better], molecule)  # files repeat themselves: what mends one mends the others
+        again = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
         mended = again.deviation <= limit
         for old, new in zip(fit, again, strict=True):
             old[bad[mended]] = new[mended]
         order[bad[mended]] = order[bad[mended]][:, better]
-        mended[0] = True  # or, by a rounding, as good as
+        mended[0] = True  # even if rounding puts it just above the limit
         bad = bad[~mended]
     return fit
 
 
 def _whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
-    """Molecules (m, s, 3) with every atom at the image nearest to the first."""
+    """Molecules (m, s, 3) with every atom at its image nearest to the first atom."""
     if cell is None or points.shape[1] == 1:
         return points
     from ase.geometry import find_mic
@@ -319,7 +319,7 @@ def _whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
 
 
 def _fit(points: np.ndarray, molecule: Molecule) -> Fit:
-    """Best rigid fit of a template to whole molecules (m, s, 3), their centres of mass in one place."""
+    """Best rigid fit of a template to whole molecules (m, s, 3), with coinciding centres of mass."""
     sites = massive(molecule)
     masses, template = molecule.masses[sites], molecule.positions_body[sites]
     centre = points[:, 0] + np.einsum("s,nsk->nk", masses, points - points[:, :1]) / masses.sum()
@@ -332,8 +332,8 @@ def _fit(points: np.ndarray, molecule: Molecule) -> Fit:
 def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> list[int] | None:
     """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
 
-    Sites are given atoms one by one, such that all distances between them agree: first closely, then up to twice the
-    limit, beyond which no fit within it exists.
+    A depth-first search assigns atoms to sites one by one so that all distances agree: first closely, then up to twice
+    the limit, beyond which no fit within the limit exists.
     """
     template = molecule.positions_body[massive(molecule)]
     wanted = np.linalg.norm(template[:, None] - template, axis=2)

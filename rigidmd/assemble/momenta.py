@@ -1,4 +1,4 @@
-"""Momenta at a temperature, and the degrees of freedom that share it."""
+"""Momenta at a temperature, and degrees of freedom."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -9,19 +9,19 @@ from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
 from rigidmd.units import BOLTZMANN
 
-#: Total momentum below this fraction of the sum of |m v| is rounding, not motion.
+#: A total momentum below this fraction of the sum of |m v| is rounding.
 AT_REST = 1e-9
 
 
 class Freedom(NamedTuple):
-    """Degrees of freedom; components of the total momentum that are conserved are zero, and are not counted."""
+    """Degrees of freedom. Conserved components of the total momentum are zero and not counted."""
 
     translation: int
     rotation: int
 
     @property
     def total(self) -> int:
-        """Both."""
+        """Of translation and rotation."""
         return self.translation + self.rotation
 
 
@@ -45,7 +45,7 @@ def kept_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
 
 
 def mobile(model: Model) -> np.ndarray:
-    """Whether each molecule (n,) moves, or is frozen."""
+    """Whether each molecule (n,) can move, that is, is not frozen."""
     return model.inverse_mass[model.species] > 0
 
 

@@ -1,4 +1,4 @@
-"""Sites of different molecules that stand too near one another."""
+"""Overlaps: sites of different molecules that are too close."""
 
 from math import inf
 from typing import TYPE_CHECKING
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from rigidmd.assemble.system import System
 
 #: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
-#: is 1750 epsilon, which no liquid visits.
+#: is 1750 epsilon, which does not occur in liquids.
 OVERLAP = 0.6
-#: Sites of different molecules closer than this fraction of the smaller molecule's radius stand inside one another.
+#: Sites of different molecules closer than this fraction of the smallest molecular radius overlap too.
 INSIDE = 0.2
 
 
 def overlaps(system: "System") -> list[str]:
-    """Molecules of a structure that stand in one another: at most five named."""
+    """Faults: overlapping molecules, at most five of them named."""
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
     sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
     faults = []
@@ -37,7 +37,7 @@ def overlaps(system: "System") -> list[str]:
 
 
 def close_pairs(system: "System", state: State, radius: float) -> list[tuple[int, int, float]]:
-    """Sites (i, j) of different molecules, not both frozen, no further apart than `radius`; their distances, Å."""
+    """Sites (i, j) of different molecules, not both frozen, within `radius` of each other, and their distances, Å."""
     cell = cell_of(system.space) if system.space.volume < inf else None
     i, j, distance = pairs_within(system.site_positions(state), cell, radius)
     a, b, free = system.sites.molecule[i], system.sites.molecule[j], mobile(system.model)

@@ -1,7 +1,7 @@
 """Readers of the formats that ASE does not read well enough.
 
-These are .gro (more digits, several frames, velocities of some atoms: ASE takes none of them), Tinker's .arc and .txyz
-(ASE has none, MDAnalysis keeps single precision) and .cssr (neither has one).
+These are .gro (ASE supports neither more digits, nor several frames, nor velocities of some atoms only), Tinker's .arc
+and .txyz (ASE has no reader, MDAnalysis reads in single precision) and .cssr (neither has a reader).
 """
 
 import re
@@ -17,7 +17,7 @@ from rigidmd.errors import StructureError
 
 
 def _numbers(path: Path, number: int, words: list[str], what: str) -> list[float]:
-    """Words of a line as numbers. Raises StructureError with the line and what should stand there."""
+    """Words of a line as numbers. Raises StructureError with the line and what was expected."""
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -51,7 +51,7 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 
 def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[float]) -> Atoms:
-    """Lines `first` to `box`. Columns are as wide as the decimal points of the first atom are apart, as in GROMACS."""
+    """The frame in lines `first` to `box`. Column width is the distance between decimal points, as in GROMACS."""
     names, residue = [], []
     position, velocity = np.zeros((box - first - 2, 3)), np.full((box - first - 2, 3), np.nan)
     points = [m.start() for m in re.finditer(r"\.", lines[first + 2][20:])] if box > first + 2 else []
@@ -122,7 +122,7 @@ def _columns(path: Path, lines: list[str], first: int, what: str) -> tuple[list[
 
 
 def read_cssr(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
-    """Cambridge Structure Search and Retrieval: edges, angles, how many atoms in which coordinates, title, atoms."""
+    """Cambridge Structure Search and Retrieval: edges, angles, number of atoms, kind of coordinates, title, atoms."""
     return [partial(_cssr_atoms, path, lines)]
 
 

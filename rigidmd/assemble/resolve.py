@@ -142,7 +142,7 @@ def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list
 
 
 def _default(given: object) -> str:
-    """How a message marks a value that was not given."""
+    """Marks a default in a message."""
     return "" if given else " (the default)"
 
 

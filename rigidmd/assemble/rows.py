@@ -1,4 +1,4 @@
-"""Rows of stages: the integrator of a stage with the thermostat and barostat that act in it."""
+"""Rows of stages: integrator, thermostat and barostat of a stage as flows."""
 
 from math import inf
 from typing import NamedTuple
@@ -70,10 +70,9 @@ def box_of(system: System, k: int) -> NamedTuple:
         return VolumeMoves(
             _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), beyond, key
         )
-    kept = system.model.keeps_momentum if stage.keeps_momentum else (False, False, False)
-    at_rest = tuple(float(axis) for axis in kept)
+    x, y, z = map(float, system.model.keeps_momentum & stage.keeps_momentum)
     rate = compressibility / stage.barostat_time
-    return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], at_rest, beyond, key)
+    return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], (x, y, z), beyond, key)
 
 
 def _scaled(tensor: Six, factor: float) -> Six:

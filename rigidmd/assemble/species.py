@@ -1,4 +1,4 @@
-"""The molecules that a scene names, and which of them are frozen."""
+"""The species of a scene: their rigid templates, and which molecules are frozen."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from rigidmd.validation import settled
 
 
 def species_of(scene: MolecularScene) -> list[Molecule]:
-    """The molecules that a scene names, in its order. Raises SceneError with every fault."""
+    """The species of a scene, in its order. Raises SceneError with every fault."""
     found, faults = [], []
     for k, entry in enumerate(scene.molecules):
         try:
@@ -53,7 +53,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
 
 
 def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
-    """Geometry from the file, everything else from the scene's sites and the table, by atom name or else by element."""
+    """Sites: positions from the file, parameters from the scene or the table, by atom name or else by element."""
     path = scene.path(settled(entry.file))
     own = entry.sites or ()
     faults = []
@@ -80,7 +80,7 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site,
 def frozen_apart(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
 ) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
-    """Species, index (n,) into them, which are frozen, and faults. A species that is frozen in part becomes two."""
+    """Species, index (n,) into them, which of them are frozen, and faults. A partly frozen species becomes two."""
     species, index, faults = list(species), index.copy(), []
     frozen = [entry.frozen is True for entry in scene.molecules]
     for k, entry in enumerate(scene.molecules):

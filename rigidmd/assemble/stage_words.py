@@ -3,7 +3,7 @@
 from rigidmd.scene.stage import COMPRESSIBILITY, Stage
 from rigidmd.units import FEMTOSECOND
 
-#: Compressibilities (1/bar) of matter: diamond, a gas at 0.01 bar.
+#: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
 STIFFEST, SOFTEST = 2e-7, 100.0
 
 
@@ -71,7 +71,7 @@ def _sampled(stage: Stage) -> str:
 
 
 def _conserved(stage: Stage) -> str:
-    """What the step leaves as it is, up to its error."""
+    """The conserved quantities, up to the error of the step."""
     kept = {
         "nve": "energy",
         "nph": "enthalpy with the energy of the piston",
@@ -82,7 +82,7 @@ def _conserved(stage: Stage) -> str:
 
 
 def stage_notes(stages: tuple[Stage, ...]) -> list[str]:
-    """What whoever runs these stages should know."""
+    """Notes on these stages."""
     return [
         f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is that of no matter (diamond has "
         f"{STIFFEST:g}, water {COMPRESSIBILITY:g}, a gas at 1 bar 1): is it in another unit? The box will "

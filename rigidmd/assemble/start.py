@@ -1,4 +1,4 @@
-"""The start of a scene of molecules: where they are, and their momenta."""
+"""The start of a scene of molecules: positions, orientations and momenta."""
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rigidmd.validation import settled
 
 
 def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
+    """Positions and orientations from the structure file, or else on a lattice. Raises SceneError, StructureError."""
     if scene.structure is not None:
         path = scene.path(scene.structure.file)
         start = scene.structure
@@ -62,7 +63,7 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
 
 
 def residue_numbers(arrangement: Arrangement) -> np.ndarray:
-    """Numbers (n,) of residues, or else 1, 2, ... among the molecules of each species."""
+    """Residue numbers (n,) of the file, or else 1, 2, ... within each species."""
     if arrangement.number is not None:
         return arrangement.number
     found = np.zeros(len(arrangement.species), int)
@@ -73,7 +74,7 @@ def residue_numbers(arrangement: Arrangement) -> np.ndarray:
 
 
 def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: Arrangement) -> list[str]:
-    """Give a state its momenta, in place: those of the structure file, or drawn at a temperature. Returns notes."""
+    """Set the momenta of a state, in place: from the structure file, or drawn at a temperature. Returns notes."""
     if scene.structure is not None and scene.structure.velocities:
         state.velocity[:] = arrangement.velocity
         state.angular_momentum_body[:] = settled(arrangement.angular_momentum_body)[: len(state.angular_momentum_body)]

@@ -1,4 +1,4 @@
-"""A start from a structure file: its atoms as the scene's molecules, in the scene's box."""
+"""A start from a structure file: atoms become the scene's molecules, in the scene's box."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -25,16 +25,16 @@ from rigidmd.forces.waves.vectors import AS_GIVEN
 from rigidmd.molecules import Molecule
 from rigidmd.validation import meant, settled
 
-MOST_NAMED = 5  # how many molecules a message names before it only counts
-ROUNDING = 1e-12  # of the longest edge: what turning a cell leaves
-SAME_BOX = 1e-4  # boxes of file and scene that differ by less, relatively, are the same as printed
-#: Units in which files are given by mistake, in Å.
+MOST_NAMED = 5  # molecules that a message names; of more it gives the number
+ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge
+SAME_BOX = 1e-4  # relative difference between boxes of file and scene that printing explains
+#: Units (Å) in which coordinates are sometimes given by mistake.
 OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
-CLOSE = 1.2  # how well distances between atoms agree with bonds of the templates, as a factor
+CLOSE = 1.2  # factor by which nearest distances may differ from the bonds of the templates
 
 
 class Arrangement(NamedTuple):
-    """Where molecules are and how they move, as a file says."""
+    """Positions, orientations and momenta of molecules at the start."""
 
     species: np.ndarray  # (n,) index into the scene's molecules
     position: np.ndarray  # (n, 3) Å
@@ -42,11 +42,11 @@ class Arrangement(NamedTuple):
     velocity: np.ndarray | None  # (n, 3) Å/ps
     angular_momentum_body: np.ndarray | None  # (n, 3) u Å²/ps
     cell: np.ndarray | None  # (3, 3), rows a along x, b in xy, c; Å
-    residual_rms: float  # Å, of all atoms against their templates
+    residual_rms: float  # Å, distances of atoms from their templates
     residual_max: float  # Å
-    number: np.ndarray | None = None  # (n,) of residues, where these are the molecules and have one
-    notes: tuple[str, ...] = ()  # what was made of the file beyond reading it
-    basis: np.ndarray = AS_GIVEN  # (3, 3) integers: the edges of the cell in those of the cell that was described
+    number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
+    notes: tuple[str, ...] = ()  # how the file was interpreted
+    basis: np.ndarray = AS_GIVEN  # (3, 3) integers: edges of the cell in terms of the described cell
 
 
 def read_structure(
@@ -88,9 +88,9 @@ def read_structure(
 
 
 def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
-    """The same crystal or liquid by a cell that leans little; turned, if that makes room for a longer cut-off.
+    """The same crystal or liquid in a cell with small tilts; rotated, if that allows a longer cut-off.
 
-    whose : the lattice, in words
+    whose : owner of the lattice, for the note
     """
     if found.cell is None:
         return found
@@ -115,7 +115,7 @@ def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
 
 
 def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
-    """The cell and its molecules beside one another, `repeat` times along each edge."""
+    """The cell and its molecules, repeated along each edge."""
     cell = settled(found.cell)
     shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
 
@@ -182,7 +182,7 @@ def _read_molecules(
 
 
 def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
-    """Refuse names of atom types that are in no molecule of the scene."""
+    """Raise StructureError for atom types named like no site or element of the scene."""
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
     faults = [
         f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
@@ -195,7 +195,7 @@ def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]
 
 
 def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """Which atoms of a file with masses weigh what no site of the scene does."""
+    """Faults: atoms of the file whose mass is that of no site of the scene."""
     if atoms.masses is None:
         return []
     masses = np.unique([mass for m in species for mass in m.masses[massive(m)]])
@@ -214,7 +214,7 @@ def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> list[str]:
-    """A note where atoms weigh other than the sites that they became."""
+    """A note if masses of the file differ from those of the sites."""
     if atoms.masses is None:
         return []
     other = {}
@@ -230,14 +230,14 @@ def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> li
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
-    """Refuse a start without a box."""
+    """Raise StructureError for a start without a box."""
     if cell is None:
         told = f" ({'; '.join(notes)})" if notes else ""
         raise StructureError(str(path), [f"has no box{told}: give [box] lengths_A, or periodic = false"])
 
 
 def _massless(matched: Matched, species: list[Molecule]) -> list[str]:
-    """What became of sites without mass, which are where the template has them, whatever the file says."""
+    """Notes on massless sites, which are placed by the template whatever the file says."""
     lacking = [len(molecule.masses) - len(massive(molecule)) for molecule in species]
     expected = int(np.array(lacking)[matched.species].sum())
     there = sum(matched.massless.values())
@@ -250,9 +250,9 @@ def _massless(matched: Matched, species: list[Molecule]) -> list[str]:
 
 
 def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: list[str]):
-    """Velocities (n, 3) and body angular momenta (n, 3) with the linear and angular momentum of the atoms', or None.
+    """Velocities (n, 3) and body angular momenta (n, 3) with the momenta of the atoms, or None.
 
-    Of linear bodies and points only what they have inertia for.
+    About axes without inertia (linear bodies, points) the angular momentum is 0.
     """
     if atoms.velocity is None:
         return None, None
@@ -278,7 +278,7 @@ def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: lis
 
 
 def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """A guess at the units, where atoms are as close to one another as those of molecules in other units than Å."""
+    """A guess at the units, if nearest distances match the bonds of the molecules in another unit than Å."""
     from scipy.spatial import KDTree
     from scipy.spatial.distance import pdist
 
@@ -295,7 +295,7 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
-    """The final state of an earlier run; every bit of it."""
+    """The final state of an earlier run, bit for bit."""
     saved = read_state(path)
     known = [molecule.name for molecule in species]
     if missing := [name for name in saved.names if name not in known]:

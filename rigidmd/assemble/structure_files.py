@@ -1,4 +1,4 @@
-"""The atoms of a structure file of any format: by ASE, or by a reader of our own where ASE falls short."""
+"""The atoms of a structure file of any format, read through ASE or by our own readers."""
 
 from collections.abc import Callable
 from functools import partial
@@ -45,7 +45,7 @@ def read_atoms(path: Path, frame: int | None = None, atom_types: dict[str, str] 
 
 
 def _without_placeholder(atoms: Atoms) -> Atoms:
-    """Without a cell that has no volume, or the cube of 1 Å that stands for none in .pdb and .cssr."""
+    """The atoms without a cell of no volume, or the cube of 1 Å that means no cell in .pdb and .cssr."""
     if atoms.cell is None:
         return atoms
     longest = np.linalg.norm(atoms.cell, axis=1).max()
@@ -92,10 +92,10 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
 
 
 def _frames(path: Path, atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    """The structures of a file, each ready to be read."""
+    """One function for each structure of a file, which reads it."""
     suffix = path.suffix.lower()
     if suffix not in READERS and suffix not in LAMMPS_DATA:
         return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, path)]
-    # Titles are in any encoding; what matters is ASCII.
+    # Titles may be in any encoding; all data are ASCII.
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     return read_lammps(path, lines, atom_types) if suffix in LAMMPS_DATA else READERS[suffix](path, lines)

@@ -1,4 +1,4 @@
-"""A scene becomes what runs: species, space, start, terms. Everything that can be wrong with that is said at once."""
+"""The system of a scene of molecules: species, model, start, terms. Faults are collected and raised together."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ from rigidmd.units import GRAM_PER_CM3
 
 
 class Sites(NamedTuple):
-    """Every site of every molecule, for the edges: output and analysis."""
+    """Every site of every molecule, for output and analysis."""
 
     molecule: np.ndarray  # (s,)
     offset_body: np.ndarray  # (s, 3)
@@ -40,20 +40,20 @@ class Sites(NamedTuple):
 
 @dataclass(frozen=True)
 class System:
-    """What a scene becomes. `state` is the start; nothing here changes during a run."""
+    """The system that a scene describes. `state` is the start; nothing here changes during a run."""
 
-    scene: MolecularScene  # with all of its numbers, see `resolve`
+    scene: MolecularScene  # resolved: every default is filled in
     species: list[Molecule]
     model: Model
     space: Space
     state: State
     terms: dict[str, NamedTuple]
     freedom: Freedom
-    constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
-    constant_pressure: float  # u/(Å ps²), that no motion changes
-    tail: Tail | None  # what is missing beyond the cut-off, where it is asked for
+    constants: dict[str, float]  # constant energies, u Å²/ps²
+    constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
+    tail: Tail | None  # the tail correction, where the scene asks for it
     sites: Sites
-    residue_number: np.ndarray  # (n,) by which a scene may pick molecules: see Molecules.frozen
+    residue_number: np.ndarray  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
     from_lattice: bool
     left_out: list[str]
     force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
@@ -71,14 +71,14 @@ class System:
 
     @property
     def external(self) -> list[str]:
-        """Names of the terms that act from outside, and so may change the total momentum."""
+        """Names of the terms of external fields, which may change the total momentum."""
         return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
 
     @property
     def tied_to_places(self) -> list[str]:
-        """Names of the terms whose energy depends on where in the lab molecules are: none can follow a box that
-        changes its size. A field on molecules without a net charge is not among them."""
-        return [name for name in self.external if self.terms[name].tied_to_places]
+        """Names of the terms whose energy depends on positions in the lab, which exclude a barostat. A field on
+        molecules without a net charge is not among them."""
+        return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
 
     @property
     def removes_momentum_every(self) -> float | None:
@@ -98,22 +98,22 @@ class System:
         return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
 
     def saved(self, state: State) -> Saved:
-        """A state with what a file of it says besides. Species that are there twice, frozen and free, are one there."""
+        """A state with the names and numbers that its file holds, where frozen and free molecules are one species."""
         names = list(dict.fromkeys(m.name for m in self.species))
         index = np.array([names.index(m.name) for m in self.species])
         return Saved(state, names, index[self.model.species], self.residue_number)
 
     @property
     def residue_names(self) -> np.ndarray:
-        """What each molecule (n,) is called in topology files."""
+        """Residue name of each molecule (n,) in topology files."""
         return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
 
     def engine(self) -> Engine:
-        """A new engine for it, in the precision of the scene."""
+        """A new engine for this system, in the precision of the scene."""
         return Engine(self.model, self.terms, self.scene.precision, self.scene.forces.skin_A)
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
-        """What `of` gives for the sites of a molecule, for all sites (s,)."""
+        """Values for all sites (s,), from `of`, which gives those of one molecule."""
         values = [of(m) for m in self.species]
         return np.concatenate([values[k] for k in self.model.species])
 

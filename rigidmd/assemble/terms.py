@@ -1,4 +1,4 @@
-"""The forces of a scene of molecules become terms, constants and what is beyond the cut-off."""
+"""The interactions of a resolved scene: terms, constants, tail correction."""
 
 from math import inf
 from typing import NamedTuple
@@ -20,30 +20,30 @@ from rigidmd.units import KJ_PER_MOL
 
 
 class Interactions(NamedTuple):
-    """What acts between molecules."""
+    """The interactions between molecules."""
 
     terms: dict[str, NamedTuple]
-    constants: dict[str, float]  # energies (u Å²/ps²) that no motion changes
-    pressure: float = 0.0  # u/(Å ps²), that no motion changes
-    tail: Tail | None = None  # what is missing beyond the cut-off, where it is asked for
+    constants: dict[str, float]  # constant energies, u Å²/ps²
+    pressure: float = 0.0  # a constant part of the pressure, u/(Å ps²)
+    tail: Tail | None = None  # where the scene asks for it
     force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: tuple[str, ...] = ()
 
 
 def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
-    """Sites of a law: chosen[k] lists the sites of species k that take part."""
+    """Sites of a law: chosen[k] lists the sites of species k that have it."""
     return sites_of(index, [m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
 
 
 def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
-    """Sites (s,) by what they do not act on: their own molecule, and frozen ones on all that is frozen."""
+    """Group of each site (s,); sites of one group do not interact. A molecule is one; all frozen molecules are one."""
     if not frozen.any():
         return sites.molecule
     return np.where(frozen[sites.molecule], len(frozen), sites.molecule).astype(np.int32)
 
 
 def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
-    """For each species (pairs, 2, sites): whether an entry of forces.pairs means the site by its first, second name.
+    """For each species (pairs, 2, sites): whether the first or second name of an entry of forces.pairs means the site.
 
     Raises SceneError.
     """
@@ -75,7 +75,7 @@ def interactions(
     basis: np.ndarray,
     pme_grid: tuple[int, int, int] | None,
 ) -> Interactions:
-    """What acts between the molecules of a resolved scene. Raises SceneError.
+    """The interactions of a resolved scene. Raises SceneError.
 
     basis, pme_grid : see `electrostatics`
     """
@@ -132,7 +132,7 @@ def _lennard_jones(
 
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
-    """What is not compiled, and why."""
+    """What is not compiled for this scene, and why."""
     out = []
     if "lennard_jones" not in terms:
         out.append("Lennard-Jones: no site has it")
