@@ -61,7 +61,7 @@ def test_shipped_scenes_are_valid(path):
         (WATER, '"spce"', '"SPC/E"', "$.molecules[0].model", "'SPC/E' is not one of"),
         (WATER, "count = 20", "count = 2.5", "$.molecules[0].count", "2.5 is not of type 'integer'"),
         (WATER, "duration_ps = 1", 'duration_ps = "1"', "$.stages[0].duration_ps", "'1' is not of type 'number'"),
-        (WATER, "duration_ps = 1", "", "$.stages[0]", "'duration_ps' is a required property"),
+        (TOP, "duration_s = 1.0", "", "$.run", "'duration_s' is a required property"),
         (WATER, "= 300", '= "warm"', "$.start.temperature_K", "'warm' is not of type 'number'"),
         (WATER, "[start]", "[strat]", "$", "'strat' was unexpected"),
         (WATER, "[[molecules]]", "[molecules]", "$.molecules", "is not of type 'array'"),

@@ -8,7 +8,6 @@ import numpy as np
 from rigidmd.assemble.cells import pairs_within
 from rigidmd.assemble.momenta import mobile
 from rigidmd.core.state import State
-from rigidmd.forces.pairs.space import cell_of
 
 if TYPE_CHECKING:
     from rigidmd.assemble.system import System
@@ -38,7 +37,7 @@ def overlaps(system: "System") -> list[str]:
 
 def close_pairs(system: "System", state: State, radius: float) -> list[tuple[int, int, float]]:
     """Sites (i, j) of different molecules, not both frozen, within `radius` of each other, and their distances, Å."""
-    cell = cell_of(system.space) if system.space.volume < inf else None
+    cell = state.cell if state.volume < inf else None
     i, j, distance = pairs_within(system.site_positions(state), cell, radius)
     a, b, free = system.sites.molecule[i], system.sites.molecule[j], mobile(system.model)
     kept = (a != b) & (free[a] | free[b])

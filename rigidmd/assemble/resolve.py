@@ -90,7 +90,9 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
     }
     reads_velocities = scene.structure is not None and scene.structure.velocities
     if scene.start.temperature_K is None and not reads_velocities:
-        tables["start"] = scene.start.model_copy(update={"temperature_K": scene.stages[0].temperatures[0]})
+        first = scene.first_moving
+        temperature = first.temperatures[0] if first else 0.0
+        tables["start"] = scene.start.model_copy(update={"temperature_K": temperature})
     return Resolved(scene.model_copy(update=tables), faults, grid)
 
 

@@ -8,7 +8,10 @@ STIFFEST, SOFTEST = 2e-7, 100.0
 
 
 def stage_in_words(stage: Stage) -> list[str]:
-    """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved."""
+    """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved. Or what is minimised, and
+    when that has converged."""
+    if stage.is_minimisation:
+        return _minimisation(stage)
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
     text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
     if stage.is_open:
@@ -23,6 +26,18 @@ def stage_in_words(stage: Stage) -> list[str]:
     return [text, f"samples {_sampled(stage)}; conserves {_conserved(stage)}"]
 
 
+def _minimisation(stage: Stage) -> list[str]:
+    what, limits = "the potential energy", [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]
+    limits.append(f"torques of {stage.torque_limit_kJ_mol:g} kJ/mol")
+    if stage.changes_box:
+        what = f"the enthalpy at {_pressure(stage)} bar, the cell {stage.pressure_coupling.replace('_', '-')}"
+        limits.append(f"a pressure within {stage.pressure_limit_bar:g} bar")
+    return [
+        f"{stage.label}: to the nearest minimum of {what}; no time passes and momenta stay",
+        f"ends at {', '.join(limits[:-1])} and {limits[-1]}, or after {stage.most_iterations} iterations",
+    ]
+
+
 def _thermostat(stage: Stage) -> str:
     text = f"{_ramp(stage.temperatures)} K by {stage.thermostat_kind.replace('_', ' ')}"
     if stage.thermostat_kind != "langevin":
@@ -34,13 +49,8 @@ def _thermostat(stage: Stage) -> str:
 
 
 def _barostat(stage: Stage) -> str:
-    first, last = stage.pressures
-    if len(set(first[:3])) == 1 and not any(first[3:]):
-        pressure = _ramp((first[0], last[0]))
-    else:
-        pressure = ", ".join(f"{value:g}" for value in (first if any(first[3:]) else first[:3]))
     own = stage.barostat_kind.replace("_", " ") or "a piston"
-    text = f"{pressure} bar by {own}, {stage.pressure_coupling.replace('_', '-')}"
+    text = f"{_pressure(stage)} bar by {own}, {stage.pressure_coupling.replace('_', '-')}"
     if stage.barostat_kind != "monte_carlo":
         text += f", {stage.barostat_time:g} ps"
     if stage.barostat_kind:
@@ -48,6 +58,13 @@ def _barostat(stage: Stage) -> str:
         text += f", a move every {every} steps" if every > 1 else ", a move every step"
     water = ", that of water" if stage.compressibility == COMPRESSIBILITY else ""
     return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
+
+
+def _pressure(stage: Stage) -> str:
+    first, last = stage.pressures
+    if len(set(first[:3])) == 1 and not any(first[3:]):
+        return _ramp((first[0], last[0]))
+    return ", ".join(f"{value:g}" for value in (first if any(first[3:]) else first[:3]))
 
 
 def _ramp(ends: tuple[float, float]) -> str:

@@ -190,7 +190,9 @@ def build(scene: MolecularScene) -> System:
         )
         system.notes.extend(f"{scene.structure.file}: {note}" for note in arrangement.notes)
         if faults := overlaps(system):
-            raise StructureError(str(scene.path(scene.structure.file)), faults)
+            if not scene.stages[0].is_minimisation:
+                raise StructureError(str(scene.path(scene.structure.file)), faults)
+            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation has to move them apart")
     else:
         system.notes.extend(f"box: {note}" for note in arrangement.notes)
     return system

@@ -39,7 +39,9 @@ class Sample(NamedTuple):
     beta: Annotated[float, Column("beta (deg)", "°", "angle between c and a")]
     gamma: Annotated[float, Column("gamma (deg)", "°", "angle between a and b")]
     heat: Annotated[float, Column("Heat (kJ/mole)", "kJ/mol", "what thermostats have put in since the start")]
-    work: Annotated[float, Column("Work (kJ/mole)", "kJ/mol", "what boxes and drives have put in since the start")]
+    work: Annotated[
+        float, Column("Work (kJ/mole)", "kJ/mol", "what boxes, drives and minimisations have put in since the start")
+    ]
     pressure_xx: Annotated[float, Column("Pressure xx (bar)", "bar", "molecular pressure tensor, symmetric part")]
     pressure_yy: Annotated[float, Column("Pressure yy (bar)", "bar", "the same, yy")]
     pressure_zz: Annotated[float, Column("Pressure zz (bar)", "bar", "the same, zz")]

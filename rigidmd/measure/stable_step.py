@@ -124,7 +124,7 @@ def long_steps(scene: MolecularScene) -> list[str]:
     temperature = scene.start.temperature_K
     for k, stage in enumerate(scene.stages):
         temperature = max(stage.temperatures) or temperature
-        if stage.is_open or not (species and temperature and scene.watch.stable_step):
+        if stage.is_open or stage.is_minimisation or not (species and temperature and scene.watch.stable_step):
             continue
         swings = [swing for m in species for swing in _swings(m, BOLTZMANN * temperature)]
         shortest = min(swings, key=lambda swing: swing.time)

@@ -12,9 +12,18 @@ from numpy.typing import ArrayLike
 from rigidmd.assemble.system import System
 from rigidmd.core.state import TAKEN, State
 from rigidmd.measure.drift import inefficiency, slope
+from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
+#: Figures of a stage that are those of motion: nothing of a minimisation.
+OF_MOTION = (
+    "integrator", "timestep_fs", "steps_per_s", "ns_per_day", "temperature_K", "temperature_error_K",
+    "temperature_translation_K", "temperature_rotation_K", "temperature_translation_unbiased_K",
+    "temperature_rotation_unbiased_K", "pressure_error_bar", "drift_kJ_mol_ns_per_molecule",
+    "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
+    "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
+)  # fmt: skip
 #: Largest share of the translational temperature in a common drift of all molecules without a note.
 SHOWS = 1e-4
 
@@ -32,6 +41,7 @@ def summarise(
     choices: dict[int, str],
     stable: dict[int, float],
     moves: dict[int, tuple[int, int]],
+    minima: dict[int, Minimum],
     warnings: list[str],
 ) -> dict:
     """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
@@ -39,11 +49,16 @@ def summarise(
     choices : choice and reason for stages that left their integrator open
     stable : the longest stable step (ps) of stages, as estimated at their start
     moves : of stages with a box that moves, how many moves were tried and accepted
+    minima : where the stages ended that are minimisations
     """
     scene = system.scene
     momentum = samples.rows[-1].momentum
     stages = [
-        _stage(system, samples.rows, k, computing[k], moves.get(k, (0, 0)))
+        (
+            _stage(system, samples.rows, k, computing[k], moves.get(k, (0, 0)))
+            if k not in minima
+            else _minimised(system, samples.rows, k, computing[k], minima[k])
+        )
         | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
         for k in range(len(computing))
         if any(sample.stage == k for sample in samples.rows)
@@ -158,6 +173,26 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float, move
         if spread
         else None,
         "energy_rms_kJ_mol_per_molecule": _known(line.rms / n),
+        "minimum": None,
+    }
+
+
+def _minimised(system: System, samples: list[Sample], k: int, computing: float, found: Minimum) -> dict:
+    """Figures of a stage that is a minimisation: those of its end. None for what only motion has."""
+    stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
+    end = [sample for sample in samples if sample.stage == k][-1:]
+    return dict.fromkeys(OF_MOTION) | {
+        "name": stage.label,
+        "ensemble": stage.ensemble,
+        "steps": 0,
+        "duration_ps": 0.0,
+        "computing_s": computing,
+        "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
+        "pressure_bar": figures["pressure_bar"],
+        **(_of_box(end) if stage.changes_box else {}),
+        "moves_tried": 0,
+        "moves_accepted": 0,
+        "minimum": figures,
     }
 
 

@@ -134,7 +134,9 @@ class StepCheck:
         self.thermal = thermal_energy(self._system, kinetic)
 
     def finding(self, state: State, load: Load, stage: Stage) -> Finding | None:
-        """What is wrong with the next step of a state in a stage; load : see `step_finding`."""
+        """What is wrong with the next step of a state in a stage, if it has steps; load : see `step_finding`."""
+        if stage.is_minimisation:
+            return None
         dt = stage.timestep_fs * FEMTOSECOND
         return step_finding(self._system, self._limits, state, load, stage.scheme, dt, self.thermal)
 
@@ -146,7 +148,8 @@ def axis_distances(molecule: Molecule) -> np.ndarray:
 
 
 def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) -> Finding | None:
-    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
+    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage; of one of
+    a minimisation only Q.
 
     The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
     energy at a thermostat's temperature if that is larger.
@@ -154,6 +157,8 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     if limits.orthogonality and not now.orthogonality <= limits.orthogonality:
         seen = f"|QᵀQ - 1| is {now.orthogonality:.2g} (watch.orthogonality = {limits.orthogonality:g})"
         return Finding(f"a matrix Q is no longer a rotation: {seen}", unturned=True)
+    if system.scene.stages[now.stage].is_minimisation:
+        return None
     grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
     if limits.volume and grown > limits.volume:
         seen = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"

@@ -1,6 +1,7 @@
 """Reports of a run: summary.json, the summary as text, and energy.png."""
 
 import json
+from collections.abc import Sequence
 from math import floor, log10
 from pathlib import Path
 
@@ -10,9 +11,11 @@ from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
 from rigidmd.output.figure import save_figure
+from rigidmd.scene.stage import Stage
 
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
+DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
     "wrapped": "molecules are wrapped into the box; displacements need unwrapped frames",
@@ -79,13 +82,35 @@ def body_summary_text(summary: dict) -> str:
 
 
 def _stage_title(stage: dict) -> str:
+    if found := stage["minimum"]:
+        ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
+        relief = f" and {found['relief_steps']} of relief" if found["relief_steps"] else ""
+        return f"{stage['name']}: {ended} after {found['iterations']} iterations{relief}; {stage['computing_s']:.1f} s"
     title = f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs, {stage['duration_ps']:g} ps"
     if stage["steps_per_s"]:
         title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:.3g} ns/day"
     return title
 
 
+def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
+    before, after = found["energy_before_kJ_mol_per_molecule"], found["energy_after_kJ_mol_per_molecule"]
+    rows = [("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after")]
+    torque = f", torque {found['largest_torque_kJ_mol']:.2g} kJ/mol"
+    rows.append(("largest force", f"{found['largest_force_kJ_mol_A']:.2g} kJ/(mol Å){torque}"))
+    if found["pressure_bar"] is not None:
+        off = found["largest_pressure_deviation_bar"]
+        more = "" if off is None else f"; at most {off:.2g} bar from the one asked for"
+        rows.append(("pressure", f"{found['pressure_bar']:.4g} bar of forces alone{more}"))
+    if stage.get("density_g_cm3") is not None:
+        rows.append(("density", f"{stage['density_g_cm3']:.4f} g/cm³"))
+        edges = (f"{edge} {stage[f'{edge}_A']:.4f}" for edge in "abc")
+        rows.append(("box", f"{', '.join(edges)} Å"))
+    return rows
+
+
 def _stage_rows(stage: dict) -> list[tuple[str, str]]:
+    if stage["minimum"]:
+        return _minimum_rows(stage, stage["minimum"])
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     if stage["temperature_K"] is not None:
         parts = _temperatures(stage, "K")
@@ -133,36 +158,43 @@ def signed(value: float, error: float) -> str:
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
+def drawn(stages: Sequence[Stage], samples: Samples) -> np.ndarray:
+    """Which samples (n,) are drawn: a minimisation is one moment, and may begin at any energy."""
+    return np.array([not stages[k].is_minimisation for k in samples["stage"]], bool)
+
+
 def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> None:
     """energy.png: the drift of the last stage on its own scale; energies and temperatures of the whole run."""
     from matplotlib.figure import Figure
 
     stages = system.scene.stages
     n = len(system.model.species)
-    time, stage = samples["time"], samples["stage"]
+    shown = drawn(stages, samples)
+    column = {name: samples[name][shown] for name in DRAWN}
+    time, stage = column["time"], samples["stage"][shown]
     figure = Figure(figsize=(8, 7), layout="constrained")
     drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
     own = stage == stage[-1]
-    drift.plot(time[own], samples["drift"][own] / n, color=COOL, lw=0.9)
-    last = summary["stages"][-1]
+    drift.plot(time[own], column["drift"][own] / n, color=COOL, lw=0.9)
+    last = summary["stages"][stage[-1]]
     if own.sum() > 2 and last["drift_kJ_mol_ns_per_molecule"] is not None:
         gradient, error = last["drift_kJ_mol_ns_per_molecule"], last["drift_error_kJ_mol_ns_per_molecule"]
-        fitted = (samples["drift"][own] / n).mean() + gradient / 1000 * (time[own] - time[own].mean())
+        fitted = (column["drift"][own] / n).mean() + gradient / 1000 * (time[own] - time[own].mean())
         drift.plot(time[own], fitted, color=WARM, lw=1.4)
         drift.set_title(
             f"{last['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
     drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
-    parts.plot(time, (samples["potential"] - samples["potential"][-1]) / n, color=COOL, lw=0.9, label="potential")
-    parts.plot(time, (samples["kinetic"] - samples["kinetic"][-1]) / n, color=WARM, lw=0.9, label="kinetic")
+    parts.plot(time, (column["potential"] - column["potential"][-1]) / n, color=COOL, lw=0.9, label="potential")
+    parts.plot(time, (column["kinetic"] - column["kinetic"][-1]) / n, color=WARM, lw=0.9, label="kinetic")
     parts.set_ylabel("less its last value\n(kJ/mol per molecule)")
-    for column, color, label in (
+    for name, color, label in (
         ("temperature_translation", COOL, "translation"),
         ("temperature_rotation", WARM, "rotation"),
     ):
-        if np.isfinite(samples[column]).all():
-            temperature.plot(time, samples[column], color=color, lw=0.9, label=label)
+        if np.isfinite(column[name]).all():
+            temperature.plot(time, column[name], color=color, lw=0.9, label=label)
     temperature.set_ylabel("temperature (K)")
     temperature.set_xlabel("time (ps)")
     for axis in (drift, parts, temperature):

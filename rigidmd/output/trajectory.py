@@ -95,7 +95,7 @@ def _checked(times: list[float]) -> list[float]:
     gaps = np.diff(times)
     if len(gaps) and np.ptp(gaps) > EVEN * gaps.max():
         warnings.warn(
-            f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps): dt is that of the first two; "
+            f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps): dt is the first that is not 0; "
             "use the time of each frame (ts.time)",
             stacklevel=4,
         )
@@ -107,6 +107,8 @@ class _Timed(ProtoReader):
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
+        # two frames at one time: before and after a minimisation
+        self._dt = float(next((gap for gap in np.diff(times) if gap > 0), 0.0))
         super().__init__(*source, **options | {"times": times})  # readers give all their options to copies
         self._timed(self.ts)
 
@@ -117,7 +119,7 @@ class _Timed(ProtoReader):
 
     def _timed(self, frame):
         frame.time = self._times[frame.frame]
-        frame.dt = self._times[1] - self._times[0] if len(self._times) > 1 else 0.0
+        frame.dt = self._dt
         return frame
 
     def _read_frame(self, i):

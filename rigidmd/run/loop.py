@@ -49,12 +49,13 @@ def _as_warning(sentence: str) -> None:
 
 
 class Stretch(NamedTuple):
-    """A stretch of equal steps."""
+    """A stretch of equal steps, or what is done in no time."""
 
     row: Scheme | Solver
     dt: float  # ps, or s for a single body
     steps: int
     counted: int = 0  # steps before it from which observers count their intervals
+    act: Callable[[bool | None], None] | None = None  # done before its steps; told whether to show progress
 
 
 class Costs(NamedTuple):
@@ -218,7 +219,7 @@ class Simulation(Base):
 
     @abstractmethod
     def _durations(self) -> list[float]:
-        """Durations of the stretches, ps or s."""
+        """Durations of the stretches, ps or s; 0 of those without steps."""
 
     @abstractmethod
     def _enter(self, k: int) -> Stretch:
@@ -272,7 +273,8 @@ class Simulation(Base):
         durations = self._durations()
         self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
         time = 0.0  # of whole stretches
-        with progress_of(sum(durations), self.time_unit, progress) as advanced:
+        whole = sum(durations)
+        with progress_of(whole, self.time_unit, progress if whole > 0 else False) as advanced:
             for k in range(len(durations)):
                 self.stretch = stretch = self._enter(k)
                 first = int(self.state.step[NOW])
@@ -280,6 +282,12 @@ class Simulation(Base):
                     self._show(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
                 every = [self._every(observer, stretch.dt) for observer in observers]
                 seconds, done, shown = 0.0, 0, True
+                if stretch.act is not None:
+                    began = clock.perf_counter()
+                    stretch.act(progress)
+                    seconds = clock.perf_counter() - began
+                    due = [observer.interval is not None or observer.ends for observer in observers]
+                    self._show(observers, Moment(self, first, time, k), due)
                 while done < stretch.steps and not self._interrupted:
                     counts = [self._counted(observer, stretch) + done for observer in observers]
                     ahead = [n - count % n for count, n in zip(counts, every, strict=True) if n]

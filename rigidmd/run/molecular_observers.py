@@ -1,5 +1,6 @@
 """Observers of molecules: samples with their checks and log, the final state, a figure."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from rigidmd.core.state import State
@@ -8,9 +9,10 @@ from rigidmd.measure import watch
 from rigidmd.measure.samples import Samples
 from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.output.log import Log
-from rigidmd.output.report import draw_energy
+from rigidmd.output.report import draw_energy, drawn
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
+from rigidmd.scene.stage import Stage
 
 if TYPE_CHECKING:
     from rigidmd.run.molecules import MolecularSimulation
@@ -136,6 +138,9 @@ class FinalState(Observer):
 class EnergyFigure(Observer):
     """energy.png: drift, energies and temperatures."""
 
+    def __init__(self, stages: Sequence[Stage]):
+        self._stages = stages
+
     def files(self) -> list[str]:
         """One."""
         return [ENERGY]
@@ -143,6 +148,6 @@ class EnergyFigure(Observer):
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
         """Draw it if there are at least two samples."""
         samples = results.samples
-        if isinstance(samples, Samples) and len(samples) > 1:
+        if isinstance(samples, Samples) and int(drawn(self._stages, samples).sum()) > 1:
             draw_energy(run.path(ENERGY), run.system, samples, results.summary)
             results.files.append(run.path(ENERGY))

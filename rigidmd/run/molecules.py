@@ -18,14 +18,17 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.meanings import meanings
+from rigidmd.measure.minimum import Minimum, minimum_in_words
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.subjects import choose_for_molecules
 from rigidmd.measure.summary import summarise
+from rigidmd.output.progress import progress_of
 from rigidmd.output.report import summary_text
 from rigidmd.output.scene_file import input_names, write_scene
 from rigidmd.run.loop import Costs, Options, Simulation, Stretch
+from rigidmd.run.minimise import minimise
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, Sampler, StepWatch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
@@ -83,7 +86,7 @@ class MolecularSimulation(Simulation):
             )
         first = self.scene.stages[0]
         relief = None
-        if self.system.from_lattice:
+        if self.system.from_lattice and not first.is_minimisation:
             radius = np.array([m.radius for m in self.system.species])
             temperature = self.scene.start.temperature_K or 0.0
             # At 0 K the scale is the deepest well between two sites.
@@ -102,8 +105,8 @@ class MolecularSimulation(Simulation):
                             "shorten timestep_fs of the first stage"
                         ],
                     )
-        for k in range(len(self.scene.stages)):
-            if not self.scene.stages[k].is_open:
+        for k, stage in enumerate(self.scene.stages):
+            if not (stage.is_open or stage.is_minimisation):
                 row = row_of_stage(self.system, k)
                 self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
         self.engine.forget()
@@ -111,16 +114,19 @@ class MolecularSimulation(Simulation):
         self._choices: dict[int, str] = {}
         self._stable: dict[int, float] = {}
         self._moves: dict[int, tuple[int, int]] = {}
+        self._minima: dict[int, Minimum] = {}
         self._origins: dict[int, float] = {}
         self._stage = 0
         self._conserved: float | None = None
 
     def _durations(self) -> list[float]:
-        return [stage.duration_ps for stage in self.scene.stages]
+        return [stage.duration for stage in self.scene.stages]
 
     def _enter(self, k: int) -> Stretch:
         self._moves[self._stage] = self.engine.moves
         self._stage = k
+        if self.scene.stages[k].is_minimisation:
+            return self._enter_minimisation(k)
         if self.scene.stages[k].is_open:
             self._choose(k)
         self._estimate(k)
@@ -130,11 +136,32 @@ class MolecularSimulation(Simulation):
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
         self.state = self.engine.begin(self.state, row)
         self.state.begin_stretch()
-        if k > 0 and stage.keeps_momentum and not self.scene.stages[k - 1].keeps_momentum:
+        before = [other for other in self.scene.stages[:k] if not other.is_minimisation]
+        if before and stage.keeps_momentum and not before[-1].keeps_momentum:
             self.state.books[TAKEN] -= remove_momentum(self.system.model, self.state.velocity)
         if self._conserved is not None:
             self._origins[k] = self._conserved
         return Stretch(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
+
+    def _enter_minimisation(self, k: int) -> Stretch:
+        stage = self.scene.stages[k]
+        self.engine = self.system.engine()
+        self.state = self.engine.begin(self.state, stage.scheme)
+        self.state.begin_stretch()
+        if self._conserved is not None:
+            self._origins[k] = self._conserved
+        return Stretch(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
+
+    def _minimise(self, progress: bool | None) -> None:
+        """Go to the minimum of the present stage, with a warning where it is not reached."""
+        k = self._stage
+        stage = self.scene.stages[k]
+        with progress_of(stage.most_iterations, "iterations", progress) as advanced:
+            found = minimise(self.system, self.state, stage, lambda: self._interrupted, advanced)
+        self.engine.forget()
+        self._minima[k] = found
+        if not found.converged:
+            self.note(f"stages.{k}: {minimum_in_words(found, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
@@ -170,7 +197,8 @@ class MolecularSimulation(Simulation):
 
     def _look(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]
-        step = stage.timestep_fs * FEMTOSECOND if stage.integrator == "velocity_verlet" else nan
+        is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
+        step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
         return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage))
 
     def sample_of(self, moment: Moment) -> Sample:
@@ -178,7 +206,7 @@ class MolecularSimulation(Simulation):
         seen = moment.observation
         conserved = seen.energy - float(self.state.books.sum()) / KJ_PER_MOL
         self._conserved = conserved
-        volume = self.state.volume
+        volume, stage = self.state.volume, self.scene.stages[moment.stage]
         boxed = volume < np.inf
         cell, books = self.state.cell, self.state.books / KJ_PER_MOL
         edges = np.linalg.norm(cell, axis=1) if boxed else np.full(3, nan)
@@ -194,13 +222,13 @@ class MolecularSimulation(Simulation):
             temperature=seen.temperature,
             volume=volume * 1e-3 if boxed else nan,
             density=mass / volume / GRAM_PER_CM3 if boxed else nan,
-            stage_name=self.scene.stages[moment.stage].label,
+            stage_name=stage.label,
             temperature_translation=seen.temperature_translation,
             temperature_rotation=seen.temperature_rotation,
             temperature_translation_unbiased=seen.temperature_translation_unbiased,
             temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
             pressure_bar=seen.pressure_bar,
-            drift=conserved - self._origins.setdefault(moment.stage, conserved),
+            drift=nan if stage.is_minimisation else conserved - self._origins.setdefault(moment.stage, conserved),
             momentum=float(np.linalg.norm(seen.momentum)),
             orthogonality=seen.orthogonality,
             a=float(edges[0]),
@@ -235,7 +263,7 @@ class MolecularSimulation(Simulation):
         if self.folder is not None:
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
-            files += [EnergyFigure()] if output.figure else []
+            files += [EnergyFigure(self.scene.stages)] if output.figure else []
         return [*files, *observers]
 
     def _samples(self) -> Samples:
@@ -246,7 +274,7 @@ class MolecularSimulation(Simulation):
         self._moves[self._stage] = self.engine.moves
         return summarise(
             self.system, samples, self.state, relief_steps, self.threads, costs.preparing, costs.wall,
-            costs.computing, self._interrupted, self._choices, self._stable, self._moves, self.notes,
+            costs.computing, self._interrupted, self._choices, self._stable, self._moves, self._minima, self.notes,
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:

@@ -175,6 +175,6 @@ def field_faults(scene: "MolecularScene") -> list[str]:
             f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is less than two steps of stages.{k} "
             f"({stage.timestep_fs:g} fs), which cannot follow it"
             for k, stage in enumerate(scene.stages)
-            if not stage.is_open and period < 2 * stage.timestep_fs
+            if not (stage.is_open or stage.is_minimisation) and period < 2 * stage.timestep_fs
         ]
     return faults

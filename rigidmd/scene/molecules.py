@@ -106,8 +106,15 @@ class MolecularScene(Scene):
         """Species, their origin and stages."""
         species = ", ".join(f"{entry.count or ''} {entry.label}".strip() for entry in self.molecules)
         origin = "" if self.structure is None else f" of {self.structure.file}"
-        stages = ", ".join(f"{stage.label} {stage.duration_ps:g} ps" for stage in self.stages)
+        stages = ", ".join(
+            stage.label if stage.is_minimisation else f"{stage.label} {stage.duration:g} ps" for stage in self.stages
+        )
         return f"{self.name}: {species}{origin}; {stages}"
+
+    @property
+    def first_moving(self) -> Stage | None:
+        """The first stage in which time passes, if there is one."""
+        return next((stage for stage in self.stages if not stage.is_minimisation), None)
 
     @property
     def inputs(self) -> dict[str, Path]:
@@ -134,13 +141,16 @@ class MolecularScene(Scene):
             faults.append("box.density_g_cm3 and a structure file contradict each other: omit one")
         elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
             faults.append("structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false")
-        if self.start.temperature_K is None and self.stages[0].temperature_K is None:
+        first = self.first_moving
+        if self.start.temperature_K is None and first is not None and first.temperature_K is None:
             from_file = self.structure is not None and self.structure.velocities
             if not from_file:
-                faults.append("start.temperature_K is missing: the first stage is nve and no velocities are read")
+                which = "the first stage" if first is self.stages[0] else "the first stage in which time passes"
+                faults.append(f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read")
         if self.start.temperature_K is not None and self.structure is not None and self.structure.velocities:
             faults.append("start.temperature_K would do nothing: the velocities are read from the structure file")
-        if self.start.temperature_K == 0 and self.stages[0].thermostat_kind in ("velocity_rescaling", "nose_hoover"):
+        rescaled = first is not None and first.thermostat_kind in ("velocity_rescaling", "nose_hoover")
+        if self.start.temperature_K == 0 and rescaled:
             faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest")
         faults += self._barostat_faults()
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
@@ -162,9 +172,10 @@ class MolecularScene(Scene):
         """Faults of stages with a barostat."""
         faults = []
         for k, stage in enumerate(self.stages):
-            if not stage.has_barostat:
+            if not stage.changes_box:
                 continue
-            where = f"stages.{k}: {stage.ensemble} changes the box,"
+            given = " with pressure_bar" if stage.is_minimisation else ""
+            where = f"stages.{k}: {stage.ensemble}{given} changes the box,"
             if not self.box.periodic:
                 faults.append(f"{where} but box.periodic is false")
             if any(species.frozen for species in self.molecules):
@@ -182,6 +193,11 @@ class MolecularScene(Scene):
         wanted = self.output.trajectory_interval_ps
         faults = []
         for k, stage in enumerate(self.stages):
+            if stage.is_minimisation:
+                faults.append(
+                    f"output.trajectory: a .dcd file cannot hold two frames at one time (stages.{k}); use .xtc"
+                )
+                continue
             if stage.is_open:
                 faults.append(f"output.trajectory: a .dcd file cannot follow the step of stages.{k}; use .xtc")
                 continue

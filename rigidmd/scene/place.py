@@ -83,4 +83,4 @@ class Start(Section):
     """The start."""
 
     temperature_K: NonNegative | None = None
-    """Temperature of the momenta that are drawn; that of the first stage when not given"""
+    """Temperature of the momenta that are drawn; that of the first stage in which time passes when not given"""

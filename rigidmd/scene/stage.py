@@ -1,15 +1,15 @@
-"""Tables of a scene of molecules: stages, each with one ensemble and one time step."""
+"""Tables of a scene of molecules: stages, each with one ensemble and one time step, or a minimisation."""
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.schemes import AUTO, SCHEMES, WITH_BATH, Rotor, Scheme, auto_faults, rotor_fault
-from rigidmd.validation import Number, Positive, Section
+from rigidmd.validation import Count, Number, Positive, Section
 
 MOST_STEPS = 1e12
 
-Ensemble = Literal["nve", "nvt", "npt", "nph"]
+Ensemble = Literal["nve", "nvt", "npt", "nph", "minimise"]
 Thermostat = Literal["velocity_rescaling", "langevin", "nose_hoover", "andersen"]
 Barostat = Literal["cell_rescaling", "monte_carlo"]
 Coupling = Literal["isotropic", "semi_isotropic", "anisotropic", "flexible"]
@@ -25,20 +25,32 @@ MOVES_PER_TIME = 20
 #: Of water at 298 K and 1 bar, 1/bar.
 COMPRESSIBILITY = 4.5e-5
 
+#: Ensembles in which time passes.
+MOVING = {"nve", "nvt", "npt", "nph"}
+#: In USED, a minimisation in which the cell relaxes.
+CELL = "minimise with a cell"
 #: Ensembles, thermostats and barostats under which each key does something.
 USED = {
+    "duration_ps": MOVING,
+    "timestep_fs": MOVING,
+    "integrator": MOVING,
+    "rotor": MOVING,
     "temperature_K": {"nvt", "npt"},
     "thermostat": {"nvt", "npt"},
     "thermostat_time_ps": set(THERMOSTAT_TIMES),
     "friction_translation_per_ps": {"langevin"},
     "friction_rotation_per_ps": {"langevin"},
     "nose_hoover_links": {"nose_hoover"},
-    "pressure_bar": {"npt", "nph"},
-    "pressure_coupling": {"npt", "nph"},
+    "pressure_bar": {"npt", "nph", "minimise"},
+    "pressure_coupling": {"npt", "nph", CELL},
     "barostat": {"npt"},
     "barostat_time_ps": {"cell_rescaling", "nph"},
     "barostat_interval_ps": {"npt"},
     "compressibility_per_bar": {"npt", "nph"},
+    "force_limit_kJ_mol_A": {"minimise"},
+    "torque_limit_kJ_mol": {"minimise"},
+    "pressure_limit_bar": {CELL},
+    "most_iterations": {"minimise"},
 }
 
 #: Names from other programs -> advice.
@@ -59,9 +71,10 @@ class Stage(Section):
     """Name of the stage; default: that of the ensemble"""
     ensemble: Ensemble = "nve"
     """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and
-    pressure"""
-    duration_ps: Positive
-    """How long"""
+    pressure. minimise: no time passes; molecules move and turn to a minimum of the potential energy, or of the enthalpy
+    if pressure_bar is given, with the cell"""
+    duration_ps: Positive | None = Field(default=None, validate_default=True)
+    """How long; required except with minimise"""
     timestep_fs: Positive = 2.0
     """Time step"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
@@ -80,8 +93,8 @@ class Stage(Section):
     nose_hoover_links: Links = 3
     """Links of each Nose-Hoover chain"""
     pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
-    """Pressure of the barostat; two for a linear change over the stage, [1, 1000]; three for one along each
-    axis; six for the tensor xx, yy, zz, xy, xz, yz"""
+    """Pressure of the barostat, or at which minimise relaxes the cell; two for a linear change over the stage,
+    [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz, yz"""
     pressure_coupling: Coupling = "isotropic"
     """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z apart; anisotropic: three
     edges; flexible: edges and angles"""
@@ -103,6 +116,18 @@ class Stage(Section):
     """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten radians of libration"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; default: the one that the integrator needs"""
+    force_limit_kJ_mol_A: Positive = 0.1
+    """Of minimise: largest force on a molecule at convergence. Forces in a liquid are of the order of 10 kJ/mol/Å, and
+    force constants between 1 (argon) and 100 kJ/mol/Å² (hydrogen bonds): with 0.1 positions are good to 0.1 and 0.001 Å
+    and energies to 0.005 kJ/mol per molecule, 0.002 kT at 300 K"""
+    torque_limit_kJ_mol: Positive = 0.1
+    """Of minimise: largest torque on a molecule about a principal axis at convergence; for a molecule with a radius of
+    1 Å as strict as the default limit of forces"""
+    pressure_limit_bar: Positive = 1.0
+    """Of minimise with pressure_bar: largest deviation from it at convergence. At the compressibility of water 1 bar
+    changes the volume by 5e-5"""
+    most_iterations: Count = 5000
+    """Of minimise: it stops after so many, with a warning if it has not converged"""
 
     @model_validator(mode="before")
     @classmethod
@@ -123,6 +148,13 @@ class Stage(Section):
             raise ValueError(f"{REFUSED[asked]}. There are {', '.join((*Thermostat.__args__, *Barostat.__args__))}")
         return name
 
+    @field_validator("duration_ps")
+    @classmethod
+    def _lasts(cls, duration: float | None, others: ValidationInfo):
+        if duration is None and others.data.get("ensemble") != "minimise":
+            raise ValueError("is missing")
+        return duration
+
     @model_validator(mode="after")
     def _makes_sense(self):
         faults = []
@@ -132,9 +164,9 @@ class Stage(Section):
             faults.append(f"an {self.ensemble} stage needs pressure_bar")
         if idle := [key for key, where in USED.items() if self._is_given(key) and not where & self._parts]:
             faults.append(f"{', '.join(idle)} would do nothing {self._where(idle)}")
-        if self.integrator in WITH_BATH and not self.has_thermostat:
+        if self.integrator in WITH_BATH and not self.has_thermostat and not self.is_minimisation:
             faults.append(f"{self.integrator} contains a thermostat, but {self.ensemble} has none")
-        if self.has_barostat:
+        if self.changes_box:
             faults += self._pressure_faults()
         if fault := rotor_fault(self.integrator, self.rotor):
             faults.append(fault)
@@ -143,9 +175,9 @@ class Stage(Section):
         ]
         asked = {"energy_error_kT": self.energy_error_kT, "trajectory_error": self.trajectory_error}
         faults += auto_faults(self.integrator, asked, decided)
-        if not self.duration_ps * 1000 / self.timestep_fs < MOST_STEPS:
+        if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
             faults.append(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
-        if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
+        if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
             faults.append(f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs")
         if faults:
             raise ValueError("; ".join(faults))
@@ -156,13 +188,18 @@ class Stage(Section):
 
     @property
     def _parts(self) -> set[str]:
-        """Its ensemble, thermostat and barostat."""
-        return {self.ensemble, self.thermostat_kind, self.barostat_kind}
+        """Its ensemble, thermostat and barostat, and CELL where a minimisation relaxes the cell."""
+        cell = {CELL} if self.is_minimisation and self.changes_box else set()
+        return {self.ensemble, self.thermostat_kind, self.barostat_kind} | cell
 
     def _where(self, idle: list[str]) -> str:
         """With which settings keys would do nothing, in words."""
         known = [USED[key] for key in idle]
-        of_ensemble = any(where <= {"nvt", "npt", "nph"} for where in known) or not self.has_thermostat
+        if self.is_minimisation:
+            return "in a minimise stage" + (" without pressure_bar" if all(CELL in where for where in known) else "")
+        of_ensemble = (
+            any(where <= {"nvt", "npt", "nph", "minimise", CELL} for where in known) or not self.has_thermostat
+        )
         if of_ensemble:
             return f"in an {self.ensemble} stage"
         kinds = [kind for kind in (self.thermostat_kind, self.barostat_kind) if kind]
@@ -171,6 +208,8 @@ class Stage(Section):
     def _pressure_faults(self) -> list[str]:
         faults, given, coupling = [], self.pressure_bar, self.pressure_coupling
         several = len(given) if isinstance(given, tuple) else 1
+        if self.is_minimisation and several == 2:
+            faults.append("pressure_bar: a minimum has one pressure, not one that changes")
         if self.integrator == AUTO:
             faults.append("integrator = 'auto' is for constant volume: name an integrator for a stage with a pressure")
         apart = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
@@ -190,7 +229,17 @@ class Stage(Section):
     @property
     def steps(self) -> int:
         """Number of steps: the duration in steps, rounded."""
-        return round(self.duration_ps * 1000 / self.timestep_fs)
+        return round(self.duration * 1000 / self.timestep_fs)
+
+    @property
+    def duration(self) -> float:
+        """ps; 0 where no time passes."""
+        return self.duration_ps or 0.0
+
+    @property
+    def is_minimisation(self) -> bool:
+        """Whether it is a minimisation, in which no time passes."""
+        return self.ensemble == "minimise"
 
     @property
     def is_open(self) -> bool:
@@ -240,6 +289,11 @@ class Stage(Section):
     def has_barostat(self) -> bool:
         """Whether its pressure is kept."""
         return self.ensemble in ("npt", "nph")
+
+    @property
+    def changes_box(self) -> bool:
+        """Whether the cell changes: by a barostat, or in a minimisation with pressure_bar."""
+        return self.has_barostat or (self.is_minimisation and self.pressure_bar is not None)
 
     @property
     def thermostat_kind(self) -> str:

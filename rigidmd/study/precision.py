@@ -89,10 +89,14 @@ def _own(scene: MolecularScene | BodyScene) -> str:
 def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, float]:
     """The subject, and the scene's time step per force evaluation (fs)."""
     last = scene.stages[-1]
+    if last.is_minimisation:
+        raise SceneError(scene.source, ["the last stage is a minimisation: precision needs one in which time passes"])
     simulation = MolecularSimulation(scene)
     if len(scene.stages) > 1:
         quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 1e9})
-        earlier = MolecularSimulation(scene.model_copy(update={"stages": scene.stages[:-1], "output": quiet}))
+        earlier = MolecularSimulation(
+            simulation.scene.model_copy(update={"stages": simulation.scene.stages[:-1], "output": quiet})
+        )
         state = earlier.run().state
     else:
         simulation.start()

@@ -1,0 +1,217 @@
+"""Minimisation in the rigid degrees of freedom: from a state to the minimum of energy or enthalpy beside it."""
+
+from collections import deque
+from collections.abc import Callable
+from math import inf, isfinite
+
+import numpy as np
+
+from rigidmd.assemble.system import System
+from rigidmd.core.state import WORK, State
+from rigidmd.dynamics.boxes import LONGEST_DRIFT
+from rigidmd.errors import SimulationError
+from rigidmd.measure import watch
+from rigidmd.measure.minimum import Minimum
+from rigidmd.run.enthalpy import Enthalpy, Point
+from rigidmd.run.relief import LONGEST_MOVE, relieve
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BAR, KJ_PER_MOL
+
+#: Pairs of moves and changes of the gradient that curvature is known from.
+MEMORY = 20
+#: The first move goes so far, in the longest one; without curvature each is up to twice as long as the one before.
+FIRST_MOVE = 0.1
+#: A move is taken if it gains this part of what the slope at its begin promises (Nocedal & Wright 2006, 3.4), or, where
+#: the gain is lost in the rounding of the energy, if the slope has not turned up by more than (Hager & Zhang 2005, SIAM
+#: J. Optim. 16, 170) this part of it.
+PROMISED, TURNED = 1e-4, 0.8
+#: Rounding of an energy, as a part of it.
+ROUNDING = 1e-13
+#: Moves tried along a line, each at most half of the one before.
+TRIALS = 30
+#: What cannot be, a box too small for the cut-off, is reached where moves have to be shortened to this.
+CREEPING = 1e-3
+#: Forces beyond this many deepest wells over the smallest diameter are those of an overlap: 0.77 diameters of argon.
+OVERLAPPING = 1000.0
+#: Iterations between two looks for charges that have fallen on one another.
+LOOK = 100
+
+
+def minimise(
+    system: System,
+    state: State,
+    stage: Stage,
+    stop: Callable[[], bool] = lambda: False,
+    advanced: Callable[[float], object] = lambda iterations: None,
+) -> Minimum:
+    """Move a state, in place, to the minimum of energy or enthalpy that a stage asks for; momenta and time stay.
+
+    What the energy gains, mostly less than nothing, is booked as work. L-BFGS (Nocedal & Wright 2006, algorithm 7.5)
+    with moves of bounded length. A library's does not fit: turns are no vector space, so each iteration begins from the
+    present orientations; and a line search without a bound would let charges without a repulsion, such as the hydrogens
+    of water, through the walls about them. It has converged where forces, torques and pressure are within the limits of
+    the stage, whatever the energy does.
+
+    stop : asked before each iteration whether to leave it at that; advanced : told of each iteration
+
+    Raises SimulationError where the energy has no lower bound or is no finite number.
+    """
+    enthalpy = Enthalpy(system, stage, state)
+    point = start = enthalpy.at(state.copy())
+    if not start.is_finite:
+        raise SimulationError("energy or forces are no finite numbers: sites of different molecules coincide")
+    relief_steps = _relieve(system, enthalpy, point.state)
+    if relief_steps:
+        point = enthalpy.at(point.state)
+    descent = _Descent(enthalpy, system.smallest_diameter)
+    iterations, why = 0, ""
+    while not (converged := _is_within(enthalpy, point, stage)):
+        if iterations == stage.most_iterations:
+            why = f"most_iterations = {stage.most_iterations}"
+            break
+        if stop():
+            why = "interrupted"
+            break
+        found = descent.step(point)
+        if found is None:
+            why = "no move lowers the energy any further"
+            break
+        point = found
+        iterations += 1
+        advanced(1)
+        _check_volume(system, start, point)
+        if iterations % LOOK == 0:
+            _check_charges(system, point)
+    if not converged:
+        _check_charges(system, point)
+    for name in ("position", "rotation", "cell"):
+        getattr(state, name)[:] = getattr(point.state, name)
+    state.books[WORK] += point.energy - start.energy
+    force, torque, deviation = enthalpy.largest(point)
+    return Minimum(
+        converged, why, iterations, relief_steps, start.energy, point.energy, force, torque, point.pressure,
+        deviation if stage.changes_box else None,
+    )  # fmt: skip
+
+
+def _is_within(enthalpy: Enthalpy, point: Point, stage: Stage) -> bool:
+    force, torque, deviation = enthalpy.largest(point)
+    return (
+        force <= stage.force_limit_kJ_mol_A * KJ_PER_MOL
+        and torque <= stage.torque_limit_kJ_mol * KJ_PER_MOL
+        and deviation <= stage.pressure_limit_bar * BAR
+    )
+
+
+class _Descent:
+    """L-BFGS with what it remembers of the way.
+
+    What it remembers are vectors in the frames of the moment; between iterations they are taken over as they are, which
+    is exact to the order of a turn.
+    """
+
+    def __init__(self, enthalpy: Enthalpy, diameter: float):
+        self._enthalpy = enthalpy
+        self._longest = LONGEST_MOVE * diameter
+        self._memory: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
+        self._share = FIRST_MOVE  # of the longest move, where no curvature is known
+
+    def step(self, point: Point) -> Point | None:
+        """The next point, lower than this one; None if there is none. Raises SimulationError."""
+        found = self._along(point, self._direction(point.gradient))
+        if found is None and self._memory:
+            self._memory.clear()
+            self._share = FIRST_MOVE
+            found = self._along(point, self._direction(point.gradient))
+        if found is None:
+            return None
+        move, other = found
+        change = other.gradient - point.gradient
+        if move @ change > 1e-8 * np.linalg.norm(move) * np.linalg.norm(change):
+            self._memory.append((move, change))
+        elif not self._memory:
+            self._share = min(2 * self._share, 1.0)
+        return other
+
+    def _direction(self, gradient: np.ndarray) -> np.ndarray:
+        """The move that curvature suggests, or one downhill, no longer than the longest."""
+        if self._memory:
+            found = gradient.copy()
+            shares = []
+            for move, change in reversed(self._memory):
+                shares.append(move @ found / (move @ change))
+                found -= shares[-1] * change
+            move, change = self._memory[-1]
+            found *= move @ change / (change @ change)
+            for (move, change), share in zip(self._memory, reversed(shares), strict=True):
+                found += (share - change @ found / (move @ change)) * move
+            if found @ gradient > 1e-6 * np.linalg.norm(found) * np.linalg.norm(gradient):
+                return -found * min(1.0, self._bound(found))
+            self._memory.clear()
+            self._share = FIRST_MOVE
+        return -gradient * self._share * self._bound(gradient)
+
+    def _bound(self, move: np.ndarray) -> float:
+        """By what a move may be multiplied."""
+        length, strain = self._enthalpy.reach(move)
+        return 1 / max(length / self._longest, strain / LONGEST_DRIFT)
+
+    def _along(self, point: Point, direction: np.ndarray) -> tuple[np.ndarray, Point] | None:
+        """A move along a direction that is taken, and where it leads; None if there is none. Raises SimulationError."""
+        slope, share, noise = float(direction @ point.gradient), 1.0, ROUNDING * point.scale
+        for _ in range(TRIALS):
+            move = share * direction
+            try:
+                other = self._enthalpy.at(self._enthalpy.moved(point.state, move))
+            except SimulationError:  # behind a wall, or a box too small for the cut-off
+                if share < CREEPING:
+                    raise
+                share *= 0.1
+                continue
+            gain = self._enthalpy.gain(point, other, move) if other.is_finite else inf
+            lower = gain <= PROMISED * share * slope
+            flat = gain <= noise and other.gradient @ direction <= TURNED * abs(slope)
+            if lower or flat:
+                return move, other
+            share *= min(0.5, max(0.1, -slope * share / (2 * (gain - slope * share)))) if isfinite(gain) else 0.1
+        return None
+
+
+def _relieve(system: System, enthalpy: Enthalpy, state: State) -> int:
+    """Move apart what overlaps, in place; the steps that this took."""
+    deepest = max((m.epsilon.max() for m in system.species), default=0.0)
+    if not (deepest > 0 and enthalpy.free.any()):
+        return 0
+    scale, radius = system.smallest_diameter, np.array([m.radius for m in system.species])
+    lightest = float(system.model.mass[system.model.species][enthalpy.free].min())
+    # the step in which a force of so many wells over the diameter gives the lightest molecule the momentum of one
+    step = scale * np.sqrt(lightest / deepest) / OVERLAPPING
+    return relieve(system.model, enthalpy.engine, state, radius, scale, deepest, step).steps
+
+
+def _check_volume(system: System, start: Point, point: Point) -> None:
+    """Raise SimulationError where nothing holds the box together."""
+    largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
+    if point.state.volume < inf and largest and grown > largest:
+        raise SimulationError(
+            f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {largest:g}): the enthalpy has no "
+            "minimum at a finite volume. Likely cause: at this pressure nothing holds the molecules together. Try a "
+            "higher pressure_bar"
+        )
+
+
+def _check_charges(system: System, point: Point) -> None:
+    """Raise SimulationError where charges have fallen on one another: the energy then has no lower bound."""
+    pair = watch.pair_in_core(system, point.state, None)
+    if pair is None or not pair.bare:
+        return
+    a, b = (
+        f"{system.sites.name[site]} of {watch.named(system, system.sites.molecule[site])}"
+        for site in (pair.first, pair.second)
+    )
+    one, other = system.sites.name[[pair.first, pair.second]]
+    raise SimulationError(
+        f"the energy has no lower bound: {a} and {b}, of opposite charge, are {pair.distance:.3g} Å apart, and no "
+        "repulsion of their own keeps them apart. Try giving one of these sites sigma_A and epsilon_kJ_mol, or the "
+        f'pair an entry [[forces.pairs]] with sites = ["{one}", "{other}"]'
+    )

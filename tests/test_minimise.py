@@ -1,0 +1,499 @@
+"""Minimisation in the rigid degrees of freedom and the cell: gradients, known minima, what a stage of it says and keeps."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from conftest import shaken, small_scene
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from rigidmd.assemble.describe import describe
+from rigidmd.assemble.momenta import mobile
+from rigidmd.assemble.system import build
+from rigidmd.cli import main
+from rigidmd.core.state import NOW, State, state_of
+from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.molecules import load_model
+from rigidmd.run import Every, Simulation
+from rigidmd.run.enthalpy import Enthalpy
+from rigidmd.run.minimise import minimise
+from rigidmd.scene import Scene
+from rigidmd.study.precision import precision
+from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
+
+MIXTURE = {"argon": 4, "nitrogen": 4, "spce": 6}
+FORCES = {"cutoff_A": 6.0, "tail_correction": True}
+WELL = 119.8 * BOLTZMANN  # of argon
+#: Forces to about 1e-6 of those of a liquid.
+TIGHT = {"force_limit_kJ_mol_A": 1e-5, "torque_limit_kJ_mol": 1e-5}
+ASKED = {
+    "isotropic": 800.0,
+    "semi_isotropic": (500.0, 500.0, -1500.0),
+    "anisotropic": (500.0, 0.0, 1500.0),
+    "flexible": (100.0, 200.0, 300.0, 4000.0, -5000.0, 6000.0),
+}
+
+
+def stage_of(**keys) -> dict:
+    return {"ensemble": "minimise"} | keys
+
+
+def minimum_of(scene, state: State | None = None):
+    """The results of a scene from a state, and the figures of its last stage's minimum."""
+    simulation = Simulation(scene)
+    if state is not None:
+        simulation.start_from(state)
+    results = simulation.run()
+    return results, results.summary["stages"][-1]["minimum"]
+
+
+@pytest.mark.parametrize(
+    ("coupling", "electrostatics"),
+    [*((coupling, "reaction_field") for coupling in (None, *ASKED)), ("flexible", "ewald")],
+)
+def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
+    """Points, linear and asymmetric molecules, shifts, turns and all components of a leaning cell."""
+    asked = {"pressure_bar": ASKED[coupling], "pressure_coupling": coupling} if coupling else {}
+    scene = small_scene(
+        MIXTURE, 13.0, forces=FORCES | {"electrostatics": electrostatics},
+        stages=[stage_of(**asked), {"duration_ps": 0.01}],
+    )  # fmt: skip
+    system, _, state = shaken(build(scene), 3, spread=0.1)
+    if coupling == "flexible":
+        state.cell[1, 0], state.cell[2, 0], state.cell[2, 1] = 0.4, 0.3, -0.6
+    enthalpy = Enthalpy(system, scene.stages[0], state)
+    point = enthalpy.at(state)
+    n, turns = 3 * len(state.position), (system.model.inertia > 0)[system.model.species].ravel()
+    coordinates = {None: 0, "isotropic": 1, "semi_isotropic": 2, "anisotropic": 3, "flexible": 6}[coupling]
+    assert len(point.gradient) == 2 * n + coordinates
+    assert (point.gradient[n : 2 * n][~turns] == 0).all()
+    some = np.random.default_rng(0).choice(np.flatnonzero(np.append(np.ones(n, bool), turns)), 12, replace=False)
+    for k in [*some, *range(2 * n, len(point.gradient))]:
+        gains = []
+        for h in (1e-4, -1e-4):
+            move = np.zeros(len(point.gradient))
+            move[k] = h
+            gains.append(enthalpy.gain(point, enthalpy.at(enthalpy.moved(state, move)), move))
+        slope = (gains[0] - gains[1]) / 2e-4
+        assert slope == pytest.approx(point.gradient[k], abs=1e-6 * np.abs(point.gradient).max())
+    if coupling is None:  # the cell is kept, and its pressure is still known
+        assert enthalpy.largest(point)[2] == 0
+        assert np.isfinite(point.pressure).all()
+
+
+def test_turns_of_any_size_and_strains_are_those_of_the_docstring():
+    scene = small_scene(MIXTURE, 13.0, forces=FORCES, stages=[stage_of(pressure_bar=0.0, pressure_coupling="flexible")])
+    system, _, state = shaken(build(scene), 3, spread=0.1)
+    enthalpy, rng = Enthalpy(system, scene.stages[0], state), np.random.default_rng(1)
+    n = len(state.position)
+    move = rng.standard_normal(6 * n + 6)
+    moved = enthalpy.moved(state, move)
+    shift, turn = move[: 3 * n].reshape(n, 3), move[3 * n : 6 * n].reshape(n, 3)
+    radius = np.array([m.radius or 1.0 for m in system.species])[system.model.species]
+    turned = state.rotation @ Rotation.from_rotvec(turn / radius[:, None]).as_matrix()
+    assert np.abs(moved.rotation - turned).max() < 1e-14
+    strain = move[6 * n :] / (np.sqrt(n) * np.cbrt(state.volume / n))
+    matrix = np.diag(np.exp(strain[:3]))
+    matrix[[1, 2, 2], [0, 0, 1]] = strain[3:]
+    assert np.abs(moved.cell - state.cell @ matrix).max() < 1e-13
+    assert np.abs(moved.position - state.position @ matrix - shift).max() < 1e-12
+
+
+def cluster(points: np.ndarray, seed: int) -> State:
+    """Atoms at points in diameters, shaken by a tenth of one."""
+    rng = np.random.default_rng(seed)
+    return state_of(position=3.405 * (points + 0.1 * rng.uniform(-1, 1, points.shape)))
+
+
+def icosahedron() -> np.ndarray:
+    golden = (1 + np.sqrt(5)) / 2
+    corners = [np.roll([0, a, b * golden], k) for k in range(3) for a in (1, -1) for b in (1, -1)]
+    return 1.08 * np.array([np.zeros(3), *corners]) / np.hypot(1, golden)
+
+
+def bipyramid() -> np.ndarray:
+    angle = 2 * np.pi * np.arange(5) / 5
+    ring = 0.95 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return np.vstack([ring, [[0, 0, 0.55], [0, 0, -0.55]]])
+
+
+@pytest.mark.parametrize(("points", "energy"), [(bipyramid(), -16.505384), (icosahedron(), -44.326801)])
+def test_lennard_jones_clusters(points, energy):
+    """Hoare & Pal 1971, Adv. Phys. 20, 161; the Cambridge Cluster Database."""
+    n = len(points)
+    scene = small_scene({"argon": n}, None, stages=[stage_of(force_limit_kJ_mol_A=1e-6)])
+    results, found = minimum_of(scene, cluster(points, 2))
+    assert found["converged"]
+    assert found["largest_force_kJ_mol_A"] <= 1e-6
+    assert n * found["energy_after_kJ_mol_per_molecule"] * KJ_PER_MOL / WELL == pytest.approx(energy, abs=1e-6)
+    assert results["potential"][-1] == pytest.approx(n * found["energy_after_kJ_mol_per_molecule"], rel=1e-12)
+    assert found["pressure_bar"] is None
+
+
+def pair_energy(model: str, x: np.ndarray) -> float:
+    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), place and rotation vectors of both. Plain NumPy."""
+    m = load_model(model)
+    sites = m.positions_body
+    a = Rotation.from_rotvec(x[3:6]).apply(sites)
+    b = Rotation.from_rotvec(x[6:9]).apply(sites) + x[:3]
+    r = np.linalg.norm(a[:, None] - b, axis=2)
+    energy = COULOMB * np.outer(m.charges, m.charges) / r
+    sigma, well = (m.sigma[:, None] + m.sigma) / 2, np.sqrt(np.outer(m.epsilon, m.epsilon))
+    energy += 4 * well * ((sigma / r) ** 12 - (sigma / r) ** 6)
+    return float(energy.sum()) / KJ_PER_MOL
+
+
+@pytest.mark.parametrize(("model", "published"), [("tip4p", -26.09), ("spce", None)])
+def test_the_water_dimer(model, published):
+    """TIP4P: 6.24 kcal/mol (Jorgensen et al. 1983, J. Chem. Phys. 79, 926, table III)."""
+    m = load_model(model)
+    o, h = (m.positions_body[[name.startswith(kind) for name in m.site_names]] for kind in "OH")
+    donor, acceptor = (h[0] - o[0]), h.mean(axis=0) - o[0]
+    guess = np.zeros(9)
+    guess[:3] = [2.8, 0.0, 0.0]
+    guess[3:6] = Rotation.align_vectors([[1.0, 0, 0]], [donor])[0].as_rotvec()
+    guess[6:9] = Rotation.align_vectors([[0.6, 0, 0.8]], [acceptor])[0].as_rotvec()
+    best = minimize(lambda x: pair_energy(model, x), guess, method="BFGS", tol=1e-9).fun
+    scene = small_scene({model: 2}, None, stages=[stage_of(**TIGHT)])
+    energies = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        state = state_of([[0, 0, 0], [3.2, 0, 0]], None, Rotation.random(2, rng).as_matrix())
+        _, found = minimum_of(scene, state)
+        assert found["converged"]
+        energies.append(2 * found["energy_after_kJ_mol_per_molecule"])
+    assert min(energies) == pytest.approx(best, abs=1e-6)
+    if published:
+        assert best == pytest.approx(published, abs=0.03)
+
+
+def test_fcc_argon_has_its_lattice_constant_at_no_pressure():
+    """Shells within the cut-off: 2 (sigma/a)^6 S12 = S6 with S_p = sum (r/a)^-p."""
+    cutoff, n = 8.66, 4
+    near = np.array(list(np.ndindex(7, 7, 7))) - 3
+    sites = (near[:, None] + np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])).reshape(-1, 3)
+    shells = np.linalg.norm(sites, axis=1)
+    shells = shells[(shells > 0) & (shells < 1.65)]
+    exact = 3.405 * (2 * (shells**-12.0).sum() / (shells**-6.0).sum()) ** (1 / 6)
+    assert 1.59 * exact < cutoff < 1.73 * exact
+    a = 1.02 * exact
+    points = sites[(sites >= -1).all(axis=1) & (sites < n - 1).all(axis=1)]
+    assert len(points) == 4 * n**3
+    position = a * points + 0.05 * np.random.default_rng(0).standard_normal(points.shape)
+    limits = {"force_limit_kJ_mol_A": 1e-6, "pressure_limit_bar": 1e-3}
+    scene = small_scene(
+        {"argon": len(points)}, n * a, forces={"cutoff_A": cutoff, "truncation": "shift"},
+        stages=[stage_of(pressure_bar=0.0, **limits)], output={"pressure_tensor": True},
+    )  # fmt: skip
+    results, found = minimum_of(scene, state_of(position, cell=np.eye(3) * n * a))
+    assert found["converged"]
+    assert found["largest_pressure_deviation_bar"] <= 1e-3
+    assert results.summary["stages"][0]["a_A"] / n == pytest.approx(exact, rel=1e-6)
+    assert results["pressure_bar"][-1] == pytest.approx(0.0, abs=2e-3)  # at rest: no stage moves
+    assert results["temperature"][-1] == 0
+
+
+def nitrogen_crystal(a: float, n: int, matrix: np.ndarray) -> tuple[State, np.ndarray]:
+    """n³ cells of Pa3, centres and cell times a matrix; the axes (4 n³, 3) of its molecules."""
+    corners = np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
+    along = np.array([[1, 1, 1], [1, -1, -1], [-1, -1, 1], [-1, 1, -1]]) / np.sqrt(3)
+    centres = (np.array(list(np.ndindex(n, n, n)))[:, None] + corners).reshape(-1, 3) * a
+    axes = np.tile(along, (n**3, 1))
+    across = np.cross(axes, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    rotation = np.stack([axes, across, np.cross(axes, across)], axis=2)  # the molecule lies along its first axis
+    return state_of(centres @ matrix, None, rotation, None, n * a * np.eye(3) @ matrix), axes
+
+
+def test_a_nitrogen_crystal_finds_its_shape_and_stays():
+    n = 3
+    sheared = np.array([[1.0, 0, 0], [0.02, 1.0, 0], [-0.01, 0, 1.0]])
+    stage = stage_of(pressure_bar=0.0, pressure_coupling="flexible", pressure_limit_bar=1e-3, **TIGHT)
+    found = []
+    for matrix in (np.eye(3), sheared):
+        state, axes = nitrogen_crystal(5.66, n, matrix)
+        scene = small_scene({"nitrogen": len(axes)}, 5.66 * n, forces={"cutoff_A": 8.0}, stages=[stage, stage])
+        results, again = minimum_of(scene, state)
+        assert [stage["minimum"]["converged"] for stage in results.summary["stages"]] == [True, True]
+        assert again["iterations"] == 0
+        assert np.abs(np.einsum("ni,ni->n", results.state.rotation[:, :, 0], axes)) == pytest.approx(1.0, abs=1e-9)
+        found.append((results.state.cell, again["energy_after_kJ_mol_per_molecule"]))
+    (cubic, energy), (relaxed, other) = found
+    assert np.abs(cubic - cubic[0, 0] * np.eye(3)).max() < 1e-6
+    assert np.abs(relaxed - cubic).max() < 1e-5
+    assert other == pytest.approx(energy, rel=1e-9)
+
+
+@pytest.mark.parametrize("coupling", ASKED)
+def test_the_cell_takes_the_pressure_asked_for(coupling):
+    """Each coordinate of the coupling its own; what no coordinate holds stays as it was."""
+    asked = {"semi_isotropic": (900.0, 900.0, 500.0), "flexible": (100.0, 200.0, 300.0, 100.0, -100.0, 150.0)}.get(
+        coupling, ASKED[coupling]
+    )
+    stage = stage_of(pressure_bar=asked, pressure_coupling=coupling, pressure_limit_bar=0.1)
+    scene = small_scene(
+        {"argon": 20, "nitrogen": 20, "spce": 30}, 15.5, forces=FORCES | {"cutoff_A": 5.0}, stages=[stage]
+    )
+    system, _, state = shaken(build(scene), 1)
+    volume = state.volume
+    found = minimise(system, state, scene.stages[0])
+    assert found.converged
+    pressure = found.pressure / BAR
+    edges = state.cell.diagonal()
+    if coupling == "isotropic":
+        assert pressure[:3].mean() == pytest.approx(asked, abs=0.1)
+    elif coupling == "semi_isotropic":
+        assert pressure[:2].mean() == pytest.approx(asked[0], abs=0.1)
+    else:
+        assert pressure[: len(asked)] == pytest.approx(asked, abs=0.1)
+    alike = {"isotropic": 3, "semi_isotropic": 2}.get(coupling, 1)
+    assert edges[:alike] == pytest.approx(edges[0], rel=1e-12)
+    assert (np.diff(edges)[alike - 1 :] != 0).all()
+    assert (np.abs(state.cell[np.tril_indices(3, -1)]) > 1e-3).all() == (coupling == "flexible")
+    assert (state.cell[np.triu_indices(3, 1)] == 0).all()
+    assert state.volume < volume
+
+
+def test_it_begins_from_overlaps():
+    """Two pairs of molecules in one another, one of them a hundredth of a diameter apart: 1e24 wells."""
+    scene = small_scene({"argon": 10, "spce": 10}, 18.5, stages=[stage_of()])
+    system, _, state = shaken(build(scene), 1, spread=0.1)
+    state.position[1] = state.position[0] + [0.03, 0.01, 0.0]
+    state.position[12] = state.position[11] + [0.4, 0.2, 0.1]
+    found = minimise(system, state, scene.stages[0])
+    assert found.before > 1e20 * WELL
+    assert found.converged
+    assert found.relief_steps > 0
+    assert found.after < 0
+    assert found.force <= 0.1 * KJ_PER_MOL
+    assert np.abs(np.linalg.det(state.rotation) - 1).max() < 1e-12
+
+
+def test_frozen_molecules_stay():
+    scene = small_scene({}, 18.5, molecules=[{"model": "spce", "count": 12, "frozen": "1-4"}], stages=[stage_of()])
+    system, _, state = shaken(build(scene), 1, spread=0.1)
+    before, held = state.copy(), ~mobile(system.model)
+    found = minimise(system, state, scene.stages[0])
+    assert found.converged
+    assert held.sum() == 4
+    for name in ("position", "rotation"):
+        assert np.array_equal(getattr(state, name)[held], getattr(before, name)[held])
+        assert (getattr(state, name)[~held] != getattr(before, name)[~held]).any(axis=-1).all()
+
+
+def test_what_it_keeps_and_what_it_books():
+    scene = small_scene(
+        {"argon": 10, "spce": 10}, 18.5, stages=[{"duration_ps": 0.01}, stage_of(), {"duration_ps": 0.01}]
+    )
+    seen = []
+
+    def look(moment):
+        state = moment.state.copy()
+        seen.append((moment.step, moment.time, state.velocity, state.angular_momentum_body, state.position))
+
+    results = Simulation(scene, observers=Every(0.01, look)).run()
+    assert [moment[0] for moment in seen] == [0, 5, 5, 10]
+    before, after = [moment for moment in seen if moment[0] == 5]
+    for k in (1, 2, 3):
+        assert np.array_equal(before[k], after[k])  # time, velocity, angular momentum
+    assert not np.array_equal(before[4], after[4])  # position
+    assert results.state.time[NOW] == pytest.approx(0.02)
+    assert results.state.step[NOW] == 10
+    conserved = results["conserved"]
+    taken = results["potential"][1] - results["potential"][2]
+    assert taken > 100
+    assert conserved[2] == pytest.approx(conserved[1], abs=1e-9 * taken)  # it is booked as work
+    assert results["work"][1] - results["work"][2] == pytest.approx(taken, rel=1e-9)
+    drift = results["drift"]
+    assert np.isnan(drift[results["stage"] == 1]).all()
+    assert np.isfinite(drift[results["stage"] != 1]).all()
+    first, middle, last = results.summary["stages"]
+    assert set(first) == set(middle) == set(last)
+    assert first["minimum"] is last["minimum"] is None
+    for key in (
+        "temperature_K",
+        "drift_kJ_mol_ns_per_molecule",
+        "timestep_fs",
+        "integrator",
+        "energy_rms_kJ_mol_per_molecule",
+    ):
+        assert middle[key] is None
+    assert middle["steps"] == 0
+    assert middle["potential_kJ_mol_per_molecule"] == middle["minimum"]["energy_after_kJ_mol_per_molecule"]
+    assert results.universe().trajectory.dt > 0
+
+
+def test_it_says_how_far_it_came():
+    scene = small_scene({"spce": 10}, 18.5, stages=[stage_of(most_iterations=3)])
+    with pytest.warns(
+        RigidMDWarning, match=r"stages.0: the minimisation ended after 3 iterations .*most_iterations = 3"
+    ):
+        results, found = minimum_of(scene)
+    assert not found["converged"]
+    assert found["ended_by"] == "most_iterations = 3"
+    assert found["iterations"] == 3
+    assert found["largest_force_kJ_mol_A"] > 0.1
+    assert any("largest force" in note and "(limit 0.1)" in note for note in results.summary["notes"])
+    assert found["energy_after_kJ_mol_per_molecule"] < found["energy_before_kJ_mol_per_molecule"]
+
+
+def test_it_can_be_stopped():
+    scene = small_scene({"spce": 10}, 18.5, stages=[stage_of()])
+    system, _, state = shaken(build(scene), 1, spread=0.1)
+    done = []
+    found = minimise(system, state, scene.stages[0], lambda: len(done) == 2, done.append)
+    assert (found.converged, found.why, found.iterations) == (False, "interrupted", 2)
+    assert found.after < found.before
+
+
+def test_charges_that_nothing_keeps_apart():
+    ion = {"mass_u": 20.0, "position_A": [0.0, 0.0, 0.0]}
+    molecules = [
+        {"name": "plus", "count": 1, "sites": [ion | {"name": "P", "charge_e": 1.0, "sigma_A": 2.5, "epsilon_kJ_mol": 0.4}]},
+        {"name": "minus", "count": 1, "sites": [ion | {"name": "M", "charge_e": -1.0}]},
+    ]  # fmt: skip
+    scene = small_scene({}, None, molecules=molecules, stages=[stage_of()])
+    simulation = Simulation(scene)
+    simulation.start_from(state_of([[0.0, 0, 0], [4.0, 0.3, 0]]))
+    with pytest.raises(SimulationError, match=r"no lower bound: P of molecule 1 .* and M of molecule 2 .*forces.pairs"):
+        simulation.run()
+
+
+def test_a_box_that_nothing_holds_together():
+    scene = small_scene({"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=-5000.0)])
+    with pytest.raises(SimulationError, match=r"has grown to .* volumes .*higher pressure_bar"):
+        minimum_of(scene)
+
+
+def test_a_box_that_becomes_too_small_for_the_cut_off():
+    scene = small_scene({"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=5000.0)])
+    with pytest.raises(SimulationError, match="too small for the cut-off"):
+        minimum_of(scene)
+
+
+@pytest.mark.parametrize(
+    ("stages", "more", "expected"),
+    [
+        ([stage_of(duration_ps=1.0)], {}, "duration_ps would do nothing in a minimise stage"),
+        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would do nothing"),
+        ([stage_of(temperature_K=300.0)], {}, "temperature_K would do nothing"),
+        ([stage_of(integrator="srkn_6")], {}, "integrator would do nothing"),
+        ([stage_of(pressure_coupling="flexible")], {}, "would do nothing in a minimise stage without pressure_bar"),
+        ([stage_of(pressure_limit_bar=2.0)], {}, "would do nothing in a minimise stage without pressure_bar"),
+        ([stage_of(pressure_bar=(1.0, 2.0))], {}, "one pressure, not one that changes"),
+        ([stage_of(pressure_bar=(1.0, 2.0, 3.0))], {}, "pressure_coupling = 'anisotropic'"),
+        ([stage_of(most_iterations=0)], {}, "most_iterations"),
+        ([stage_of(force_limit_kJ_mol_A=0.0)], {}, "force_limit_kJ_mol_A"),
+        ([{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}], {}, "force_limit_kJ_mol_A would do nothing in an nve stage"),
+        ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
+        ([stage_of(), {"duration_ps": 1.0}], {"start": {}}, "the first stage in which time passes is nve"),
+        ([stage_of(pressure_bar=1.0)], {"box": {"lengths_A": 20.0, "periodic": False}}, "box.periodic is false"),
+        ([stage_of(pressure_bar=1.0)], {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]}, "frozen molecules hold"),
+        ([stage_of()], {"output": {"trajectory": "t.dcd"}}, "two frames at one time"),
+        (
+            [stage_of(), {"ensemble": "nvt", "duration_ps": 1.0, "temperature_K": 300.0}],
+            {"start": {"temperature_K": 0.0}},
+            "cannot warm what is at rest",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input(stages, more, expected):
+    with pytest.raises(SceneError, match=expected):
+        small_scene({"spce": 4}, 20.0, stages=stages, **more)
+
+
+def test_precision_needs_a_stage_in_which_time_passes():
+    with pytest.raises(SceneError, match="the last stage is a minimisation"):
+        precision(small_scene({"spce": 4}, 20.0, stages=[stage_of()]))
+
+
+def test_momenta_are_those_of_the_first_stage_that_moves():
+    nvt = {"ensemble": "nvt", "duration_ps": 0.01, "temperature_K": 250.0}
+    drawn = build(small_scene({"spce": 8}, 20.0, stages=[stage_of(), nvt], start={}))
+    plain = build(small_scene({"spce": 8}, 20.0, stages=[nvt], start={}))
+    assert drawn.scene.start.temperature_K == 250.0
+    assert np.array_equal(drawn.state.velocity, plain.state.velocity)
+    alone = build(small_scene({"spce": 8}, 20.0, stages=[stage_of()], start={}))
+    assert alone.scene.start.temperature_K == 0.0
+    assert not alone.state.velocity.any()
+    assert not alone.state.angular_momentum_body.any()
+
+
+SCENE = """\
+[box]
+density_g_cm3 = 0.9
+[[molecules]]
+model = "spce"
+count = 40
+[forces]
+cutoff_A = 5.0
+[[stages]]
+ensemble = "minimise"
+[[stages]]
+name = "cell"
+ensemble = "minimise"
+pressure_bar = 1
+[[stages]]
+ensemble = "nvt"
+temperature_K = 300
+duration_ps = 0.02
+[output]
+log_interval_ps = 0.01
+trajectory_interval_ps = 0.01
+"""
+
+
+def test_a_scene_through_the_command_line(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    assert main(["check", str(tmp_path / "scene.toml")]) == 0
+    said = capsys.readouterr().out
+    assert "0: minimise: to the nearest minimum of the potential energy; no time passes and momenta stay" in said
+    assert "1: cell: to the nearest minimum of the enthalpy at 1 bar, the cell isotropic" in said
+    assert "torques of 0.1 kJ/mol and a pressure within 1 bar, or after 5000 iterations" in said
+    assert main(["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "minimise: converged after" in said
+    assert "cell: converged after" in said
+    assert "at most" in said
+    with (tmp_path / "out" / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["Stage"] for row in rows] == ["minimise", "minimise", "cell", "nvt", "nvt"]
+    assert [float(row["Time (ps)"]) for row in rows] == pytest.approx([0, 0, 0, 0.01, 0.02])
+    assert [row["Drift (kJ/mole)"] for row in rows[:3]] == ["", "", ""]
+    assert [float(row["Temperature (K)"]) for row in rows[:3]] == pytest.approx([300, 300, 300])
+    energies = [float(row["Potential Energy (kJ/mole)"]) for row in rows]
+    assert energies[0] > energies[1] > energies[2]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    kept, cell, nvt = summary["stages"]
+    assert kept["minimum"]["converged"]
+    assert kept["minimum"]["largest_pressure_deviation_bar"] is None
+    assert cell["minimum"]["largest_pressure_deviation_bar"] <= 1
+    assert cell["density_g_cm3"] == pytest.approx(float(rows[2]["Density (g/mL)"]))
+    assert cell["density_g_cm3"] != pytest.approx(0.9, rel=1e-3)
+    assert 40 * kept["minimum"]["energy_after_kJ_mol_per_molecule"] == pytest.approx(energies[1])
+    assert nvt["steps"] == 10
+    assert nvt["temperature_K"] > 0
+    assert (tmp_path / "out" / "energy.png").is_file()
+    again = Simulation(Scene.read(tmp_path / "out" / "scene.toml")).run()
+    assert [frame.time for frame in again._frames] == pytest.approx([0, 0, 0, 0.01, 0.02])
+    with np.load(tmp_path / "out" / "final.npz") as final:
+        for name in ("position", "rotation", "velocity"):
+            assert np.array_equal(final[name], getattr(again.state, name))
+
+
+def test_a_minimum_alone_has_no_figure(tmp_path):
+    Simulation(small_scene({"argon": 4}, None, stages=[stage_of()], start={}), tmp_path / "out").run(progress=True)
+    assert "energy.png" not in {path.name for path in (tmp_path / "out").iterdir()}
+    assert "stages:" in describe(small_scene({"argon": 4}, None, stages=[stage_of()], start={}))
+
+
+def test_structures_that_overlap_may_be_minimised(tmp_path):
+    (tmp_path / "two.xyz").write_text("2\n\nAr 0 0 0\nAr 1.5 0 0\n")
+    sections = {"structure": {"file": "two.xyz"}, "molecules": [{"model": "argon"}], "box": {"periodic": False}}
+    scene = small_scene({}, None, tmp_path, **sections, stages=[stage_of(force_limit_kJ_mol_A=1e-4)], start={})
+    results, found = minimum_of(scene)
+    assert found["converged"]
+    assert any("overlap" in note for note in results.summary["notes"])
+    assert np.linalg.norm(np.diff(results.state.position, axis=0)) == pytest.approx(2 ** (1 / 6) * 3.405, rel=1e-3)
