@@ -8,8 +8,8 @@ STIFFEST, SOFTEST = 2e-7, 100.0
 
 
 def stage_in_words(stage: Stage) -> list[str]:
-    """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved. Or what is minimised, and
-    when that has converged."""
+    """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved. For a minimisation: what is
+    minimised, and the limits of convergence."""
     if stage.is_minimisation:
         return _minimisation(stage)
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
@@ -33,8 +33,8 @@ def _minimisation(stage: Stage) -> list[str]:
         what = f"the enthalpy at {_pressure(stage)} bar, the cell {stage.pressure_coupling.replace('_', '-')}"
         limits.append(f"a pressure within {stage.pressure_limit_bar:g} bar")
     return [
-        f"{stage.label}: to the nearest minimum of {what}; no time passes and momenta stay",
-        f"ends at {', '.join(limits[:-1])} and {limits[-1]}, or after {stage.most_iterations} iterations",
+        f"{stage.label}: to a minimum of {what}; no time passes and momenta do not change",
+        f"limits: {', '.join(limits[:-1])} and {limits[-1]}; at most {stage.most_iterations} iterations",
     ]
 
 

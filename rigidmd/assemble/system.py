@@ -192,7 +192,7 @@ def build(scene: MolecularScene) -> System:
         if faults := overlaps(system):
             if not scene.stages[0].is_minimisation:
                 raise StructureError(str(scene.path(scene.structure.file)), faults)
-            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation has to move them apart")
+            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation moves them apart")
     else:
         system.notes.extend(f"box: {note}" for note in arrangement.notes)
     return system

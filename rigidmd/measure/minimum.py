@@ -1,4 +1,4 @@
-"""Where a minimisation ended: its figures for the summary, and in words."""
+"""The result of a minimisation: its figures for the summary, and in words."""
 
 from typing import Any, NamedTuple
 
@@ -9,22 +9,22 @@ from rigidmd.units import BAR, KJ_PER_MOL
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended, in u, Å, ps."""
+    """The result of a minimisation; u, Å, ps."""
 
     converged: bool
-    why: str  # it ended, where it has not converged
+    why: str  # reason for its end if it has not converged, else empty
     iterations: int
-    relief_steps: int  # of steepest descent before, which move apart what overlaps
-    before: float  # potential energy
-    after: float
-    force: float  # largest on a molecule that moves
-    torque: float  # largest about a principal axis
-    pressure: np.ndarray  # (6,) by `boxes.COMPONENTS`, without that of motion; NaN without a box
-    deviation: float | None  # largest of the pressure from the one asked for; None where the cell is kept
+    relief_steps: int  # of steepest descent, before the iterations
+    before: float  # potential energy at the start
+    after: float  # at the end
+    force: float  # largest force on a molecule that is not frozen
+    torque: float  # largest torque about a principal axis
+    pressure: np.ndarray  # (6,) by `boxes.COMPONENTS`, without the kinetic part; NaN without a box
+    deviation: float | None  # largest deviation from the pressure asked for; None if the cell does not relax
 
 
 def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
-    """Its figures with units in their keys. The pressure is that of forces alone; None where there is none."""
+    """The figures of a minimum with units in their keys. Pressures are without the kinetic part; None without a box."""
     pressure = found.pressure / BAR
     boxed = bool(np.isfinite(pressure).all())
     return {
@@ -43,7 +43,7 @@ def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
 
 
 def minimum_in_words(found: Minimum, stage: Stage) -> str:
-    """How far a minimisation that has not converged has come."""
+    """A warning for a minimisation that has not converged: what it has reached."""
     parts = [
         ("force", found.force / KJ_PER_MOL, stage.force_limit_kJ_mol_A, "kJ/(mol Å)"),
         ("torque", found.torque / KJ_PER_MOL, stage.torque_limit_kJ_mol, "kJ/mol"),
@@ -51,5 +51,4 @@ def minimum_in_words(found: Minimum, stage: Stage) -> str:
     if found.deviation is not None:
         parts.append(("deviation of the pressure", found.deviation / BAR, stage.pressure_limit_bar, "bar"))
     reached = ", ".join(f"{what} {value:.3g} (limit {limit:g}) {unit}" for what, value, limit, unit in parts)
-    ended = f"the minimisation ended after {found.iterations} iterations before it converged ({found.why})"
-    return f"{ended}; largest {reached}"
+    return f"the minimisation has not converged after {found.iterations} iterations ({found.why}): largest {reached}"

@@ -16,7 +16,7 @@ from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
-#: Figures of a stage that are those of motion: nothing of a minimisation.
+#: Figures of a stage that a minimisation does not have.
 OF_MOTION = (
     "integrator", "timestep_fs", "steps_per_s", "ns_per_day", "temperature_K", "temperature_error_K",
     "temperature_translation_K", "temperature_rotation_K", "temperature_translation_unbiased_K",
@@ -49,7 +49,7 @@ def summarise(
     choices : choice and reason for stages that left their integrator open
     stable : the longest stable step (ps) of stages, as estimated at their start
     moves : of stages with a box that moves, how many moves were tried and accepted
-    minima : where the stages ended that are minimisations
+    minima : results of the stages that are minimisations
     """
     scene = system.scene
     momentum = samples.rows[-1].momentum
@@ -178,7 +178,7 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float, move
 
 
 def _minimised(system: System, samples: list[Sample], k: int, computing: float, found: Minimum) -> dict:
-    """Figures of a stage that is a minimisation: those of its end. None for what only motion has."""
+    """Figures of a minimisation, at its end; None for those of OF_MOTION."""
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
     end = [sample for sample in samples if sample.stage == k][-1:]
     return dict.fromkeys(OF_MOTION) | {

@@ -148,8 +148,9 @@ def axis_distances(molecule: Molecule) -> np.ndarray:
 
 
 def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) -> Finding | None:
-    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage; of one of
-    a minimisation only Q.
+    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
+
+    In a minimisation only Q is checked.
 
     The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
     energy at a thermostat's temperature if that is larger.

@@ -99,8 +99,8 @@ def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
     rows.append(("largest force", f"{found['largest_force_kJ_mol_A']:.2g} kJ/(mol Å){torque}"))
     if found["pressure_bar"] is not None:
         off = found["largest_pressure_deviation_bar"]
-        more = "" if off is None else f"; at most {off:.2g} bar from the one asked for"
-        rows.append(("pressure", f"{found['pressure_bar']:.4g} bar of forces alone{more}"))
+        more = "" if off is None else f", within {off:.2g} bar of the one asked for"
+        rows.append(("pressure", f"{found['pressure_bar']:.4g} bar without the kinetic part{more}"))
     if stage.get("density_g_cm3") is not None:
         rows.append(("density", f"{stage['density_g_cm3']:.4f} g/cm³"))
         edges = (f"{edge} {stage[f'{edge}_A']:.4f}" for edge in "abc")
@@ -159,7 +159,7 @@ def signed(value: float, error: float) -> str:
 
 
 def drawn(stages: Sequence[Stage], samples: Samples) -> np.ndarray:
-    """Which samples (n,) are drawn: a minimisation is one moment, and may begin at any energy."""
+    """Which samples (n,) are drawn: none of minimisations, whose energy at the start would set the scale."""
     return np.array([not stages[k].is_minimisation for k in samples["stage"]], bool)
 
 

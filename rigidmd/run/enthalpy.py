@@ -1,4 +1,4 @@
-"""The enthalpy of molecules as a function of where they are, how they are turned, and of their cell; its gradient."""
+"""Enthalpy of rigid molecules as a function of positions, orientations and cell, and its gradient."""
 
 from math import inf, isfinite, nan
 from typing import NamedTuple
@@ -16,13 +16,13 @@ from rigidmd.units import BAR
 
 
 class Point(NamedTuple):
-    """What a state has of energy, and how that changes with small moves from it."""
+    """A state with its energy and the gradient there."""
 
     state: State
-    energy: float  # potential, with constants and what is beyond the cut-off, u Å²/ps²
-    scale: float  # sum of the sizes of its parts: rounding is relative to it
+    energy: float  # potential energy with constants and tail correction, u Å²/ps²
+    scale: float  # sum of the absolute values of its parts, to which rounding is relative
     load: Load
-    pressure: np.ndarray  # (6,) by `boxes.COMPONENTS`, without that of motion, u/(Å ps²); NaN without a box
+    pressure: np.ndarray  # (6,) by `boxes.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
     gradient: np.ndarray  # (k,) of the enthalpy in the coordinates of `Enthalpy.moved`, u Å/ps²
 
     @property
@@ -32,22 +32,22 @@ class Point(NamedTuple):
 
 
 class Enthalpy:
-    """H = U + P V of the molecules of a system that are not frozen; U alone where a stage keeps the cell.
+    """Enthalpy U + P V for a stage with a relaxing cell, else the potential energy U. Frozen molecules do not move.
 
-    Small moves from a state are vectors (k,) of lengths, Å, so that the second derivatives of H are of one order:
+    A move from a state is a vector (k,) of lengths (Å), scaled so that all second derivatives are of the same order:
 
         shifts of centres of mass (3 n), lab frame
-        turns about principal axes (3 n, none of points), Q <- Q exp(hat(turn)), times the radius of the molecule
-        strains of the cell, one for each coordinate of its coupling: R <- R T, cell <- cell T, with T as in `boxes`,
-        the exponentials of the first three strains on its diagonal and the others below it. A strain of 1 is as long as
-        sqrt(m N) distances between neighbours, of N molecules and m components that share the coordinate: the root of
-        the sum of squares of what neighbours go in it
+        rotations about principal axes, Q <- Q exp(hat(phi)), as phi times the radius of the molecule (3 n; 0 of points)
+        strains of the cell, one for each coordinate of the coupling: R <- R T, cell <- cell T, where T is lower
+        triangular as in `boxes`, with the exponentials of the first three strains on its diagonal and the others below.
+        A strain is multiplied by sqrt(m N) (V/N)^(1/3), for N molecules and m components that share the coordinate:
+        in a strain all N distances to neighbours, about (V/N)^(1/3), change together
 
-    Axes without inertia do not turn. The gradient of the strain is that of the molecular virial W = sum F (x) R:
-    dU/dT_ij = -W_ji. Forces between sites are in double precision: in single, energies near a minimum have too few
-    digits.
+    Axes without inertia do not turn. The derivative for the strain follows from the molecular virial W = sum F (x) R,
+    dU/dT_ij = -W_ji. Forces between sites are in double precision, because energies in single precision have too few
+    digits near a minimum.
 
-    state : whose volume scales the strain
+    state : its volume scales the strain
     """
 
     def __init__(self, system: System, stage: Stage, state: State):
@@ -58,7 +58,7 @@ class Enthalpy:
         self.turns = (model.inertia > 0)[model.species][:turning]
         radius = np.array([m.radius for m in system.species])
         self._arm = np.where(radius > 0, radius, 1.0)[model.species][:turning, None]
-        #: Which coordinate each component of the strain has, -1 for none.
+        #: Coordinate of each component of the strain; -1: none.
         self.coordinate = np.array(COUPLINGS[stage.pressure_coupling] if stage.changes_box else [-1] * 6)
         self.asked = np.array(stage.pressures[0] if stage.changes_box else [0.0] * 6) * BAR
         shared = np.bincount(self.coordinate[self.coordinate >= 0])
@@ -67,7 +67,7 @@ class Enthalpy:
         self._ends = np.cumsum([state.position.size, self.turns.size])
 
     def at(self, state: State) -> Point:
-        """Energy and gradient at a state, which is kept. Raises SimulationError."""
+        """Energy and gradient at a state, which is not copied. Raises SimulationError."""
         load, tallies = self.engine.evaluate(state)
         parts = [*(tally.energy for tally in tallies.values()), *self._system.constants.values()]
         volume, pressure = state.volume, np.full(6, nan)
@@ -106,10 +106,10 @@ class Enthalpy:
         return found
 
     def gain(self, point: Point, other: Point, move: np.ndarray) -> float:
-        """By how much the enthalpy of another point, which a move led to, is higher; u Å²/ps².
+        """Change of the enthalpy by a move from a point to another, u Å²/ps².
 
-        As in `boxes` the work of what the pressure has besides its mean is that of a true (Cauchy) stress in the mean
-        volume: no function of the cell has it, which is why enthalpies are compared across a move only.
+        Deviatoric pressures act as true (Cauchy) stress, as in `boxes`: their work is that in the mean volume of the
+        move. It is not a difference of a function of the cell, so only changes are defined, not the enthalpy itself.
         """
         gained = other.energy - point.energy
         if not len(self._lengths):
@@ -119,21 +119,23 @@ class Enthalpy:
         return gained + mean * (after - before) + 0.5 * (before + after) * float(deviation @ self._parts(move)[2])
 
     def reach(self, move: np.ndarray) -> tuple[float, float]:
-        """How far the molecule goes that a move takes furthest, by its shift or turn, Å; the largest strain."""
+        """Largest shift or rotation (times the radius) of a molecule in a move, Å; largest strain."""
         shift, turn, strain = self._parts(move)
         lengths = [np.linalg.norm(part, axis=1).max(initial=0.0) for part in (shift, turn)]
         return float(max(lengths)), float(np.abs(strain).max())
 
     def largest(self, point: Point) -> tuple[float, float, float]:
-        """Largest force on a molecule (u Å/ps²), torque about a principal axis (u Å²/ps²) and deviation of the pressure
-        in a coordinate of the strain (u/(Å ps²); 0 where the cell is kept)."""
+        """Largest force (u Å/ps²), torque about a principal axis (u Å²/ps²) and deviation of the pressure (u/(Å ps²)).
+
+        Pressures are averaged over the components that share a coordinate; 0 if the cell does not relax.
+        """
         force = np.linalg.norm(point.load.force[self.free], axis=1).max(initial=0.0)
         torque = np.abs(point.load.torque_body * self.turns).max(initial=0.0)
         off = [abs(np.mean((point.pressure - self.asked)[self.coordinate == c])) for c in range(len(self._lengths))]
         return float(force), float(torque), float(max(off, default=0.0))
 
     def _parts(self, move: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Shifts (n, 3) and turns (n, 3), both Å, and strains (6,) of a move."""
+        """Shifts (n, 3) and scaled rotations (n, 3), Å, and strains (6,) of a move."""
         shift, turn, strain = np.split(move, self._ends)
         each = np.append(strain / self._lengths, 0.0)[self.coordinate]
         return shift.reshape(-1, 3), turn.reshape(-1, 3), each

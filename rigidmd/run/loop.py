@@ -49,13 +49,13 @@ def _as_warning(sentence: str) -> None:
 
 
 class Stretch(NamedTuple):
-    """A stretch of equal steps, or what is done in no time."""
+    """A stretch of equal steps, or an action that takes no time."""
 
     row: Scheme | Solver
     dt: float  # ps, or s for a single body
     steps: int
     counted: int = 0  # steps before it from which observers count their intervals
-    act: Callable[[bool | None], None] | None = None  # done before its steps; told whether to show progress
+    act: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
 
 
 class Costs(NamedTuple):

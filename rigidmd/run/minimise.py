@@ -1,4 +1,4 @@
-"""Minimisation in the rigid degrees of freedom: from a state to the minimum of energy or enthalpy beside it."""
+"""Minimisation of energy or enthalpy in the rigid degrees of freedom, from a state to a minimum near it."""
 
 from collections import deque
 from collections.abc import Callable
@@ -17,24 +17,26 @@ from rigidmd.run.relief import LONGEST_MOVE, relieve
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, KJ_PER_MOL
 
-#: Pairs of moves and changes of the gradient that curvature is known from.
+#: Stored pairs of moves and changes of the gradient.
 MEMORY = 20
-#: The first move goes so far, in the longest one; without curvature each is up to twice as long as the one before.
+#: Length of the first move as a fraction of the longest allowed one. As long as no curvature is known, it is doubled
+#: after each move.
 FIRST_MOVE = 0.1
-#: A move is taken if it gains this part of what the slope at its begin promises (Nocedal & Wright 2006, 3.4), or, where
-#: the gain is lost in the rounding of the energy, if the slope has not turned up by more than (Hager & Zhang 2005, SIAM
-#: J. Optim. 16, 170) this part of it.
-PROMISED, TURNED = 1e-4, 0.8
-#: Rounding of an energy, as a part of it.
+#: Sufficient decrease: the least gain of a move as a fraction of slope times length (Nocedal & Wright 2006, eq. 3.4).
+DECREASE = 1e-4
+#: Where rounding hides the gain, the slope at the end of a move decides: it may have at most this fraction of its size
+#: at the start, with the other sign (Hager & Zhang 2005, SIAM J. Optim. 16, 170, eq. 4.1 with delta = 0.1).
+OPPOSITE_SLOPE = 0.8
+#: Rounding error of an energy relative to the sum of its parts.
 ROUNDING = 1e-13
-#: Moves tried along a line, each at most half of the one before.
+#: Most trial moves along a direction; each is at most half as long as the one before.
 TRIALS = 30
-#: What cannot be, a box too small for the cut-off, is reached where moves have to be shortened to this.
-CREEPING = 1e-3
-#: Forces beyond this many deepest wells over the smallest diameter are those of an overlap: 0.77 diameters of argon.
+#: If a move fails with an error even after it has been shortened by this factor, the error is final.
+SHORTEST = 1e-3
+#: Forces above this limit, in deepest wells over the smallest diameter, come from overlaps: argon at 0.77 diameters.
 OVERLAPPING = 1000.0
-#: Iterations between two looks for charges that have fallen on one another.
-LOOK = 100
+#: Iterations between two searches for opposite charges on top of each other.
+SEARCH_INTERVAL = 100
 
 
 def minimise(
@@ -44,22 +46,23 @@ def minimise(
     stop: Callable[[], bool] = lambda: False,
     advanced: Callable[[float], object] = lambda iterations: None,
 ) -> Minimum:
-    """Move a state, in place, to the minimum of energy or enthalpy that a stage asks for; momenta and time stay.
+    """Move a state, in place, to a minimum of energy or enthalpy as a stage asks for; momenta and time do not change.
 
-    What the energy gains, mostly less than nothing, is booked as work. L-BFGS (Nocedal & Wright 2006, algorithm 7.5)
-    with moves of bounded length. A library's does not fit: turns are no vector space, so each iteration begins from the
-    present orientations; and a line search without a bound would let charges without a repulsion, such as the hydrogens
-    of water, through the walls about them. It has converged where forces, torques and pressure are within the limits of
-    the stage, whatever the energy does.
+    The method is L-BFGS (Nocedal & Wright 2006, algorithm 7.5) with moves of bounded length. Convergence is judged by
+    forces, torques and pressure alone. The change of energy is booked as work.
 
-    stop : asked before each iteration whether to leave it at that; advanced : told of each iteration
+    A library's optimiser does not fit. Rotations are no vector space: each iteration starts from the present
+    orientations. An unbounded line search can put a charge without repulsion of its own, such as a hydrogen of water,
+    on an opposite charge.
 
-    Raises SimulationError where the energy has no lower bound or is no finite number.
+    stop : called before each iteration; the minimisation ends if it is true; advanced : called after each with 1
+
+    Raises SimulationError if the energy has no lower bound or is not a finite number.
     """
     enthalpy = Enthalpy(system, stage, state)
     point = start = enthalpy.at(state.copy())
     if not start.is_finite:
-        raise SimulationError("energy or forces are no finite numbers: sites of different molecules coincide")
+        raise SimulationError("energy or forces are not finite numbers: sites of different molecules coincide")
     relief_steps = _relieve(system, enthalpy, point.state)
     if relief_steps:
         point = enthalpy.at(point.state)
@@ -80,7 +83,7 @@ def minimise(
         iterations += 1
         advanced(1)
         _check_volume(system, start, point)
-        if iterations % LOOK == 0:
+        if iterations % SEARCH_INTERVAL == 0:
             _check_charges(system, point)
     if not converged:
         _check_charges(system, point)
@@ -104,17 +107,17 @@ def _is_within(enthalpy: Enthalpy, point: Point, stage: Stage) -> bool:
 
 
 class _Descent:
-    """L-BFGS with what it remembers of the way.
+    """The iterations of L-BFGS and their memory.
 
-    What it remembers are vectors in the frames of the moment; between iterations they are taken over as they are, which
-    is exact to the order of a turn.
+    The components of stored vectors along rotations refer to the body axes of their own iteration. They are used
+    unchanged later: the error is of the order of the rotation in between.
     """
 
     def __init__(self, enthalpy: Enthalpy, diameter: float):
         self._enthalpy = enthalpy
         self._longest = LONGEST_MOVE * diameter
         self._memory: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
-        self._share = FIRST_MOVE  # of the longest move, where no curvature is known
+        self._share = FIRST_MOVE  # of the longest move, while no curvature is known
 
     def step(self, point: Point) -> Point | None:
         """The next point, lower than this one; None if there is none. Raises SimulationError."""
@@ -134,7 +137,7 @@ class _Descent:
         return other
 
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
-        """The move that curvature suggests, or one downhill, no longer than the longest."""
+        """The quasi-Newton move, or one along the negative gradient; no longer than allowed."""
         if self._memory:
             found = gradient.copy()
             shares = []
@@ -152,25 +155,28 @@ class _Descent:
         return -gradient * self._share * self._bound(gradient)
 
     def _bound(self, move: np.ndarray) -> float:
-        """By what a move may be multiplied."""
+        """The factor that makes a move as long as allowed."""
         length, strain = self._enthalpy.reach(move)
         return 1 / max(length / self._longest, strain / LONGEST_DRIFT)
 
     def _along(self, point: Point, direction: np.ndarray) -> tuple[np.ndarray, Point] | None:
-        """A move along a direction that is taken, and where it leads; None if there is none. Raises SimulationError."""
+        """An accepted move along a direction and the point that it leads to; None if there is none.
+
+        Raises SimulationError.
+        """
         slope, share, noise = float(direction @ point.gradient), 1.0, ROUNDING * point.scale
         for _ in range(TRIALS):
             move = share * direction
             try:
                 other = self._enthalpy.at(self._enthalpy.moved(point.state, move))
             except SimulationError:  # behind a wall, or a box too small for the cut-off
-                if share < CREEPING:
+                if share < SHORTEST:
                     raise
                 share *= 0.1
                 continue
             gain = self._enthalpy.gain(point, other, move) if other.is_finite else inf
-            lower = gain <= PROMISED * share * slope
-            flat = gain <= noise and other.gradient @ direction <= TURNED * abs(slope)
+            lower = gain <= DECREASE * share * slope
+            flat = gain <= noise and other.gradient @ direction <= OPPOSITE_SLOPE * abs(slope)
             if lower or flat:
                 return move, other
             share *= min(0.5, max(0.1, -slope * share / (2 * (gain - slope * share)))) if isfinite(gain) else 0.1
@@ -178,19 +184,19 @@ class _Descent:
 
 
 def _relieve(system: System, enthalpy: Enthalpy, state: State) -> int:
-    """Move apart what overlaps, in place; the steps that this took."""
+    """Move overlapping molecules apart, in place; the number of steps."""
     deepest = max((m.epsilon.max() for m in system.species), default=0.0)
     if not (deepest > 0 and enthalpy.free.any()):
         return 0
     scale, radius = system.smallest_diameter, np.array([m.radius for m in system.species])
     lightest = float(system.model.mass[system.model.species][enthalpy.free].min())
-    # the step in which a force of so many wells over the diameter gives the lightest molecule the momentum of one
+    # in this time step the limit of the force gives the lightest molecule a momentum of thermal size at kT = one well
     step = scale * np.sqrt(lightest / deepest) / OVERLAPPING
     return relieve(system.model, enthalpy.engine, state, radius, scale, deepest, step).steps
 
 
 def _check_volume(system: System, start: Point, point: Point) -> None:
-    """Raise SimulationError where nothing holds the box together."""
+    """Raise SimulationError if the box grows without bound."""
     largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
     if point.state.volume < inf and largest and grown > largest:
         raise SimulationError(
@@ -201,7 +207,7 @@ def _check_volume(system: System, start: Point, point: Point) -> None:
 
 
 def _check_charges(system: System, point: Point) -> None:
-    """Raise SimulationError where charges have fallen on one another: the energy then has no lower bound."""
+    """Raise SimulationError if opposite charges are on top of each other: the energy then has no lower bound."""
     pair = watch.pair_in_core(system, point.state, None)
     if pair is None or not pair.bare:
         return

@@ -153,7 +153,7 @@ class MolecularSimulation(Simulation):
         return Stretch(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
 
     def _minimise(self, progress: bool | None) -> None:
-        """Go to the minimum of the present stage, with a warning where it is not reached."""
+        """Minimise as the present stage says, with a warning if it does not converge."""
         k = self._stage
         stage = self.scene.stages[k]
         with progress_of(stage.most_iterations, "iterations", progress) as advanced:
