@@ -5,6 +5,9 @@ dipoles and crystals.
 standard errors: 4.5 where many figures are compared at once, else 3.5.
 """
 
+import contextlib
+import io
+import re
 import warnings
 from typing import NamedTuple
 
@@ -222,6 +225,125 @@ def test_kinetic_energies_are_those_of_the_temperature(name, thermostat):
         assert equipartition_judged(course, temperature) < MANY
 
 
+# Ensembles at two states.
+
+#: Two-centre Lennard-Jones: sigma 3 Å, epsilon 100 K, 20 u a site, L* = 0.67.
+DIAMETER, DEPTH = 3.0, 100.0
+DUMBBELL = {
+    "name": "dumbbell",
+    "sites": [
+        {"name": name, "mass_u": 20.0, "sigma_A": DIAMETER, "epsilon_K": DEPTH, "position_A": [0.0, 0.0, z]}
+        for name, z in (("A", -0.335 * DIAMETER), ("B", 0.335 * DIAMETER))
+    ],
+}
+
+
+def dumbbells(count: int, forces: dict, *stages: dict) -> dict:
+    """A scene of dumbbells at 0.458 a sigma³."""
+    edge = DIAMETER * (count / 0.458) ** (1 / 3)
+    return {
+        "box": {"lengths_A": edge},
+        "molecules": [DUMBBELL | {"count": count}],
+        "forces": forces,
+        "start": {"temperature_K": 200.0},
+        "stages": list(stages),
+    }
+
+
+def state_data(course: Course, temperature: float, pressure: float | None = None) -> pv.data.SimulationData:
+    """A stage at a temperature (K), and at a pressure (bar)."""
+    ensemble = {"ensemble": "NVT", "volume": 1.0} if pressure is None else {"ensemble": "NPT", "pressure": pressure}
+    return pv.data.SimulationData(
+        units=UNITS,
+        ensemble=pv.data.EnsembleData(natoms=len(course.system.model.species), temperature=temperature, **ensemble),
+        observables=pv.data.ObservableData(
+            potential_energy=course["potential"], total_energy=course["energy"], volume=course["volume"]
+        ),
+    )
+
+
+def ensemble_judged(name: str, one, two, **options) -> float:
+    """How far slopes of the log ratio of two distributions are from the true ones, in standard errors."""
+    printed = io.StringIO()
+    with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
+        warnings.simplefilter("ignore")
+        found = pv.ensemble.check(one, two, verbosity=1, **options)
+    rows = re.findall(r"^\s+(\S+)\s+\+/-\s+(\S+)\s+\|\s+(\S+)", printed.getvalue(), re.MULTILINE)
+    for slope, error, true in rows[: len(found)]:  # the same follows as differences of temperature and pressure
+        told(f"{name}, slope", float(slope), float(error), float(true))
+        assert float(error) < 0.15 * abs(float(true))  # a slope that is not known tells nothing
+    return float(np.max(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("thermostat", THERMOSTATS)
+def test_energies_at_two_temperatures(thermostat):
+    """ln [p2(U)/p1(U)] has the slope 1/kT1 - 1/kT2."""
+    found = []
+    for temperature in (190.0, 230.0):
+        common = {"temperature_K": temperature, "timestep_fs": 4.0}
+        stage = common | {"ensemble": "nvt", "thermostat": thermostat} | THERMOSTATS[thermostat]
+        warm = common | WARM | {"duration_ps": 20.0}
+        forces = {"cutoff_A": 6.5, "truncation": "smooth_switch"}
+        course = follow(dumbbells(50, forces, warm, stage | {"duration_ps": 400.0}), 0.2)
+        found.append(state_data(course, temperature))
+    assert ensemble_judged(f"{thermostat}, U", *found) < FEW
+    assert ensemble_judged(f"{thermostat}, E", *found, total_energy=True) < FEW
+
+
+@pytest.mark.slow
+def test_energies_of_water_at_two_temperatures():
+    """The same of SPC/E with a reaction field, langevin."""
+    found = []
+    for temperature in (290.0, 330.0):
+        stage = {"temperature_K": temperature, "timestep_fs": 1.0} | WARM
+        scene = liquid("spce", stage | {"duration_ps": 10.0}, stage | {"duration_ps": 150.0})
+        found.append(state_data(follow(scene, 0.15), temperature))
+    assert ensemble_judged("SPC/E, langevin, U", *found) < FEW
+
+
+BAROSTATS = {
+    "cell_rescaling": {"barostat_time_ps": 0.2, "barostat_interval_ps": 0.02, "compressibility_per_bar": 5e-4},
+    "monte_carlo": {"barostat_interval_ps": 0.02, "compressibility_per_bar": 2e-4},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("barostat", BAROSTATS)
+def test_volumes_and_enthalpies_at_two_states(barostat):
+    """Slopes (p1 - p2)/kT of V, 1/kT1 - 1/kT2 of the enthalpy, and both together of U and V."""
+    found = []
+    for temperature, pressure in ((200.0, 1000.0), (200.0, 1450.0), (240.0, 1000.0)):
+        common = {"temperature_K": temperature, "timestep_fs": 4.0}
+        stage = common | {"ensemble": "npt", "thermostat": "langevin", "pressure_bar": pressure, "barostat": barostat}
+        stage |= THERMOSTATS["langevin"] | BAROSTATS[barostat]
+        forces = {"cutoff_A": 6.3, "truncation": "smooth_switch"}
+        scene = dumbbells(50, forces, stage | {"duration_ps": 20.0}, stage | {"duration_ps": 400.0})
+        course = follow(scene, 0.2)
+        tried, accepted = (course.results.summary["stages"][-1][f"moves_{what}"] for what in ("tried", "accepted"))
+        print(f"{barostat}: {accepted / tried:.2f} of the moves accepted")
+        found.append(state_data(course, temperature, pressure))
+    base, squeezed, warm = found
+    assert ensemble_judged(f"{barostat}, V", base, squeezed) < FEW
+    assert ensemble_judged(f"{barostat}, H", base, warm) < FEW
+    assert ensemble_judged(f"{barostat}, U and V", squeezed, warm) < FEW
+
+
+@pytest.mark.slow
+def test_fluctuations_of_the_energy_fall_with_the_square_of_the_step():
+    """NVE, velocity Verlet, of a mixture: rms fluctuations of the energy at steps that are halved."""
+    found = []
+    for step in (1.0, 0.5, 0.25):
+        warm, nve = WARM | {"duration_ps": 3.0}, {"timestep_fs": step, "temperature_K": None}
+        # so short that the three are one trajectory
+        course = follow(liquid("mixture", warm, nve | {"duration_ps": 0.5}), 0.001)
+        observed = pv.data.ObservableData(constant_of_motion=course["energy"])
+        found.append(pv.data.SimulationData(units=UNITS, dt=step, observables=observed))
+    deviation = pv.integrator.convergence(found)
+    print(f"largest deviation from 4 at each halving: {deviation:.3f}")
+    assert deviation < 0.1
+
+
 # A dipole in a field.
 
 #: TIP4P/2005 without its Lennard-Jones site: nothing acts between these molecules.
@@ -257,6 +379,21 @@ def orientations(thermostat: dict, step: float, duration: float, interval: float
     return cosine.mean(axis=1), float(1 / np.tanh(x) - 1 / x)
 
 
+@pytest.mark.slow
+def test_a_dipole_in_a_field():
+    """<cos> = coth x - 1/x, x = mu E/kT, to 1e-3; and what a long step adds."""
+    friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0}
+    for name, thermostat, step in (("langevin", friction, 2.0), ("andersen", {"thermostat": "andersen",
+                                    "thermostat_time_ps": 0.1}, 2.0)):  # fmt: skip
+        cosine, exact = orientations(thermostat, step, 120.0, 0.2, 2000)
+        error = error_of(cosine)
+        assert error < 5e-4
+        assert told(f"<cos> of a dipole, {name}, {step:g} fs", cosine.mean(), error, exact) < FEW
+        assert cosine.mean() == pytest.approx(exact, abs=1e-3)
+    cosine, exact = orientations(friction, 20.0, 120.0, 0.2, 2000)
+    told("<cos> of a dipole, langevin, 20 fs", cosine.mean(), error_of(cosine), exact)
+
+
 def test_a_few_dipoles_in_a_field():
     """The same to 1 %, in seconds."""
     cosine, exact = orientations({"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400)
@@ -265,6 +402,66 @@ def test_a_few_dipoles_in_a_field():
 
 
 # Liquids and crystals at a pressure.
+
+PRESSURE_UNIT = DEPTH * BOLTZMANN / DIAMETER**3 / BAR  # bar
+#: Of Mecke's equation of state at T* = 2 and p* = 2.013: density, residual energy; what is taken as its own uncertainty.
+DENSITY, ENERGY, UNCERTAIN = 0.458, -10.900, (5e-4, 0.01)
+
+
+def compressed(barostat: str, pressure: float, duration: float) -> tuple:
+    """Dumbbells at T* = 2 and a pressure (bar): volume a molecule and residual energy, reduced, over time."""
+    stage = {
+        "ensemble": "npt", "temperature_K": 2 * DEPTH, "pressure_bar": pressure, "barostat": barostat,
+        "timestep_fs": 4.0, "thermostat": "velocity_rescaling",
+    } | BAROSTATS[barostat]  # fmt: skip
+    forces = {"cutoff_A": 11.7, "truncation": "plain", "tail_correction": True}
+    course = follow(dumbbells(256, forces, stage | {"duration_ps": 15.0}, stage | {"duration_ps": duration}), 0.1)
+    return course["volume"] * 1e3 / DIAMETER**3 / 256, course["potential"] * KJ_PER_MOL / (256 * BOLTZMANN * DEPTH)
+
+
+@pytest.mark.slow
+def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state():
+    """Two-centre Lennard-Jones, L* = 0.67, T* = 2, p* = 2.013: density and energy by either barostat; <dV²>/(V kT)
+    against -d ln V/dp between two pressures about it."""
+    middle, apart = 2.013, 0.4
+    found = {barostat: compressed(barostat, middle * PRESSURE_UNIT, 250.0) for barostat in BAROSTATS}
+    for barostat, (volume, energy) in found.items():
+        for name, values, reference, own in (
+            ("density", 1 / volume, DENSITY, UNCERTAIN[0]),
+            ("residual energy", energy, ENERGY, UNCERTAIN[1]),
+        ):
+            error = error_of(values)
+            told(f"two-centre liquid, {barostat}, {name}", values.mean(), error, reference)
+            assert error < 0.003 * abs(reference)
+            assert abs(values.mean() - reference) < FEW * error + own
+    for k, name in enumerate(("volume", "residual energy")):
+        one, other = (values[k] for values in found.values())
+        error = np.hypot(error_of(one), error_of(other))
+        assert told(f"cell_rescaling less monte_carlo, {name}", one.mean() - other.mean(), error, 0.0) < FEW
+    ends = [compressed("cell_rescaling", (middle + sign * apart) * PRESSURE_UNIT, 100.0)[0] for sign in (1, -1)]
+    slope = -np.log(ends[0].mean() / ends[1].mean()) / (2 * apart)
+    error_of_slope = np.hypot(*(error_of(end) / end.mean() for end in ends)) / (2 * apart)
+    assert error_of_slope < 0.1 * slope
+    for barostat, (volume, _) in found.items():
+        value = 256 * volume.var() / (2 * volume.mean())
+        error = value * error_of((volume - volume.mean()) ** 2) / volume.var()
+        assert error < 0.25 * slope
+        assert told(f"compressibility by fluctuations, {barostat}", value, np.hypot(error, error_of_slope), slope) < FEW
+
+
+@pytest.mark.slow
+def test_a_piston_keeps_the_mean_pressure():
+    """nph: over time the pressure is the one asked for."""
+    warm = WARM | {"temperature_K": 200.0, "timestep_fs": 4.0, "duration_ps": 10.0}
+    nph = {"ensemble": "nph", "pressure_bar": 1000.0, "timestep_fs": 2.0, "barostat_time_ps": 0.5}
+    forces = {"cutoff_A": 6.3, "truncation": "smooth_switch", "tail_correction": True}
+    course = follow(dumbbells(50, forces, warm, nph | {"duration_ps": 10.0}, nph | {"duration_ps": 150.0}), 0.05)
+    pressure = course["pressure_bar"]
+    error = error_of(pressure)
+    assert error < 10
+    assert told("nph, pressure, bar", pressure.mean(), error, 1000.0) < FEW
+    assert np.ptp(course["volume"]) > 0.03 * course["volume"].mean()
+
 
 #: Argon, 108 atoms at 40 K and 1000 bar.
 COLD, PRESSED, SHEAR = 40.0, 1000.0, 250.0
