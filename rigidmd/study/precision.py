@@ -7,8 +7,8 @@ from rigidmd.errors import SceneError
 from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
 from rigidmd.measure.trials import Precision, Subject, measure, plan
-from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.study.averages import start_of_last_stage
 from rigidmd.validation import meant
 
 #: Tried when no others are asked for: the common one, the best of each kind, and of a body what textbooks do.
@@ -90,14 +90,7 @@ def _own(scene: MolecularScene | BodyScene) -> str:
 def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, float]:
     """The subject, and the time step of the scene for one force evaluation (fs)."""
     last = scene.stages[-1]
-    simulation = MolecularSimulation(scene)
-    if len(scene.stages) > 1:
-        quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 1e9})
-        earlier = MolecularSimulation(scene.model_copy(update={"stages": scene.stages[:-1], "output": quiet}))
-        state = earlier.run().state
-    else:
-        simulation.start()
-        state = simulation.state
+    simulation, state = start_of_last_stage(scene)
     subject = molecular_subject(simulation.system, state, last.rotor, span or SPAN_PS)
     subject.rounding = rounding(simulation.system, state)
     own = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
