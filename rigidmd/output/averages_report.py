@@ -174,8 +174,8 @@ def draw(path: Path, found: Averages) -> None:
         axis.set_title(f"{quantity.name}, {_unit(quantity)}", loc="left", fontsize=9, color=INK)
         axis.set_xlim(left=0)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.annotate(f"{SHARE:.0%} of {_scale(quantity)}", (1, found.allowed(quantity)),
-                      xycoords=("axes fraction", "data"), fontsize=7, color=FAINT, ha="right", va="bottom")  # fmt: skip
+        axis.annotate(f"{SHARE:.0%} of {_scale(quantity)}", (0.02, found.allowed(quantity)),
+                      xycoords=("axes fraction", "data"), fontsize=7, color=FAINT, ha="left", va="bottom")  # fmt: skip
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
     for axis in axes[max(0, len(shown) - columns) : len(shown)]:

@@ -41,6 +41,9 @@ USED = {
     "compressibility_per_bar": {"npt", "nph"},
 }
 
+#: What may be asked of the integrator and step that are left to a pilot.
+ASKED = ("energy_error_kT", "trajectory_error", "bias_kT")
+
 #: Names that users of other programs ask for, and what to say.
 REFUSED = {
     "berendsen": "'berendsen' samples no ensemble: its fluctuations are too small and heat flows into the slowest "
@@ -101,6 +104,8 @@ class Stage(Section):
     """With auto: rms error of the energy, in kT per degree of freedom"""
     trajectory_error: Positive | None = None
     """With auto: largest error of Q (of X in Å, of points) at the end of the pilot run, ten radians of libration"""
+    bias_kT: Positive | None = None
+    """With auto, of nvt: estimated bias of the average potential energy, in kT per degree of freedom"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; the one that the integrator needs when not given"""
 
@@ -141,8 +146,10 @@ class Stage(Section):
         decided = [
             key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default
         ]
-        asked = {"energy_error_kT": self.energy_error_kT, "trajectory_error": self.trajectory_error}
+        asked = {key: getattr(self, key) for key in ASKED}
         faults += auto_faults(self.integrator, asked, decided)
+        if self.bias_kT is not None and not self.has_thermostat:
+            faults.append(f"bias_kT is of averages at a temperature, and {self.ensemble} has no thermostat")
         if not self.duration_ps * 1000 / self.timestep_fs < MOST_STEPS:
             faults.append(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
         if self.duration_ps * 1000 < 0.5 * self.timestep_fs:
@@ -199,8 +206,8 @@ class Stage(Section):
 
     def decided(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with what a pilot has chosen."""
-        none = {"energy_error_kT": None, "trajectory_error": None}
-        return self.model_copy(update={"integrator": integrator, "timestep_fs": timestep_fs} | none)
+        changes = {"integrator": integrator, "timestep_fs": timestep_fs}
+        return self.model_copy(update=changes | dict.fromkeys(ASKED))
 
     @property
     def resolved(self) -> "Stage":

@@ -15,7 +15,7 @@ from rigidmd.measure.summary import mean
 from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.run.observers import Every
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.stage import THERMOSTAT_TIMES, Stage
+from rigidmd.scene.stage import ASKED, THERMOSTAT_TIMES, Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 from rigidmd.validation import meant
 
@@ -29,8 +29,8 @@ AROUND = (0.5, 1.0, 2.0, 4.0)
 SAMPLE_PS = 20.0
 #: Time before sampling, in the time sampled: the start is from a distribution of another step.
 SETTLING = 0.2
-#: Averages are taken from looks this far apart, ps.
-LOOK_PS = 0.02
+#: Averages are taken from looks this far apart, ps, and of long runs from no more than so many.
+LOOK_PS, MOST_LOOKS = 0.02, 4000
 
 
 def averages(
@@ -157,17 +157,18 @@ def _changed(stage: Stage, integrator: str, thermostat: str, step: float, sample
     """The stage by another method at another step; what it says of its own thermostat and rotor holds only for them."""
     changes = {"integrator": integrator, "thermostat": thermostat, "timestep_fs": step}
     changes |= {"duration_ps": (1 + SETTLING) * sample}
-    changes |= dict.fromkeys(("energy_error_kT", "trajectory_error", "bias_kT"))
+    changes |= dict.fromkeys(ASKED)
     if thermostat != stage.thermostat_kind:
         changes["thermostat_time_ps"] = None
     if integrator != stage.integrator:
         changes["rotor"] = None
-    return stage.model_copy(update={key: value for key, value in changes.items() if key in Stage.model_fields})
+    return stage.model_copy(update=changes)
 
 
 def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, sample: float, progress: Every) -> None:
     """Run a stage from a state, and put means and cost into `run`."""
-    output = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": LOOK_PS})
+    interval = max(LOOK_PS, sample / MOST_LOOKS)
+    output = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
     changed = scene.model_copy(update={"stages": (stage,), "output": output})
     simulation = MolecularSimulation(changed, observers=progress, warn=lambda warning: None)
     simulation.start_from(state)
