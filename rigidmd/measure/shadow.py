@@ -35,7 +35,7 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: Bias of U in kT per degree of freedom, in x.
 BIAS = {"velocity_verlet": 1 / 8, "baoab": 1 / 24}
-#: C of liquids is up to about twice that of harmonic motions, and so is the bias of velocity Verlet: 216 SPC/E waters.
+#: The heat capacity of water says that C may be twice that of harmonic motions; the bias of velocity Verlet then too.
 ALLOWANCE = {"velocity_verlet": 2.0, "baoab": 1.0}
 #: The same in words.
 BASIS = {
@@ -77,7 +77,7 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     if target is None:
         raise ValueError("no bias is asked for")
     found = stiffest(system, state)
-    rate = _mean_square_rate(system, state, k)
+    rate = mean_square_rate(system, state, k)
     steps = {}
     for integrator in BIAS:
         if integrator == "baoab" and not _may_use_langevin(stage):
@@ -99,17 +99,17 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
 
 def _may_use_langevin(stage: Stage) -> bool:
     """Whether the stage has Langevin's thermostat, or says nothing of its thermostat."""
-    if stage.thermostat is None:
-        return stage.thermostat_time_ps is None
-    return stage.thermostat == "langevin"
+    return stage.leaves_thermostat or stage.thermostat == "langevin"
 
 
 def _decided(stage: Stage, integrator: str, timestep_fs: float) -> Stage:
     decided = stage.decided(integrator, timestep_fs)
-    return decided.model_copy(update={"thermostat": "langevin"}) if integrator == "baoab" else decided
+    if integrator == "baoab":
+        decided = decided.model_copy(update={"thermostat": "langevin"})
+    return decided.resolved
 
 
-def _mean_square_rate(system: System, state: State, k: int) -> float:
+def mean_square_rate(system: System, state: State, k: int) -> float:
     """Mean w² of a degree of freedom (1/ps²) in stage k, over the second half of a pilot run from a state on."""
     stage = system.scene.stages[k]
     thermal = BOLTZMANN * max(stage.temperatures)

@@ -204,6 +204,11 @@ class Stage(Section):
         """Whether integrator and step are still to be chosen."""
         return self.integrator == AUTO
 
+    @property
+    def leaves_thermostat(self) -> bool:
+        """Whether the thermostat is chosen with the integrator: a bias is asked for, and nothing of a thermostat."""
+        return self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
+
     def decided(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with what a pilot has chosen."""
         changes = {"integrator": integrator, "timestep_fs": timestep_fs}
@@ -213,7 +218,7 @@ class Stage(Section):
     def resolved(self) -> "Stage":
         """This stage with every number that it uses."""
         found: dict[str, Any] = {}
-        if self.has_thermostat:
+        if self.has_thermostat and not self.leaves_thermostat:
             found |= {"thermostat": self.thermostat_kind}
             if self.thermostat_kind == "langevin":
                 translation, rotation = self.frictions

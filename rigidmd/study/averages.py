@@ -51,6 +51,8 @@ def averages(
     told = [_method(name, stage) for name in methods] if methods else _usual(stage)
     if not (sample > 0 and all(step > 0 for step in timesteps or [])):
         raise SceneError("precision", ["time steps and --sample-ps must be greater than 0"])
+    if timesteps and max(timesteps) * FEMTOSECOND > sample:
+        raise SceneError("--timesteps", [f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"])
     simulation, state = start_of_last_stage(scene)
     remove_momentum(simulation.system.model, state.velocity)
     found = stiffest(simulation.system, state)
