@@ -4,6 +4,7 @@ import argparse
 import json
 import shlex
 import sys
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,7 +102,9 @@ def _parser() -> argparse.ArgumentParser:
         _precision,
         "measure the error and the run time of integrators at several time steps",
         "rigidmd precision systems/heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
-        "  rigidmd precision systems/heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles",
+        "  rigidmd precision systems/heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles\n"
+        "  rigidmd precision liquid.toml --averages --sample-ps 50 --timesteps 1,2,4,6,8 "
+        "--integrators baoab,velocity_verlet+nose_hoover",
     )
     _scene_arguments(precision)
     precision.add_argument(
@@ -117,8 +120,17 @@ def _parser() -> argparse.ArgumentParser:
         "--repeats", type=int, default=3, metavar="N", help="timings of each run (default: 3); 1 shows no spread"
     )
     precision.add_argument(
-        "--averages", type=float, metavar="PS",
-        help="molecules only: also average temperatures, energy and pressure over this many ps at each time step",
+        "--averages", type=float, metavar="PS", nargs="?", const=inf,
+        help="of molecules: also average temperatures, energy and pressure over so many ps with every step, at "
+        "constant energy. With no PS behind it, instead of all else: sample the last stage under its thermostat (nvt, "
+        "npt) with every integrator at every step, and tell the bias of averages. --integrators then takes names with "
+        "a thermostat, baoab+langevin (default: that of the stage, baoab+langevin, "
+        "velocity_verlet+velocity_rescaling, velocity_verlet+nose_hoover), and --timesteps default to shares of the "
+        "longest stable one",
+    )  # fmt: skip
+    precision.add_argument(
+        "--sample-ps", type=float, metavar="PS",
+        help="with --averages alone: time sampled with every step, after a fifth of it (default: 20)",
     )  # fmt: skip
     precision.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-precision)")
     precision.add_argument("--force", action="store_true", help="replace earlier results in that folder")
@@ -354,6 +366,10 @@ def _precision(options: argparse.Namespace) -> int:
         timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
     except ValueError:
         raise SceneError("--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]) from None
+    if options.averages == inf:
+        return _averages(options, scene, folder, integrators, timesteps)
+    if options.sample_ps is not None:
+        raise SceneError("--sample-ps", ["it goes with --averages that has no PS of its own"])
     _say("compiling and running the reference")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         found = precision(
@@ -368,6 +384,27 @@ def _precision(options: argparse.Namespace) -> int:
     print(table_text(found), "", *advice(found), sep="\n")
     make_folder(folder, options.force, FILES)
     written = write_precision(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    return 0
+
+
+def _averages(
+    options: argparse.Namespace, scene, folder: Path, methods: list[str] | None, timesteps: list[float] | None
+) -> int:
+    """`precision --averages`."""
+    from tqdm import tqdm
+
+    from rigidmd.output.averages_report import FILES, advice, table_text, write_averages
+    from rigidmd.output.folder import make_folder
+    from rigidmd.study.averages import SAMPLE_PS, averages
+
+    sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
+    _say("compiling, and running what comes before the last stage")
+    with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
+        found = averages(scene, methods, timesteps, sample, lambda share: bar.update(share - bar.n))
+    print(table_text(found), "", *advice(found), sep="\n")
+    make_folder(folder, options.force, FILES)
+    written = write_averages(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
 

@@ -57,3 +57,18 @@ def move(engine: Engine, state: State, scheme: Scheme, dt: float, steps: int) ->
 def built(counts, edge, seed=0, spread=0.4, **sections):
     """`shaken` of `small_scene`."""
     return shaken(build(small_scene(counts, edge, **sections)), seed, spread)
+
+
+#: Argon atoms on springs, so far apart that nothing else acts on them: m w² in u/ps², and w dt = 1 at 36 fs.
+SPRING = 30_000.0
+
+
+def springs(**stage) -> Scene:
+    """64 argon atoms, each an isotropic oscillator, under Langevin's thermostat at 300 K unless told otherwise."""
+    told = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 20.0, "thermostat": "langevin",
+            "friction_translation_per_ps": 15.0} | stage  # fmt: skip
+    return small_scene(
+        {"argon": 64}, 80.0, forces={"cutoff_A": 8.0}, stages=[{k: v for k, v in told.items() if v is not None}],
+        fields={"restraints": [{"stiffness_kJ_mol_A2": SPRING / 100}]},
+        output={"trajectory": False, "figure": False},
+    )  # fmt: skip

@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
-from conftest import ROOT, small_scene
+from conftest import ROOT, SPRING, small_scene, springs
 
 from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.measure.shadow import bias_of_potential, mean_square_rate
 from rigidmd.run import Simulation
+from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.scene import Scene
+from rigidmd.study.averages import averages, start_of_last_stage
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 
@@ -80,6 +83,9 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
         ({"energy_error_kT": 1e-3}, "energy_error_kT would do nothing without integrator = 'auto'"),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0}, "timestep_fs would do nothing with"),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"}, "rotor would do nothing with"),
+        ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
+        ({"integrator": "auto", "bias_kT": 1e-3}, "bias_kT is of averages at a temperature, and nve has no thermostat"),
+        ({"bias_kT": 1e-3}, "bias_kT would do nothing without integrator = 'auto'"),
     ],
 )
 def test_contradictions_are_refused(stage, fault):
@@ -100,3 +106,59 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
     stages = [{"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-30}]
     with pytest.raises(SimulationError, match=r"stopped at step 0 \(0 ps\): no integrator keeps its error below 1e-30"):
         Simulation(small_scene({"argon": 40}, 18.5, stages=stages)).run()
+
+
+@pytest.mark.parametrize(
+    ("thermostat", "integrator", "part"),
+    [("andersen", "velocity_verlet", 2 / 8), ("langevin", "baoab", 1 / 24), (None, "baoab", 1 / 24)],
+)
+def test_the_bias_asked_for_sets_the_step(thermostat, integrator, part, tmp_path):
+    """Of oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
+    stage = {"integrator": "auto", "bias_kT": 1e-3, "thermostat": thermostat, "duration_ps": 0.2}
+    if thermostat != "langevin":
+        stage["friction_translation_per_ps"] = None
+    results = Simulation(springs(**stage), tmp_path / "a").run()
+    found = results.summary["stages"][0]
+    assert found["integrator"] == integrator
+    assert found["timestep_fs"] == pytest.approx(1e3 * np.sqrt(1e-3 / part * 39.948 / SPRING), rel=0.1)
+    assert f"{integrator} at {found['timestep_fs']:g} fs chosen: bias of U below about" in found["choice"]
+    assert "not sampled" in found["choice"]
+    again = Scene.read(tmp_path / "a" / "scene.toml")
+    assert again.stages[0].bias_kT is None
+    assert again.stages[0].thermostat_kind == (thermostat or "langevin")
+    repeated = Simulation(again).run()
+    for one, other in zip(results.state, repeated.state, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def test_a_large_bias_is_no_reason_for_an_unstable_step():
+    results = Simulation(springs(integrator="auto", bias_kT=10.0, duration_ps=0.2)).run()
+    assert results.summary["stages"][0]["timestep_fs"] == pytest.approx(1e3 * np.sqrt(39.948 / SPRING), rel=0.03)
+
+
+def test_check_says_which_bias_is_asked_for(capsys):
+    water = str(ROOT / "systems" / "water.toml")
+    more = ["--set", "stages.0.integrator=auto", "--set", "stages.0.bias_kT=1e-3"]
+    assert main(["check", water, *more]) == 0
+    assert "for an error of 0.001 kT per degree of freedom of the average potential energy" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
+    """64 SPC/E waters; BAOAB's estimate is an upper one."""
+    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 5.0}]
+    stages += [stages[0] | {"timestep_fs": 2.0}]
+    scene = small_scene({"spce": 64}, 12.42, forces={"cutoff_A": 6.0}, stages=stages)
+    _, state = start_of_last_stage(scene)
+    rate = mean_square_rate(MolecularSimulation(scene).system, state, 1)
+    found = averages(scene, ["velocity_verlet", "baoab"], [2.0, 4.0, 5.0], sample=200.0)
+    potential = found.quantities[0]
+    for run in found.runs:
+        if run.timestep == 5.0:
+            bias, error = found.bias(run, potential)
+            estimate = bias_of_potential(run.integrator, rate, 5e-3)
+            if run.integrator == "baoab":
+                assert abs(bias) < 2 * estimate + 2 * error
+            else:
+                assert error < bias / 4
+                assert 0.5 - error / estimate < bias / estimate < 2 + error / estimate

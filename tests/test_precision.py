@@ -3,21 +3,26 @@
 import csv
 import dataclasses
 import itertools
+import json
 import tomllib
 
 import numpy as np
 import pytest
-from conftest import ROOT, small_scene
+from conftest import ROOT, SPRING, small_scene, springs
 
 from rigidmd.cli import main
 from rigidmd.core.schemes import FORMULATIONS, SCHEMES
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import trials as measuring
+from rigidmd.measure.bias import Point, extrapolate
 from rigidmd.measure.subjects import body_subject
 from rigidmd.measure.trials import Method, Precision, Trial, measure, timing
+from rigidmd.output import averages_report
 from rigidmd.output.precision_report import advice, row, table_text, write_precision
 from rigidmd.scene import Scene
+from rigidmd.study import averages as sampling
 from rigidmd.study import precision as choosing
+from rigidmd.study.averages import averages
 from rigidmd.study.precision import precision
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -371,6 +376,159 @@ def test_what_else_is_kept_is_shown(top):
     dimer = precision(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["velocity_verlet"], [1.0], repeats=1)
     assert set(dimer.trials[0].kept) == {"momentum", "L"}
     assert max(dimer.trials[0].kept.values()) < 1e-11
+
+
+def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():
+    slopes, error = {"a": 0.3, "b": -0.1}, 0.01
+    points = [Point(name, dt, 5 + b * dt**2, error) for name, b in slopes.items() for dt in (1.0, 2.0, 3.0)]
+    fit = extrapolate(points)
+    assert fit.limit == pytest.approx(5)
+    assert fit.longest == 3
+    assert {name: at[0] for name, at in fit.slopes.items()} == pytest.approx(slopes)
+    wild = Point("a", 6.0, 5 + 0.3 * 36 + 0.02 * 6**4, error)
+    assert extrapolate([*points, wild]) == fit
+    assert fit.bias(wild)[0] == pytest.approx(0.3 * 36 + 0.02 * 6**4)
+    assert fit.bias(wild)[1] == pytest.approx(np.hypot(error, fit.limit_error))
+    known = extrapolate(points, exact=4.9)
+    assert (known.limit, known.limit_error) == (4.9, 0.0)
+    assert known.bias(points[0]) == pytest.approx((points[0].mean - 4.9, error))
+    alone = extrapolate([Point("a", 2.0, 7.0, 0.1), Point("b", 4.0, 8.0, 0.1)])
+    assert (alone.limit, alone.limit_error, alone.slopes) == (7.0, 0.1, {})
+    assert alone.bias(Point("a", 2.0, 7.0, 0.1)) == (0.0, 0.0)
+
+
+def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
+    rng = np.random.default_rng(0)
+    steps, errors = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.03, 0.02, 0.04, 0.02])
+    limits, biases = [], []
+    for _ in range(2000):
+        noise = errors * rng.standard_normal((2, 4))
+        points = [
+            Point(name, *point)
+            for name, b, n in zip("ab", (0.02, 0.05), noise, strict=True)
+            for point in zip(steps, 2 + b * steps**2 + n, errors, strict=True)
+        ]
+        fit = extrapolate(points)
+        if fit.longest == 4:  # of what was not left out by chance
+            limits.append((fit.limit, fit.limit_error))
+            biases.append([fit.bias(point) for point in points])
+    assert len(limits) > 1700
+    assert np.std([limit for limit, _ in limits]) == pytest.approx(limits[0][1], rel=0.08)
+    found = np.array(biases)
+    assert np.allclose(found[:, :, 0].std(axis=0), found[0, :, 1], rtol=0.08)
+    assert np.mean([limit for limit, _ in limits]) == pytest.approx(2, abs=4 * limits[0][1] / np.sqrt(len(limits)))
+
+
+@pytest.fixture(scope="module")
+def oscillators():
+    """Springs at w dt = 1 and less, by velocity Verlet and BAOAB."""
+    unit = 1e3 * np.sqrt(39.948 / SPRING)  # fs of a radian
+    shares = []
+    found = averages(
+        springs(), ["velocity_verlet", "baoab"], [0.4 * unit, 0.7 * unit, unit], sample=60.0, say=shares.append
+    )
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1)
+    return found
+
+
+def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
+    thermal, freedom = 0.0083144626 * 300, 3
+    quantities = {quantity.name: quantity for quantity in oscillators.quantities}
+    for run in oscillators.runs:
+        x = (run.timestep / 1e3) ** 2 * SPRING / 39.948
+        verlet = run.integrator == "velocity_verlet"
+        swing = 1 / (1 - x / 4)  # of the conserved energy p²/2m + m w² (1 - x/4) q²/2
+        exact = {
+            "U": freedom * thermal / 2 * (swing if verlet else 1),
+            "T_trans": 300 * (1 if verlet else 1 - x / 4),
+        }
+        if verlet:
+            exact["T_trans unbiased"] = 300 * (1 + x / 6 * swing)
+        for name, value in exact.items():
+            mean, error = run.averages[name]
+            assert error < 0.01 * value
+            assert abs(mean - value) < 4 * error
+            assert oscillators.point(run, quantities[name]).mean == mean
+        assert oscillators.point(run, quantities["T_trans unbiased"]) is None or verlet
+
+
+def test_what_is_said_of_averages_follows_from_them(oscillators):
+    quantities = {quantity.name: quantity for quantity in oscillators.quantities}
+    assert set(quantities) == {"U", "T_trans", "T_trans unbiased", "pressure"}
+    potential = quantities["U"]
+    limit = oscillators.fit(potential)
+    assert abs(limit.limit - 1.5 * 0.0083144626 * 300) < 4 * limit.limit_error
+    coarse = oscillators.runs[2]
+    bias, error = oscillators.bias(coarse, potential)
+    assert coarse.method == "velocity_verlet + langevin"
+    assert abs(bias - (1 / 0.75 - 1) / 2) < 4 * error < 0.1
+    # 1 % of kT is x/8
+    step, seen = oscillators.off_at("velocity_verlet + langevin", potential)
+    assert seen
+    assert step == pytest.approx(1e3 * np.sqrt(0.08 * 39.948 / SPRING), rel=0.1)
+    assert not oscillators.off_at("velocity_verlet + langevin", quantities["T_trans"])[1]
+    said = "\n".join(averages_report.advice(oscillators))
+    assert f"U is off by 1% of kT per degree of freedom at: velocity_verlet + langevin {step:.2g} fs; baoab" in said
+    assert "T_trans is off by 1% of its value at: velocity_verlet + langevin none seen, more than" in said
+    assert "temperatures are held against 300 K" in said
+    assert coarse.forces_per_ps == pytest.approx(1e3 / coarse.timestep)
+    assert coarse.seconds_per_ns > 0
+
+
+def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypatch):
+    stage = {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0, "duration_ps": 1.0, "timestep_fs": 5.0}
+    scene = small_scene({"argon": 40}, 18.5, start={"temperature_K": 90.0}, stages=[{"duration_ps": 0.1}, stage])
+    monkeypatch.setattr(Scene, "read", lambda path, overrides: scene)
+    folder = tmp_path / "p"
+    command = ["precision", "liquid.toml", "--averages", "--sample-ps", "0.4", "--timesteps", "5,10,400",
+               "--integrators", "velocity_verlet", "-o", str(folder)]  # fmt: skip
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "bias of averages over 0.4 ps of npt" in said
+    assert "velocity_verlet + velocity_rescaling at 400 fs: stopped at step" in said
+    with (folder / "precision.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["step (fs)"] for row in rows] == ["5.0", "10.0", "400.0"]
+    assert float(rows[0]["density (g/cm³)"]) > 0
+    assert rows[2]["density (g/cm³)"] == ""
+    told = json.loads((folder / "precision.json").read_text())
+    assert told["runs"][0]["averages"]["density"]["mean"] == float(rows[0]["density (g/cm³)"])
+    assert told["runs"][2]["fault"].startswith("stopped at step")
+    assert "pressure" not in told["quantities"]
+    assert (folder / "averages.png").read_bytes().startswith(b"\x89PNG")
+    assert main(command) == 2  # nothing is overwritten
+
+
+def test_averages_need_a_thermostat_at_one_temperature(capsys):
+    water = str(ROOT / "systems" / "water.toml")
+    assert main(["precision", water, "--averages"]) == 2
+    said = capsys.readouterr().err
+    assert "--averages samples the last stage, and nve has no thermostat" in said
+    assert len([line for line in said.splitlines() if "averages" in line]) == 1
+    assert main(["precision", water, "--sample-ps", "3"]) == 2
+    assert "it goes with --averages" in capsys.readouterr().err
+    with pytest.raises(SceneError, match="a single body has no thermostat"):
+        averages(Scene.read(TOP))
+    with pytest.raises(SceneError, match="one temperature and one pressure"):
+        averages(springs(temperature_K=[300.0, 200.0]))
+    with pytest.raises(SceneError, match=r"no thermostat langevn; did you mean|no thermostat langevn"):
+        averages(springs(), ["baoab+langevn"])
+    with pytest.raises(SceneError, match="there is no verlet"):
+        averages(springs(), ["verlet"])
+    with pytest.raises(SceneError, match="greater than 0"):
+        averages(springs(), sample=0.0)
+
+
+def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
+    monkeypatch.setattr(sampling, "_sample", lambda *_: None)
+    found = averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
+    assert list(dict.fromkeys((run.integrator, run.thermostat) for run in found.runs)) == [
+        ("velocity_verlet", "nose_hoover"), ("baoab", "langevin"), ("velocity_verlet", "velocity_rescaling")
+    ]  # fmt: skip
+    longest = 2e3 * np.sqrt(39.948 / SPRING)
+    steps = [run.timestep for run in found.runs if run.integrator == "baoab"]
+    assert steps == pytest.approx([share * longest for share in sampling.LADDER], rel=0.05)
 
 
 @pytest.mark.slow

@@ -15,7 +15,11 @@ def stage_in_words(stage: Stage) -> list[str]:
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
     text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
     if stage.is_open:
-        asked = f"{stage.energy_error_kT:g} kT" if stage.energy_error_kT else f"{stage.trajectory_error:g} of Q or X"
+        asked = f"{stage.trajectory_error or 0:g} of Q or X"
+        if stage.energy_error_kT:
+            asked = f"{stage.energy_error_kT:g} kT"
+        elif stage.bias_kT:
+            asked = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
         text = (
             f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {asked}"
         )

@@ -204,16 +204,18 @@ def _first_look(system: BodySystem, whole: float) -> Motion:
     return motion(system, snapshots)
 
 
-def choose_for_molecules(system: System, state: State, stage: Stage) -> tuple[str, float, str]:
-    """Integrator, time step (fs) and reason for a stage that leaves them open and starts at a state.
+def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, str]:
+    """Stage k, which starts at a state and leaves integrator and step open, with both, and the reason in words.
 
     Raises SimulationError.
     """
+    stage = system.scene.stages[k]
     natural = natural_time(system, state)
     step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
     subject = molecular_subject(system, state, None, PILOT_SPAN * natural if natural else SPAN_PS)
     longest = {name: 4 * step * SCHEMES[name].force_evaluations for name in SCHEMES}
-    return _chosen(subject, longest, stage.energy_error_kT, stage.trajectory_error)
+    integrator, timestep, reason = _chosen(subject, longest, stage.energy_error_kT, stage.trajectory_error)
+    return stage.decided(integrator, timestep), reason
 
 
 def decided_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None) -> tuple[BodyScene, str]:

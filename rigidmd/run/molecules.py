@@ -21,6 +21,7 @@ from rigidmd.measure.meanings import meanings
 from rigidmd.measure.minimum import Minimum, minimum_in_words
 from rigidmd.measure.observables import Observation, observe
 from rigidmd.measure.samples import Sample, Samples
+from rigidmd.measure.shadow import choose_for_averages
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.subjects import choose_for_molecules
 from rigidmd.measure.summary import summarise
@@ -186,10 +187,11 @@ class MolecularSimulation(Simulation):
         """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
         stage = self.scene.stages[k]
         self._say("choosing integrator and step by pilot runs")
-        integrator, timestep, reason = choose_for_molecules(self.system, self.state, stage)
-        self._choices[k] = f"{integrator} at {timestep:g} fs chosen: {reason}"
+        choose = choose_for_averages if stage.bias_kT else choose_for_molecules
+        decided, reason = choose(self.system, self.state, k)
+        self._choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
         stages = list(self.scene.stages)
-        stages[k] = stage.decided(integrator, timestep)
+        stages[k] = decided
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
         self.system = replace(self.system, scene=self.scene)
         if self.folder is not None:

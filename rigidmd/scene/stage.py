@@ -53,6 +53,9 @@ USED = {
     "most_iterations": {"minimise"},
 }
 
+#: What may be asked of the integrator and step that are left to a pilot.
+ASKED = ("energy_error_kT", "trajectory_error", "bias_kT")
+
 #: Names from other programs -> advice.
 REFUSED = {
     "berendsen": "'berendsen' samples no ensemble: its fluctuations are too small and heat flows into the slowest "
@@ -114,6 +117,8 @@ class Stage(Section):
     """With auto: rms error of the energy, in kT per degree of freedom"""
     trajectory_error: Positive | None = None
     """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten radians of libration"""
+    bias_kT: Positive | None = None
+    """With auto, of nvt: estimated bias of the average potential energy, in kT per degree of freedom"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; default: the one that the integrator needs"""
     force_limit_kJ_mol_A: Positive = 0.1
@@ -173,8 +178,10 @@ class Stage(Section):
         decided = [
             key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default
         ]
-        asked = {"energy_error_kT": self.energy_error_kT, "trajectory_error": self.trajectory_error}
+        asked = {key: getattr(self, key) for key in ASKED}
         faults += auto_faults(self.integrator, asked, decided)
+        if self.bias_kT is not None and not self.has_thermostat:
+            faults.append(f"bias_kT is of averages at a temperature, and {self.ensemble} has no thermostat")
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
             faults.append(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
         if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
@@ -246,16 +253,21 @@ class Stage(Section):
         """Whether integrator and step are still open."""
         return self.integrator == AUTO
 
+    @property
+    def leaves_thermostat(self) -> bool:
+        """Whether the thermostat is chosen with the integrator: a bias is asked for, and nothing of a thermostat."""
+        return self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
+
     def decided(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with the choice of pilot runs."""
-        none = {"energy_error_kT": None, "trajectory_error": None}
-        return self.model_copy(update={"integrator": integrator, "timestep_fs": timestep_fs} | none)
+        changes = {"integrator": integrator, "timestep_fs": timestep_fs}
+        return self.model_copy(update=changes | dict.fromkeys(ASKED))
 
     @property
     def resolved(self) -> "Stage":
         """This stage with every number that it uses."""
         found: dict[str, Any] = {}
-        if self.has_thermostat:
+        if self.has_thermostat and not self.leaves_thermostat:
             found |= {"thermostat": self.thermostat_kind}
             if self.thermostat_kind == "langevin":
                 translation, rotation = self.frictions

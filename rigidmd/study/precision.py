@@ -7,8 +7,8 @@ from rigidmd.errors import SceneError
 from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
 from rigidmd.measure.trials import Precision, Subject, measure, plan
-from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.study.averages import start_of_last_stage
 from rigidmd.validation import meant
 
 #: Default integrators: the common one, the best of each kind, and for a body the textbook solvers.
@@ -91,16 +91,7 @@ def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, f
     last = scene.stages[-1]
     if last.is_minimisation:
         raise SceneError(scene.source, ["the last stage is a minimisation: precision needs one in which time passes"])
-    simulation = MolecularSimulation(scene)
-    if len(scene.stages) > 1:
-        quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 1e9})
-        earlier = MolecularSimulation(
-            simulation.scene.model_copy(update={"stages": simulation.scene.stages[:-1], "output": quiet})
-        )
-        state = earlier.run().state
-    else:
-        simulation.start()
-        state = simulation.state
+    simulation, state = start_of_last_stage(scene)
     subject = molecular_subject(simulation.system, state, last.rotor, span or SPAN_PS)
     subject.rounding = rounding(simulation.system, state)
     own = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
