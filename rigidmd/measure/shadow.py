@@ -85,7 +85,7 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
         decided = _decided(stage, integrator, stage.timestep_fs)
         stable = LONGEST * stable_angle(decided.scheme) / found.rate if found else inf
         good = sqrt(target / (ALLOWANCE[integrator] * BIAS[integrator] * rate)) if rate > 0 else inf
-        step = min(good, stable, stage.duration_ps)
+        step = min(good, stable, stage.duration)
         steps[integrator] = _rounded(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
     best = max(steps, key=lambda name: (steps[name], -BIAS[name]))
     step = steps[best] * FEMTOSECOND

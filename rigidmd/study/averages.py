@@ -47,6 +47,8 @@ def averages(
     fifth of that. say : told the share that is done. The earlier stages run before, once, as the scene says. Raises
     SceneError.
     """
+    if isinstance(scene, BodyScene):
+        raise SceneError(scene.source, ["--averages is for molecules; a single body has no thermostat"])
     stage = _with_thermostat(scene)
     told = [_method(name, stage) for name in methods] if methods else _usual(stage)
     if not (sample > 0 and all(step > 0 for step in timesteps or [])):
@@ -72,7 +74,7 @@ def averages(
     whole = sum(run.forces_per_ps for _, run in plan)
     done = 0.0
     for changed, run in plan:
-        length = changed.duration_ps
+        length = changed.duration
 
         def share(moment, before=done, part=run.forces_per_ps / whole, length=length):
             say(before + part * min(1.0, moment.time / length))
@@ -112,16 +114,15 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[MolecularSimulation, Sta
     simulation = MolecularSimulation(scene)
     if len(scene.stages) > 1:
         quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 1e9})
-        earlier = MolecularSimulation(scene.model_copy(update={"stages": scene.stages[:-1], "output": quiet}))
+        resolved = simulation.scene
+        earlier = MolecularSimulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet}))
         return simulation, earlier.run().state
     simulation.start()
     return simulation, simulation.state
 
 
-def _with_thermostat(scene: MolecularScene | BodyScene) -> Stage:
+def _with_thermostat(scene: MolecularScene) -> Stage:
     """The last stage. Raises SceneError where it does not keep one temperature."""
-    if isinstance(scene, BodyScene):
-        raise SceneError(scene.source, ["--averages is for molecules; a single body has no thermostat"])
     stage = scene.stages[-1]
     if not stage.has_thermostat:
         fault = (
