@@ -66,7 +66,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("timestep_fs = 1", "timestep_fs = -2", ["stages.0.timestep_fs", "is -2", "greater than 0"]),
         ("timestep_fs = 1", "timestep_fs = 100", ["less than one step"]),
         ("duration_ps = 0.01", "", ["stages.0.duration_ps", "missing"]),
-        ("timestep_fs = 1", 'ensemble = "npt"', ["line 10", "stages.0.ensemble", "'npt'", "must be 'nve' or 'nvt'", "no pressure coupling yet"]),
+        ("timestep_fs = 1", 'ensemble = "nvp"', ["line 10", "stages.0.ensemble", "'nvp'", "must be 'nve', 'nvt', 'npt', 'nph' or 'minimise'"]),
         ("timestep_fs = 1", 'ensemble = "NVT"', ["stages.0.ensemble", "'NVT'", "did you mean nvt?"]),
         ("timestep_fs = 1", "ensemble = nvt", ["line 10: stages.0.ensemble: is nvt without quotes", '"nvt"']),
         ("timestep_fs = 1", "ensemble = infinite", ["line 10: stages.0.ensemble: is infinite without quotes"]),

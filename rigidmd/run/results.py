@@ -89,7 +89,14 @@ class Results:
             import pandas
         except ImportError:
             raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
-        written = {name: column.header for name, column in self.samples.described.items() if column.header}
+        from rigidmd.output.log import TENSOR
+
+        left_out = () if getattr(self.system.scene.output, "pressure_tensor", True) else TENSOR
+        written = {
+            name: column.header
+            for name, column in self.samples.described.items()
+            if column.header and name not in left_out
+        }
         return pandas.DataFrame({header: self[name] for name, header in written.items()})
 
     def universe(self) -> "MDAnalysis.Universe":
