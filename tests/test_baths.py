@@ -142,7 +142,9 @@ def test_chains_can_be_run_backwards(liquid):
     assert state.bath.reshape(2, 2, 4)[:, 0] == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("thermostat", ["velocity_rescaling", "langevin", "nose_hoover", "andersen"])
+@pytest.mark.parametrize("thermostat", [
+    "langevin", *(pytest.param(name, marks=pytest.mark.slow) for name in ("velocity_rescaling", "nose_hoover", "andersen")),
+])  # fmt: skip
 def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermostat):
     stage = {"ensemble": "nvt", "temperature_K": [300.0, 310.0], "thermostat": thermostat, "duration_ps": 0.02}
     scene = small_scene({"spce": 1000}, 32.0, stages=[stage], output={"trajectory": False})

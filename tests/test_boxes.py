@@ -168,14 +168,16 @@ def gas(count, thermostat, box_for):
     engine = system.engine()
     state = engine.begin(system.state, row)
     found = []
-    for _ in range(1500):
-        move(engine, state, row, 0.005, 40)
+    for _ in range(800):
+        move(engine, state, row, 0.005, 30)
         found.append(state.volume * pressure / THERMAL)
     return np.array(found), engine.moves
 
 
-@pytest.mark.parametrize("thermostat", ["langevin", "velocity_rescaling"])
-@pytest.mark.parametrize("barostat", ["cell_rescaling", "monte_carlo"])
+@pytest.mark.parametrize(("barostat", "thermostat"), [
+    ("cell_rescaling", "velocity_rescaling"), pytest.param("cell_rescaling", "langevin", marks=pytest.mark.slow),
+    pytest.param("monte_carlo", "langevin", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
     """p(V) ~ V^N exp(-p V/kT): a Gamma distribution, whatever the thermostat does to the total momentum."""
     n, key = 8, key_of(3, BOX)
@@ -188,12 +190,12 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
 
     volumes, moves = gas(n, thermostat, box_for)
     assert 0.2 < moves[1] / moves[0] < 0.99  # what is rejected matters
-    blocks = volumes.reshape(30, -1).mean(axis=1)
+    blocks = volumes.reshape(20, -1).mean(axis=1)
     error = blocks.std(ddof=1) / np.sqrt(len(blocks))
-    assert error < 0.25
+    assert error < 0.35
     assert abs(volumes.mean() - (n + 1)) < 4 * error
-    assert volumes.var() == pytest.approx(n + 1, rel=0.25)
-    apart = volumes[:: max(1, round(1500 / (blocks.var() and volumes.var() / error**2)))]
+    assert volumes.var() == pytest.approx(n + 1, rel=0.35)
+    apart = volumes[:: max(1, round(800 / (blocks.var() and volumes.var() / error**2)))]
     assert stats.kstest(apart, "gamma", args=(n + 1,)).pvalue > 1e-3
 
 
@@ -260,7 +262,8 @@ def test_a_piston_can_be_run_backwards(compressed):
 
 
 @pytest.mark.parametrize("stage", [
-    {"barostat": "monte_carlo"}, {"pressure_coupling": "flexible"}, {"ensemble": "nph", "temperature_K": None},
+    {"pressure_coupling": "flexible"}, pytest.param({"barostat": "monte_carlo"}, marks=pytest.mark.slow),
+    pytest.param({"ensemble": "nph", "temperature_K": None}, marks=pytest.mark.slow),
 ], ids=str)  # fmt: skip
 def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
     own = {key: value for key, value in (NPT | {"duration_ps": 0.02} | stage).items() if value is not None}

@@ -394,6 +394,7 @@ def test_a_dipole_in_a_field():
     told("<cos> of a dipole, langevin, 20 fs", cosine.mean(), error_of(cosine), exact)
 
 
+@pytest.mark.slow
 def test_a_few_dipoles_in_a_field():
     """The same to 1 %, in seconds."""
     cosine, exact = orientations({"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400)

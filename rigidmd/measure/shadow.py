@@ -116,11 +116,16 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     engine, freedom = system.engine(), system.freedom_in(k)
     first = square_rate(system, engine, state, thermal)
     fastest = max(sum_ / n for sum_, n in zip(first, freedom, strict=True) if n) if freedom.total else 0.0
+    if fastest == 0 and (found := stiffest(system, state)) is not None:
+        fastest = found.rate**2  # the start is a minimum, where no force says how fast motions are
     if not isfinite(fastest) or fastest <= 0:
         return 0.0
     dt = STEP / sqrt(fastest)
     stages = list(system.scene.stages)
-    stages[k] = stage.decided("velocity_verlet", dt / FEMTOSECOND)
+    # Langevin's thermostat at a fifth of that rate brings any start to its temperature within the first half
+    heat = {"thermostat": "langevin", "thermostat_time_ps": None, "friction_translation_per_ps": sqrt(fastest) / 5}
+    pilot_stage = stage.decided("baoab", dt / FEMTOSECOND)
+    stages[k] = pilot_stage.model_copy(update=heat | {"friction_rotation_per_ps": None})
     pilot = replace(system, scene=system.scene.model_copy(update={"stages": tuple(stages)}))
     scheme = row(pilot, k)
     moving = engine.begin(state, scheme)
