@@ -390,12 +390,12 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
         ([stage_of(), {"duration_ps": 1.0}], {"start": {}}, "the first stage in which time passes is nve"),
         ([stage_of(pressure_bar=1.0)], {"box": {"lengths_A": 20.0, "periodic": False}}, "box.periodic is false"),
-        ([stage_of(pressure_bar=1.0)], {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]}, "frozen molecules hold"),
+        ([stage_of(pressure_bar=1.0)], {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]}, "frozen molecules do not move"),
         ([stage_of()], {"output": {"trajectory": "t.dcd"}}, "two frames at one time"),
         (
             [stage_of(), {"ensemble": "nvt", "duration_ps": 1.0, "temperature_K": 300.0}],
             {"start": {"temperature_K": 0.0}},
-            "cannot warm what is at rest",
+            "cannot heat molecules at rest",
         ),
     ],
 )  # fmt: skip

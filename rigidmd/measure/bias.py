@@ -63,7 +63,7 @@ def extrapolate(points: Sequence[Point], exact: float | None = None) -> Fit:
     steps = sorted({point.timestep for point in points}, reverse=True)
     fits = [fit for longest in steps if (fit := _fit(points, longest, exact)) is not None]
     for fit, chi2, freedom in fits:
-        if chi2 <= freedom + 2 * sqrt(2 * freedom):
+        if freedom == 0 or chi2 <= freedom + 2 * sqrt(2 * freedom):
             return fit
     if fits:
         fit, chi2, freedom = fits[-1]
