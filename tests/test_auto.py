@@ -110,7 +110,11 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
 
 @pytest.mark.parametrize(
     ("thermostat", "integrator", "part"),
-    [("andersen", "velocity_verlet", 2 / 8), ("langevin", "baoab", 1 / 24), (None, "baoab", 1 / 24)],
+    [
+        pytest.param("andersen", "velocity_verlet", 2 / 8, marks=pytest.mark.slow),
+        pytest.param("langevin", "baoab", 1 / 24, marks=pytest.mark.slow),
+        (None, "baoab", 1 / 24),
+    ],
 )
 def test_the_bias_asked_for_sets_the_step(thermostat, integrator, part, tmp_path):
     """Of oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""

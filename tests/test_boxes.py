@@ -49,7 +49,7 @@ def strain_state(box, state, room):
     boxes.apply_strain(box, state, room)
 
 
-@pytest.fixture(scope="module", params=["reaction_field", "pme"])
+@pytest.fixture(scope="module", params=["reaction_field", pytest.param("pme", marks=pytest.mark.slow)])
 def liquid(request):
     """20 waters and 12 nitrogens in a slanted box under a stress, with a tail: system, engine, state."""
     forces = {"cutoff_A": 5.5, "truncation": "smooth_switch", "electrostatics": request.param, "tail_correction": True}

@@ -218,7 +218,7 @@ def conserved_along(kind, scheme, dt):
 
 
 @pytest.mark.parametrize("kind", RUNS)
-@pytest.mark.parametrize("name", ["velocity_verlet", "srkn_4"])
+@pytest.mark.parametrize("name", ["velocity_verlet", pytest.param("srkn_4", marks=pytest.mark.slow)])
 def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
     scheme, dt = SCHEMES[name], RUNS[kind][3] * (2 if name == "srkn_4" else 1)
     errors = []

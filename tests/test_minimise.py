@@ -51,7 +51,10 @@ def minimum_of(scene, state: State | None = None):
 
 @pytest.mark.parametrize(
     ("coupling", "electrostatics"),
-    [*((coupling, "reaction_field") for coupling in (None, *ASKED)), ("flexible", "ewald")],
+    [
+        *((coupling, "reaction_field") for coupling in (None, *ASKED)),
+        pytest.param("flexible", "ewald", marks=pytest.mark.slow),
+    ],
 )
 def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
     """Points, linear and asymmetric molecules, shifts, turns and all components of a leaning cell."""
@@ -145,7 +148,9 @@ def pair_energy(model: str, x: np.ndarray) -> float:
     return float(energy.sum()) / KJ_PER_MOL
 
 
-@pytest.mark.parametrize(("model", "published"), [("tip4p", -26.09), ("spce", None)])
+@pytest.mark.parametrize(
+    ("model", "published"), [("tip4p", -26.09), pytest.param("spce", None, marks=pytest.mark.slow)]
+)
 def test_the_water_dimer(model, published):
     """TIP4P: 6.24 kcal/mol (Jorgensen et al. 1983, J. Chem. Phys. 79, 926, table III)."""
     m = load_model(model)

@@ -432,6 +432,7 @@ def oscillators():
     return found
 
 
+@pytest.mark.slow
 def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
     thermal, freedom = 0.0083144626 * 300, 3
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
@@ -453,6 +454,7 @@ def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
         assert oscillators.point(run, quantities["T_trans unbiased"]) is None or verlet
 
 
+@pytest.mark.slow
 def test_what_is_said_of_averages_follows_from_them(oscillators):
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
     assert set(quantities) == {"U", "T_trans", "T_trans unbiased", "pressure"}
