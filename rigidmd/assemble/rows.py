@@ -30,8 +30,7 @@ def row(system: System, k: int) -> Scheme:
         idle = VelocityRescaling(steady(0.0), inf, system.freedom.total, key_of(scene.seed, BATH, k))
         found = found.with_bath(idle)
     if stage.ensemble == "npt":
-        every = max(1, round(stage.barostat_interval / (stage.timestep_fs * FEMTOSECOND)))
-        found = found.with_box(box_of(system, k), every)
+        found = found.with_box(box_of(system, k), stage.moves_every)
     elif stage.ensemble == "nph":
         found = found.with_piston(box_of(system, k))
     if stage.keeps_momentum and (interval := system.removes_momentum_every) is not None:

@@ -5,6 +5,16 @@ from rigidmd.units import FEMTOSECOND
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
 STIFFEST, SOFTEST = 2e-7, 100.0
+#: Of each ensemble, the distribution that it samples and what it conserves.
+LAWS = {
+    "nve": ("the microcanonical distribution", "energy"),
+    "nph": ("the isoenthalpic distribution", "enthalpy with the energy of the piston"),
+    "nvt": ("the canonical distribution, exp(-H/kT)", "energy less heat"),
+    "npt": (
+        "the isothermal-isobaric distribution, exp(-(H + p V)/kT)",
+        "energy less heat and less the work of the box",
+    ),
+}
 
 
 def stage_in_words(stage: Stage) -> list[str]:
@@ -58,7 +68,7 @@ def _barostat(stage: Stage) -> str:
     if stage.barostat_kind != "monte_carlo":
         text += f", {stage.barostat_time:g} ps"
     if stage.barostat_kind:
-        every = max(1, round(stage.barostat_interval / (stage.timestep_fs * FEMTOSECOND)))
+        every = stage.moves_every
         text += f", a move every {every} steps" if every > 1 else ", a move every step"
     water = ", that of water" if stage.compressibility == COMPRESSIBILITY else ""
     return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
@@ -77,12 +87,7 @@ def _ramp(ends: tuple[float, float]) -> str:
 
 def _sampled(stage: Stage) -> str:
     """The distribution, up to the error of the step."""
-    law = {
-        "nve": "the microcanonical distribution",
-        "nph": "the isoenthalpic distribution",
-        "nvt": "the canonical distribution, exp(-H/kT)",
-        "npt": "the isothermal-isobaric distribution, exp(-(H + p V)/kT)",
-    }[stage.ensemble]
+    law = LAWS[stage.ensemble][0]
     if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
         law += ", with the invariant measure of the shape"
     first, last = stage.pressures if stage.has_barostat else (0, 0)
@@ -93,12 +98,7 @@ def _sampled(stage: Stage) -> str:
 
 def _conserved(stage: Stage) -> str:
     """The conserved quantities, up to the error of the step."""
-    kept = {
-        "nve": "energy",
-        "nph": "enthalpy with the energy of the piston",
-        "nvt": "energy less heat",
-        "npt": "energy less heat and less the work of the box",
-    }[stage.ensemble]
+    kept = LAWS[stage.ensemble][1]
     return f"{kept}, total momentum" if stage.keeps_momentum else f"{kept}, not the total momentum"
 
 

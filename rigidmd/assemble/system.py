@@ -177,6 +177,15 @@ def build(scene: MolecularScene) -> System:
         force_error=acting.force_error,
         notes=[*acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )
+    if tied := system.tied_to_places:
+        words = ", ".join(name.replace("_", " ") for name in tied)
+        faults = [
+            f"stages.{k}: {stage.ensemble} changes the box, and {words} depend on places in it: keep the volume"
+            for k, stage in enumerate(scene.stages)
+            if stage.changes_box
+        ]
+        if faults:
+            raise SceneError(scene.source, faults)
     system.notes.extend(set_momenta(scene, model, state, arrangement))
     system.notes.extend(
         f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"

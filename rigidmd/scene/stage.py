@@ -354,6 +354,11 @@ class Stage(Section):
         return self.barostat_interval_ps or self.barostat_time / MOVES_PER_TIME
 
     @property
+    def moves_every(self) -> int:
+        """Steps between two moves of the box."""
+        return max(1, round(self.barostat_interval * 1000 / self.timestep_fs))
+
+    @property
     def compressibility(self) -> float:
         """1/bar"""
         return self.compressibility_per_bar or COMPRESSIBILITY
