@@ -134,8 +134,11 @@ class Reader:
             case ["pip", "install", what]:
                 project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
                 assert what in (".", *(f".[{extra}]" for extra in project["optional-dependencies"]))
-            case ["pytest", *arguments]:
-                assert arguments in ([], ["-m", "slow"])
+            case ["pytest"] | ["pytest", "-m", "slow"]:
+                pass
+            case ["pytest", "-m", "slow", "-rP", script]:
+                assert not runs
+                assert "@pytest.mark.slow" in (ROOT / script).read_text()
             case _:
                 pytest.fail(f"no command that this test knows: {words}")
 

@@ -780,7 +780,7 @@ def test_total_momentum_is_taken_out_at_steps_that_the_scene_decides():
     assert found["momentum"][-1] < 1e-9 < kept["momentum"][-1]
     assert (found["momentum"][found["step"] % 50 == 0] < 1e-9).all()
     assert kept.summary["momentum_removed"] is None
-    assert "taken out every 0.05 ps" in summary_text(found.summary)
+    assert "removed every 0.05 ps" in summary_text(found.summary)
     assert coarse().summary["momentum_removed"] == {"interval_ps": 1.0, "energy_kJ_mol": 0.0}  # the usual interval
 
 
