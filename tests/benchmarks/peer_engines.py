@@ -327,19 +327,26 @@ def gro(sites: dict, velocity: np.ndarray) -> str:
 
 
 def top(sites: dict) -> str:
-    """A GROMACS topology of one species: SETTLE for three sites, a constraint for two."""
+    """A GROMACS topology of one species: SETTLE for three sites, a constraint for two; a fourth, without mass, is a
+    virtual site between the arms of the first."""
     n, s = sites["position"].shape[:2]
     template = sites["template"] / 10
     lines = ["[ defaults ]", "1 2 no", "[ atomtypes ]"]
     kinds = zip(sites["name"], sites["mass"], sites["charge"], sites["sigma"] / 10, sites["epsilon"], strict=True)
     atoms = ["[ moleculetype ]", "MOL 2", "[ atoms ]"]
     for k, (name, mass, charge, sigma, epsilon) in enumerate(kinds, 1):
-        lines.append(f"T{k} {mass} 0 A {sigma:.12g} {epsilon:.12g}")
+        lines.append(f"T{k} {mass} 0 {'A' if mass > 0 else 'V'} {sigma:.12g} {epsilon:.12g}")
         atoms.append(f"{k} T{k} 1 MOL {name} 1 {charge} {mass}")
     lines += atoms
-    first, second = (np.linalg.norm(template[0] - template[1]), np.linalg.norm(template[-2] - template[-1]))
-    if s == 3:
-        lines += ["[ settles ]", f"1 1 {first:.12g} {second:.12g}", "[ exclusions ]", "1 2 3", "2 1 3", "3 1 2"]
+    first = np.linalg.norm(template[0] - template[1])
+    if s > 2:
+        lines += ["[ settles ]", f"1 1 {first:.12g} {np.linalg.norm(template[1] - template[2]):.12g}"]
+        if s == 4:
+            arms = template[1] + template[2] - 2 * template[0]
+            share = np.linalg.norm(template[3] - template[0]) / np.linalg.norm(arms)
+            lines += ["[ virtual_sites3 ]", f"4 1 2 3 1 {share:.12g} {share:.12g}"]
+        everyone = range(1, s + 1)
+        lines += ["[ exclusions ]", *(" ".join(map(str, [k, *(j for j in everyone if j != k)])) for k in everyone)]
     else:
         lines += ["[ constraints ]", f"1 2 1 {first:.12g}"]
     return "\n".join([*lines, "[ system ]", "start", "[ molecules ]", f"MOL {n}"]) + "\n"

@@ -1,0 +1,129 @@
+"""The density of liquid water at 298.15 K and 1 bar, by rigidmd and by GROMACS side by side, with errors.
+
+    python tests/benchmarks/densities.py --models spce,tip4p2005 --duration 2000
+
+512 molecules, cut-off 9 Å, PME, dispersion beyond the cut-off in the pressure, steps of 2 fs, one thread each, both at
+once. rigidmd: baoab with Langevin friction, stochastic cell rescaling, mixed precision. GROMACS: leap-frog, v-rescale,
+C-rescale. Both measure the kinetic energy where harmonic motions leave no error of the step in positions. Errors are
+standard errors by pymbar's statistical inefficiency; the first tenth of each run is left out.
+"""
+
+import argparse
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from peer_engines import Gromacs, call, environment, gro, program, top
+from pymbar import timeseries
+
+from rigidmd import Scene, Simulation
+from rigidmd.units import KJ_PER_MOL
+
+COUNT, CUTOFF, TEMPERATURE, STEP = 512, 9.0, 298.15, 2.0  # Å, K, fs
+EVERY = 0.1  # ps between samples
+
+
+def scene(model: str, *stages: dict) -> dict:
+    """A scene of the liquid; `stages` begin at a guess of the density."""
+    common = {"temperature_K": TEMPERATURE, "timestep_fs": STEP, "integrator": "baoab", "thermostat": "langevin"}
+    return {
+        "box": {"density_g_cm3": 0.99},
+        "molecules": [{"model": model, "count": COUNT}],
+        "forces": {"cutoff_A": CUTOFF, "truncation": "shift", "tail_correction": True, "electrostatics": "pme"},
+        "precision": "mixed",
+        "threads": 1,
+        "start": {"temperature_K": TEMPERATURE},
+        "stages": [common | stage for stage in stages],
+        "output": {"trajectory": False, "figure": False, "log_interval_ps": EVERY},
+    }
+
+
+def own_density(model: str, duration: float) -> np.ndarray:
+    """Density over time by rigidmd, g/cm³."""
+    npt = {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": 1.0}
+    results = Simulation(Scene.from_dict(scene(model, npt | {"duration_ps": duration}))).run(progress=True)
+    return results["density"][1:]
+
+
+def begin_gromacs(model: str, duration: float, folder: Path) -> subprocess.Popen:
+    """A run of GROMACS in the folder, begun."""
+    nvt = {"ensemble": "nvt", "duration_ps": 5.0}
+    simulation = Simulation(Scene.from_dict(scene(model, nvt)))
+    state = simulation.run().state
+    system = simulation.system
+    species = system.species[0]
+    sites = {
+        "position": system.site_positions(state, wrapped=True).reshape(COUNT, -1, 3),
+        "template": species.positions_body,
+        "edge": state.cell[0, 0],
+        "name": species.site_names,
+        "mass": species.masses,
+        "charge": species.charges,
+        "sigma": np.where(species.epsilon > 0, species.sigma, 1.0),
+        "epsilon": species.epsilon / KJ_PER_MOL,
+    }
+    every = round(EVERY / (STEP * 1e-3))
+    options = {
+        "integrator": "md", "dt": STEP * 1e-3, "nsteps": round(duration / (STEP * 1e-3)), "gen-vel": "yes",
+        "gen-temp": TEMPERATURE, "cutoff-scheme": "verlet", "nstlist": 20, "verlet-buffer-tolerance": 1e-4,
+        "rvdw": CUTOFF / 10, "rcoulomb": CUTOFF / 10, "vdw-modifier": "potential-shift", "DispCorr": "EnerPres",
+        "coulombtype": "PME", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.5, "ref-t": TEMPERATURE,
+        "pcoupl": "C-rescale", "tau-p": 1.0, "ref-p": 1.0, "compressibility": 4.5e-5,
+        "nstenergy": every, "nstlog": 0,
+    }  # fmt: skip
+    (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
+    (folder / "run.gro").write_text(gro(sites, np.zeros_like(sites["position"])))
+    (folder / "run.top").write_text(top(sites))
+    gmx = [program("gmx"), "-quiet", "-nobackup"]
+    call([*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr"], folder)
+    threads = ["-ntmpi", "1", "-ntomp", "1", "-notunepme"]
+    with (folder / "said.txt").open("w") as said:
+        return subprocess.Popen([*gmx, "mdrun", "-deffnm", "run", *threads], cwd=folder, env=environment(),
+                                stdout=said, stderr=said)  # fmt: skip
+
+
+def end_gromacs(run: subprocess.Popen, folder: Path) -> np.ndarray:
+    """Its density over time, g/cm³."""
+    if run.wait() != 0:
+        raise SystemExit((folder / "said.txt").read_text()[-2000:])
+    call([program("gmx"), "-quiet", "energy", "-f", "run.edr", "-o", "run.xvg", "-dp"], folder, "Density\n\n")
+    lines = [line.split() for line in (folder / "run.xvg").read_text().splitlines() if line[0] not in "#@"]
+    return 1e-3 * np.array(lines, float)[1:, 1]
+
+
+def average(values: np.ndarray) -> tuple[float, float]:
+    """Mean and standard error of a series without its first tenth."""
+    kept = values[len(values) // 10 :]
+    return float(kept.mean()), float(kept.std(ddof=1) * np.sqrt(timeseries.statistical_inefficiency(kept) / len(kept)))
+
+
+def main() -> None:
+    """Run both engines for each model and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--models", default="spce,tip4p2005")
+    parser.add_argument("--duration", type=float, default=2000.0, metavar="PS")
+    parser.add_argument("--output", metavar="FILE", help="also keep the figures as JSON")
+    options = parser.parse_args()
+    found = {}
+    print(f"{Gromacs.version()}; {options.duration:g} ps each")
+    print("| model | rigidmd, g/cm³ | GROMACS, g/cm³ | difference, % |\n|---|---|---|---|")
+    for model in options.models.split(","):
+        with tempfile.TemporaryDirectory() as name:
+            run = begin_gromacs(model, options.duration, Path(name))
+            try:
+                own = average(own_density(model, options.duration))
+                other = average(end_gromacs(run, Path(name)))
+            finally:
+                run.kill()
+        difference, error = 100 * (own[0] / other[0] - 1), 100 * np.hypot(own[1], other[1]) / other[0]
+        told = [f"{value:.5f} ± {error:.5f}" for value, error in (own, other)] + [f"{difference:+.3f} ± {error:.3f}"]
+        print(f"| {model} | {' | '.join(told)} |", flush=True)
+        found[model] = {"rigidmd": own, "gromacs": other, "duration_ps": options.duration}
+    if options.output:
+        Path(options.output).write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
