@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 import shlex
 import sys
 from math import inf
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 #: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
 BY_SIGNAL = 128
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
+#: Exit code of a run that stopped because its wall time was up: run it again with --resume.
+OUT_OF_TIME = 75
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -27,7 +30,10 @@ EXAMPLES = """examples:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 130 or 143 ended by a signal."""
+    """Run one command.
+
+    Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a signal.
+    """
     from rigidmd.errors import RigidMDError, SimulationError
 
     options = _parser().parse_args(arguments)
@@ -73,7 +79,22 @@ def _parser() -> argparse.ArgumentParser:
     _scene_arguments(run)
     run.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
     run.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
-    run.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
+    run.add_argument(
+        "--resume", action="store_true",
+        help="go on from the last checkpoint in that folder, to the same bits; without one, begin",
+    )  # fmt: skip
+    _going_on(run)
+
+    resume = _command(
+        commands,
+        "resume",
+        _resume,
+        "go on with a run that was stopped",
+        "rigidmd resume runs/water --until 200ps",
+    )
+    resume.add_argument("folder", metavar="DIR", help="folder of the run")
+    _going_on(resume)
+    resume.set_defaults(overrides=[], force=False, resume=True)
 
     energy = _command(
         commands,
@@ -206,6 +227,35 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _going_on(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
+    parser.add_argument(
+        "--walltime", type=_walltime, metavar="H:MM:SS",
+        help="stop shortly before this time is up, with a checkpoint and exit code 75",
+    )  # fmt: skip
+    parser.add_argument(
+        "--until", type=_until, metavar="TIME",
+        help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run",
+    )  # fmt: skip
+
+
+def _walltime(text: str) -> float:
+    """Seconds in H:MM:SS, MM:SS or D-H:MM:SS."""
+    found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
+    days, hours, minutes, seconds = (int(part or 0) for part in found.groups())
+    return 86400.0 * days + 3600.0 * hours + 60.0 * minutes + seconds
+
+
+def _until(text: str) -> float:
+    """Picoseconds in a time such as 200ps."""
+    found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
+    return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
+
+
 def _read_scene(options: argparse.Namespace, **more):
     from rigidmd.scene import Scene, parse_override
 
@@ -255,18 +305,38 @@ def _run(options: argparse.Namespace) -> int:
         if isinstance(scene, BodyScene):
             raise SceneError(scene.source, ["--threads is for molecules; a single body uses one thread"])
         scene = _read_scene(options, threads=options.threads)
+    if options.until is not None:
+        scene = scene.lasting(options.until)
     folder = Path(options.output) if options.output else Path("runs") / scene.name
     from rigidmd.output.folder import check_folder
 
-    check_folder(folder, options.force)  # before anything slow is imported
+    if not options.resume:
+        check_folder(folder, options.force)  # before anything slow is imported
     from rigidmd.run import Simulation
 
-    simulation = Simulation(scene, folder, options.force, say=_say, warn=_warn)
+    going_on = {"resume": options.resume, "walltime": options.walltime}
+    simulation = Simulation(scene, folder, options.force, say=_say, warn=_warn, **going_on)
     print(simulation.introduction(), flush=True)
     results = simulation.run(progress=True)
     print(simulation.conclusion(results))
     print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
+    if results.interrupted:
+        print(f"  `rigidmd resume {shlex.quote(str(folder))}` goes on with it")
+    if results.out_of_time:
+        return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0
+
+
+def _resume(options: argparse.Namespace) -> int:
+    from rigidmd.output.folder import MARKER, SCENE
+
+    folder = Path(options.folder)
+    if not (folder / MARKER).is_file():
+        from rigidmd.errors import OutputError
+
+        raise OutputError(f"{folder} is not the folder of a run")
+    options.scene, options.output = str(folder / SCENE), options.folder
+    return _run(options)
 
 
 def _say(sentence: str) -> None:

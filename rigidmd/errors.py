@@ -47,5 +47,9 @@ class OutputError(RigidMDError):
     """A folder or file that cannot be written, or would be overwritten."""
 
 
+class CheckpointError(RigidMDError):
+    """A checkpoint that cannot be read, or does not fit the scene."""
+
+
 class SimulationError(RigidMDError):
     """A run that was stopped because its numbers became meaningless."""

@@ -1,4 +1,4 @@
-"""Files that are written completely or not at all."""
+"""Files that are written completely or not at all, and files that grow by whole pieces."""
 
 import contextlib
 import os
@@ -12,16 +12,86 @@ from rigidmd.errors import OutputError
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary path beside `path`, renamed to it when the block succeeds and removed when it fails."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = None
     try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from None
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def sync_file(path: Path) -> None:
+    """Return when what has been written to a file or a folder is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+class AppendedFile:
+    """A file that grows by whole pieces. A piece that cannot be written is taken back. Methods raise OutputError.
+
+    size : bytes of an existing file to go on with, whose rest is cut off; None begins a new file
+    """
+
+    def __init__(self, path: Path, size: int | None = None):
+        self._path = path
+        with self._told():
+            self._file = path.open("wb" if size is None else "r+b", buffering=0)
+            self.size = size or 0
+            if size is not None:
+                if self._file.seek(0, os.SEEK_END) < size:
+                    self._file.close()
+                    raise OutputError(f"{path} is shorter than it was: {size} bytes are needed to go on with it")
+                self._file.truncate(size)
+                self._file.seek(size)
+
+    def append(self, piece: bytes) -> None:
+        """Add a piece at the end."""
+        with self._told():
+            try:
+                self._write(piece)
+            except OSError:
+                with contextlib.suppress(OSError):
+                    self._file.truncate(self.size)
+                raise
+            self.size += len(piece)
+
+    def patch(self, offset: int, piece: bytes) -> None:
+        """Replace bytes at an offset."""
+        with self._told():
+            self._file.seek(offset)
+            self._write(piece)
+            self._file.seek(self.size)
+
+    def sync(self) -> None:
+        """Return when all of it is on the disk."""
+        with self._told():
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close it."""
+        with self._told():
+            self._file.close()
+
+    def _write(self, piece: bytes) -> None:
+        rest = memoryview(piece)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None

@@ -34,6 +34,14 @@ class Engine(Protocol):
         """An exact copy of the state that was last moved."""
         ...
 
+    def memory(self) -> dict[str, np.ndarray] | None:
+        """Arrays on which the next steps depend besides the state; None if there is more than arrays can hold."""
+        ...
+
+    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
+        """Go on from a state with what `memory` gave for it, to the same bits. Raises ValueError if they do not fit."""
+        ...
+
     def forget(self) -> None:
         """Declare that positions were changed from outside since the last step."""
         ...

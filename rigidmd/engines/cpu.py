@@ -34,6 +34,9 @@ from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room,
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
 Precision = Literal["double", "mixed"]
+#: Owners of arrays in the memory of an engine, besides its terms, and the arrays of each.
+LOAD, BOX = "load", "box"
+REMEMBERED = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
 DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
@@ -141,6 +144,40 @@ class Engine:
             raise ValueError("this engine has moved no state yet")
         return self._moved.copy()
 
+    def memory(self) -> dict[str, np.ndarray] | None:
+        """Lists as last built, forces at the present positions, what the box knows: for `recall`."""
+        found = {
+            f"{name}.{key}": array
+            for name, own in self.workspaces.items()
+            if hasattr(own, "memory")
+            for key, array in own.memory().items()
+        }
+        if self.load is not None and not self._stale:
+            found |= self._named(self.load, LOAD)
+        return found | (self._named(self._room, BOX) if self._room is not None else {})
+
+    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
+        """Go on from a state with what `memory` gave for it, to the same bits. Raises ValueError if they do not fit."""
+        own = self._prepare(state)
+        kept = {name: {key: memory[f"{name}.{key}"] for key in of} for name, of in _by_owner(memory).items()}
+        self._workspaces = (
+            tuple(
+                workspace.recall(kept[name]) if name in kept else workspace
+                for name, workspace in zip(self.names, own, strict=False)
+            )
+            or own
+        )
+        self.load, self._stale = no_load(state), LOAD not in kept
+        if LOAD in kept:
+            _fill(self.load, kept[LOAD])
+        if BOX in kept:
+            self._room = box_room(state)
+            _fill(self._room, kept[BOX])
+
+    @staticmethod
+    def _named(arrays: NamedTuple, owner: str) -> dict[str, np.ndarray]:
+        return {f"{owner}.{name}": getattr(arrays, name) for name in REMEMBERED[owner]}
+
     @property
     def moves(self) -> tuple[int, int]:
         """Moves of the box tried and accepted so far."""
@@ -186,6 +223,24 @@ def keep_time(state: State, dt: float) -> None:
     """Begin a new stretch of equal steps, in place, if the step has changed or time was set from outside."""
     if state.time[NOW] != state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt:
         state.begin_stretch()
+
+
+def _by_owner(memory: dict[str, np.ndarray]) -> dict[str, list[str]]:
+    """Owner -> names of its arrays, of names such as owner.array."""
+    found: dict[str, list[str]] = {}
+    for name in memory:
+        owner, _, key = name.rpartition(".")
+        found.setdefault(owner, []).append(key)
+    return found
+
+
+def _fill(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
+    """Copy arrays of a memory into those of a tuple. Raises ValueError if they do not fit."""
+    for name, array in kept.items():
+        there = getattr(arrays, name)
+        if there.shape != array.shape:
+            raise ValueError(f"{name} has the shape {array.shape}, not {there.shape}")
+        there[:] = array
 
 
 def _check_arrays(state: State) -> None:

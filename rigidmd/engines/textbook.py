@@ -189,6 +189,15 @@ class OdeEngine(Engine):
         else:
             self._adaptive(form, state, solver, dt, until)
 
+    def memory(self) -> dict[str, np.ndarray] | None:
+        """As `Engine.memory`; None of Radau, which would go on only within its tolerance."""
+        return None if isinstance(self._solver, Radau) else super().memory()
+
+    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
+        """As `Engine.recall`; DOP853 goes on from its last step."""
+        super().recall(state, memory)
+        self._anew = False
+
     def forget(self) -> None:
         """As `Engine.forget`; the variables stay, and the solver restarts."""
         super().forget()

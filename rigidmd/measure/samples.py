@@ -1,5 +1,6 @@
 """Samples of a run of molecules, kept as rows and read as columns."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple, get_args, get_type_hints
 
@@ -59,6 +60,9 @@ COLUMNS: dict[str, Column] = {
 }
 
 
+NUMBERS = [name for name in COLUMNS if name != "stage_name"]
+
+
 @dataclass
 class Samples:
     """The rows of a run, in order."""
@@ -73,6 +77,24 @@ class Samples:
         if column not in COLUMNS:
             raise KeyError(f"no column {column!r}; there are {', '.join(COLUMNS)}")
         return np.array([getattr(row, column) for row in self.rows])
+
+    def table(self) -> np.ndarray:
+        """All numbers (rows, columns) as float64, which holds every one of them; for `of_table`."""
+        return np.array([[float(getattr(row, name)) for name in NUMBERS] for row in self.rows]).reshape(
+            -1, len(NUMBERS)
+        )
+
+    @classmethod
+    def of_table(cls, table: np.ndarray, stages: Sequence[str]) -> "Samples":
+        """The rows of a table; `stages` are the names of all stages. Raises ValueError if it is no such table."""
+        if table.ndim != 2 or table.shape[1] != len(NUMBERS):
+            raise ValueError(f"samples have the shape {table.shape}")
+        rows = []
+        for values in table.tolist():
+            row = dict(zip(NUMBERS, values, strict=True))
+            row |= {name: int(row[name]) for name in ("step", "stage")}
+            rows.append(Sample(**row, stage_name=stages[int(row["stage"])]))
+        return cls(rows)
 
     @property
     def described(self) -> dict[str, Column]:

@@ -304,7 +304,7 @@ class BodyCheck:
         self._start = self._energies(system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
-        self._moved = abs(self._start["kinetic"]) + (0.0 if system.flies else 2 * swing)
+        self.moved = abs(self._start["kinetic"]) + (0.0 if system.flies else 2 * swing)
 
     def _energies(self, state: State) -> dict[str, float]:
         columns = energies(self.system, state.time[:1], State(*(array[None] for array in state)))
@@ -327,9 +327,9 @@ class BodyCheck:
         if not limits.energy or not is_balanced(system):
             return None
         start, now = self._start, self._energies(state)
-        self._moved = max(self._moved, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
+        self.moved = max(self.moved, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
         error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
-        scale = self._moved + ROUNDING * abs(now["energy"])
+        scale = self.moved + ROUNDING * abs(now["energy"])
         if error <= limits.energy * scale:
             return None
         return Finding(

@@ -4,13 +4,17 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from rigidmd.errors import OutputError
 
 #: Files of a run; the scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
 FINAL, LAST_GOOD, ENERGY, SUMMARY = "final.npz", "last_good_state.npz", "energy.png", "summary.json"
+CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
 #: Marks the folder of a run and lists the files that the run may write, one a line; --force may remove these.
 MARKER = ".rigidmd-run"
+LOCK = ".rigidmd-lock"
 
 
 def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None:
@@ -18,7 +22,7 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
     if folder.exists():
         if not folder.is_dir():
             raise OutputError(f"{folder} is a file; name another folder with -o")
-        if any(folder.iterdir()):
+        if not is_empty(folder):
             if not (folder / MARKER).is_file():
                 raise OutputError(f"{folder} is not empty and holds no earlier run; name another folder with -o")
             if not force:
@@ -36,19 +40,70 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
         raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")
 
 
-def make_folder(folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
+def make_folder(
+    folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = (), lock: "FolderLock | None" = None
+) -> None:
     """Make the folder of a run that will write these files. Of an earlier run only the files that it wrote are removed.
 
-    Raises OutputError.
+    lock : taken as soon as there is a folder. Raises OutputError.
     """
     check_folder(folder, force, inputs)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if lock is not None and not lock.is_taken:
+            lock.take()
+            check_folder(folder, force, inputs)  # another run may have made it meanwhile
         for name in _written(folder):
             (folder / name).unlink(missing_ok=True)
         (folder / MARKER).write_text("\n".join(names) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder} cannot be made: {error.strerror}") from None
+
+
+def continue_folder(folder: Path, names: Iterable[str]) -> None:
+    """Go on in the folder of a run that will also write these files. Its summary is no longer true and is removed.
+
+    Raises OutputError.
+    """
+    try:
+        (folder / SUMMARY).unlink(missing_ok=True)
+        everything = dict.fromkeys([*_written(folder), *names])
+        (folder / MARKER).write_text("\n".join(everything) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
+
+
+class FolderLock:
+    """Keeps other runs out of a folder. The system ends it with the process, however that ends."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._lock = FileLock(folder / LOCK, timeout=0)
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether this process has it."""
+        return self._lock.is_locked
+
+    def take(self) -> None:
+        """Take it unless it is taken already or the folder does not exist. Raises OutputError."""
+        if self.is_taken or not self._folder.is_dir():
+            return
+        try:
+            self._lock.acquire()
+        except Timeout:
+            raise OutputError(f"another run is writing in {self._folder}; name another folder with -o") from None
+        except OSError as error:
+            raise OutputError(f"{self._folder} cannot be written: {error.strerror}") from None
+
+    def release(self) -> None:
+        """Let others in."""
+        self._lock.release()
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder is absent or holds nothing but a lock."""
+    return not folder.exists() or all(path.name == LOCK for path in folder.iterdir())
 
 
 def _written(folder: Path) -> list[str]:

@@ -4,9 +4,11 @@ The first columns are those of OpenMM's StateDataReporter.
 """
 
 import csv
+import io
 from math import isnan
 from pathlib import Path
 
+from rigidmd.core.files import AppendedFile
 from rigidmd.measure import samples
 from rigidmd.measure.samples import Sample
 
@@ -21,20 +23,33 @@ def columns(tensor: bool = True) -> dict[str, str]:
 
 
 class Log:
-    """Writes samples to a CSV file, numbers with all significant digits; missing values are empty."""
+    """Writes samples to a CSV file, numbers with all significant digits; missing values are empty. Raises OutputError.
 
-    def __init__(self, path: Path, tensor: bool):
+    kept : bytes of an existing file to go on with; the rest is cut off. None begins a new file
+    """
+
+    def __init__(self, path: Path, tensor: bool, kept: int | None = None):
         self._columns = columns(tensor)
-        self._file = path.open("w", newline="", encoding="utf-8")
-        self._writer = csv.writer(self._file, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
-        self._writer.writerow(self._columns.values())
+        self._file = AppendedFile(path, kept)
+        if kept is None:
+            self._append(list(self._columns.values()))
+
+    @property
+    def kept(self) -> int:
+        """Bytes so far, all of them on disk."""
+        self._file.sync()
+        return self._file.size
 
     def write(self, sample: Sample) -> None:
         """Add a line."""
         row = [getattr(sample._replace(time=round(sample.time, 9)), name) for name in self._columns]
-        self._writer.writerow([None if isinstance(x, float) and isnan(x) else x for x in row])
-        self._file.flush()
+        self._append([None if isinstance(x, float) and isnan(x) else x for x in row])
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def _append(self, row: list) -> None:
+        line = io.StringIO(newline="")
+        csv.writer(line, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n").writerow(row)
+        self._file.append(line.getvalue().encode())

@@ -1,8 +1,11 @@
 """Trajectories and topology files through MDAnalysis. The only room that imports it."""
 
-import ctypes
+import contextlib
 import os
+import struct
+import tempfile
 import warnings
+from collections.abc import Iterator
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,7 @@ from MDAnalysis.coordinates.XYZ import XYZReader
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.system import System
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import AppendedFile, whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.output.frame import Frame
@@ -181,46 +184,104 @@ def _check_fits(path: Path, positions: np.ndarray) -> None:
 class TrajectoryFile:
     """Writes frames to a file as they come. The ending sets the format.
 
-    interval : time between frames (ps); only .dcd uses it, which stores it once for all frames.
+    MDAnalysis writes each frame to a file of its own in memory; its bytes go to the end of the trajectory. So every
+    write is checked, a file that ends early ends with a whole frame, and a run can go on with the file of another.
+
+    interval : time between frames (ps); only .dcd uses it, which stores it once for all frames
+    kept : bytes and frames of an existing file to go on with; the rest is cut off. None begins a new file
+    Raises OutputError, here and in every method.
     """
 
-    def __init__(self, path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool):
-        self._system = system
-        self._velocities = velocities
-        self._wrapped = wrapped
+    def __init__(
+        self,
+        path: Path,
+        system: System | BodySystem,
+        interval: float,
+        velocities: bool,
+        wrapped: bool,
+        kept: tuple[int, int] | None = None,
+    ):
+        self._path, self._format, self._system = path, path.suffix, system
+        self._velocities, self._wrapped = velocities, wrapped
         self._universe = universe(system, system.state, velocities)
-        options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            self._writer: Any = mda.Writer(str(path), n_atoms=len(system.sites.name), **options.get(path.suffix, {}))
-        self._path, self._format = path, path.suffix
+        self._options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}.get(
+            path.suffix, {}
+        )
+        size, self._frames = kept or (0, 0)
+        self._file = AppendedFile(path, size if kept else None)
+
+    @property
+    def kept(self) -> tuple[int, int]:
+        """Bytes and frames so far, all of them on disk."""
+        self._file.sync()
+        return self._file.size, self._frames
 
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
         set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
         _check_fits(self._path, self._universe.trajectory.ts.positions)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if self._format == ".xyz":
-                self._writer.remark = _extended_xyz(state.cell, time)
-            elif self._format == ".pdb":
-                self._writer.REMARK(f"TIME {time:.6f} PS")
-            self._writer.write(self._universe.atoms)
-            if self._format == ".pdb" and (box := dimensions(state.cell)):
-                self._writer.CRYST1(box)  # MDAnalysis assigns lines between two models to the first
-        self._flush()
-
-    def _flush(self) -> None:
-        """Flush the frame to disk, so that a killed run leaves whole frames."""
-        for name in ("_xyz", "pdbfile"):
-            if (file := getattr(self._writer, name, None)) is not None:
-                file.flush()
-        if os.name == "posix":  # the writers of XTC and TRR cannot flush their C streams: flush all streams
-            ctypes.CDLL(None).fflush(None)
+        self._file.append(self._part_of(self._whole(state, time)))
+        self._frames += 1
+        if self._format in COUNTER:
+            offset, form = COUNTER[self._format]
+            self._file.patch(offset, struct.pack(form, self._frames))
 
     def close(self) -> None:
         """Finish the file."""
-        self._writer.close()
+        if self._format == ".pdb":
+            self._file.append(PDB_END)
+        self._file.close()
+
+    def _whole(self, state: State, time: float) -> bytes:
+        """The file that has the present frame alone."""
+        options = self._options | ({"start": self._frames} if self._format == ".pdb" else {})
+        with _scratch(self._path) as path, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            form = "NCDF" if self._format == ".nc" else self._format[1:].upper()
+            writer: Any = mda.Writer(path, n_atoms=len(self._system.sites.name), format=form, **options)
+            with writer:
+                if self._format == ".xyz":
+                    writer.remark = _extended_xyz(state.cell, time)
+                elif self._format == ".pdb":
+                    writer.REMARK(f"TIME {time:.6f} PS")
+                writer.write(self._universe.atoms)
+                if self._format == ".pdb" and (box := dimensions(state.cell)):
+                    writer.CRYST1(box)  # MDAnalysis assigns lines between two models to the first
+            return Path(path).read_bytes()
+
+    def _part_of(self, whole: bytes) -> bytes:
+        """What is added to the trajectory: the frame, before the first one with the head of the file."""
+        n, first = len(self._system.sites.name), self._frames == 0
+        if self._format == ".pdb":
+            lines = whole.removesuffix(PDB_END)
+            model = lines.index(b"MODEL ")
+            return lines if first else lines[: lines.index(b"\n") + 1] + lines[model:]
+        if self._format == ".xyz":
+            return whole.removesuffix(b"\n\n") + b"\n"
+        if first or self._format not in COUNTER:
+            return whole
+        boxed = self._universe.dimensions is not None
+        size = 80 + 12 * n if self._format == ".dcd" else 4 + 12 * n * (1 + self._velocities) + 48 * boxed
+        return whole[-size:]
+
+
+#: Where a format counts its frames: offset and how the number is packed.
+COUNTER = {".dcd": (8, "<i"), ".nc": (4, ">i")}
+PDB_END = b"END\n"
+
+
+@contextlib.contextmanager
+def _scratch(path: Path) -> Iterator[str]:
+    """A path to write one frame to: in memory on Linux, elsewhere a hidden file beside the trajectory."""
+    if hasattr(os, "memfd_create"):
+        handle = os.memfd_create(path.name)
+        try:
+            yield f"/proc/self/fd/{handle}"
+        finally:
+            os.close(handle)
+    else:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".frame") as folder:
+            yield str(Path(folder) / path.name)
 
 
 def _extended_xyz(cell: np.ndarray, time: float) -> str:

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
-from rigidmd.core.state import NOW
+from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.measure.body_summary import summarise_body
 from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.stable_step import body_rate, stable_angle
 from rigidmd.measure.subjects import decided_for_body
+from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.report import body_summary_text
 from rigidmd.output.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
@@ -21,6 +22,7 @@ from rigidmd.run.loop import Costs, Options, Simulation, Stretch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.results import Results
+from rigidmd.run.resuming import check_same_scene, state_from
 from rigidmd.scene import BodyScene
 from rigidmd.validation import settled
 
@@ -85,6 +87,28 @@ class BodySimulation(Simulation):
         if k > 0:
             self.state.begin_stretch(self.system.breaks()[k - 1])
             self.engine.change(*self.system.during(float(self.state.time[NOW])))
+        return self._stretches[k]
+
+    def _memory(self) -> dict[str, Any]:
+        return {
+            "scene": self.scene.model_dump(mode="json", exclude_none=True),
+            "stable": self._stable,
+            "notes": self.notes,
+        }
+
+    def _recall(self, kept: Checkpoint) -> None:
+        told = kept.told["run"]
+        self.state = state_from(kept.of("state").arrays, self.state)
+        check_same_scene(self.scene, told["scene"], {}, int(self.state.step[NOW]))
+        self._stable = told["stable"]
+        self._warnings.extend(told["notes"])
+        self._stretches = self._walk()
+        k = kept.told["place"]["stretch"]
+        if k > 0:
+            self.engine.change(*self.system.during(float(self.state.time[ORIGIN])))
+        self.engine.recall(self.state, kept.of("engine").arrays)
+
+    def _reenter(self, k: int) -> Stretch:
         return self._stretches[k]
 
     def _walk(self) -> list[Stretch]:

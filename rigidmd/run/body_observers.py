@@ -4,11 +4,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.core.state import State
 from rigidmd.forces.body.frame import Inertial
 from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
 from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
 from rigidmd.mechanics.rotor import SplitRotor
 from rigidmd.output.body_figures import FIGURES, draw_motion
+from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.folder import MOTION, MOTION_NPZ
 from rigidmd.output.motion_file import write_csv, write_npz
 from rigidmd.run.moment import Moment
@@ -30,6 +32,21 @@ class Sampler(Observer):
         self.interval = interval
         self.snapshots: list[Snapshot] = []
 
+    def memory(self) -> Checkpoint:
+        """All of them."""
+        stacked = {
+            name: np.array([getattr(snapshot.state, name) for snapshot in self.snapshots]) for name in State._fields
+        }
+        return Checkpoint({}, stacked | {"t": np.array([snapshot.time for snapshot in self.snapshots])})
+
+    def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
+        """Restore them."""
+        fields = [kept.arrays[name] for name in State._fields]
+        self.snapshots = [
+            Snapshot(time, State(*(field[k].copy() for field in fields)))
+            for k, time in enumerate(kept.arrays["t"].tolist())
+        ]
+
     def see(self, moment: Moment) -> None:
         """One more."""
         self.snapshots.append(Snapshot(moment.time, moment.state.copy()))
@@ -46,6 +63,14 @@ class BodyWatch(Observer):
         # at most half a second of computing and LOOKS samples
         self.steps = min(BODY_PATIENCE // getattr(run.system.method, "force_evaluations", 1), LOOKS * every)
         self._run = run
+
+    def memory(self) -> Checkpoint:
+        """What its checks remember."""
+        return Checkpoint({"moved": self.check.moved}, {})
+
+    def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
+        """Restore it."""
+        self.check.moved = kept.told["moved"]
 
     def see(self, moment: Moment) -> None:
         """Raise a `Finding` if the state exceeds a limit."""

@@ -9,8 +9,9 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack, cast, overload
 
 import numpy as np
 
@@ -18,14 +19,27 @@ from rigidmd.core.schemes import SCHEMES, Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines import Engine
 from rigidmd.engines.cpu import NotFiniteError
-from rigidmd.errors import RigidMDWarning, SimulationError
-from rigidmd.output.folder import SUMMARY, check_folder, make_folder
+from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SimulationError
+from rigidmd.output.checkpoint import Checkpoint, latest
+from rigidmd.output.folder import (
+    CHECKPOINT,
+    PREVIOUS,
+    SUMMARY,
+    FolderLock,
+    check_folder,
+    continue_folder,
+    is_empty,
+    make_folder,
+)
 from rigidmd.output.progress import progress_of
 from rigidmd.output.report import write_summary
+from rigidmd.run.keeper import PIECE, Keeper
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Every, Observer
 from rigidmd.run.results import Results
+from rigidmd.run.resuming import fitting
 from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.validation import settled
 
 if TYPE_CHECKING:
     from rigidmd.assemble.body import BodySystem, Pose
@@ -38,6 +52,11 @@ if TYPE_CHECKING:
     Base = object
 else:
     Base = ABC
+
+
+def _owner(k: int, observer: Observer) -> str:
+    """The name under which a checkpoint keeps what an observer remembers."""
+    return f"{k}.{type(observer).__name__}"
 
 
 def _as_warning(sentence: str) -> None:
@@ -58,12 +77,22 @@ class Stretch(NamedTuple):
     act: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
 
 
+class Place(NamedTuple):
+    """Where in its stretches a run is."""
+
+    stretch: int = 0
+    first: int = 0  # steps before the stretch
+    time: float = 0.0  # of the stretches before, ps or s
+    computing: Sequence[float] = ()  # seconds of the stretches before
+    seconds: float = 0.0  # of computing in this one
+
+
 class Costs(NamedTuple):
     """Times of a run, in seconds."""
 
     preparing: float  # compiling, relief of overlaps
     wall: float  # stretches with observers and output
-    computing: list[float]  # the steps of each stretch
+    computing: Sequence[float]  # the steps of each stretch
 
 
 class Options(TypedDict, total=False):
@@ -72,6 +101,8 @@ class Options(TypedDict, total=False):
     observers: Every | Sequence[Every]
     say: Callable[[str], object]
     warn: Callable[[str], object]
+    resume: bool
+    walltime: float | None
 
 
 class BodyOptions(Options, total=False):
@@ -91,6 +122,8 @@ class Simulation(Base):
     observers : `Every` objects of your own, called between steps
     say : called with a sentence before something that takes a moment (compiling, relieving)
     warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's `warnings`
+    resume : go on from the last checkpoint in the folder, to the same bits; begin if the folder is empty or absent
+    walltime : seconds from now after which the run has to have ended; it stops shortly before, with a checkpoint
     applied : for a single body, forces from Python functions: see `BodySimulation`
     """
 
@@ -124,6 +157,8 @@ class Simulation(Base):
         observers: Every | Sequence[Every] = (),
         say: Callable[[str], object] = lambda sentence: None,
         warn: Callable[[str], object] = _as_warning,
+        resume: bool = False,
+        walltime: float | None = None,
     ):
         self.scene = scene
         self.folder = None if folder is None else Path(folder)
@@ -134,6 +169,10 @@ class Simulation(Base):
         self._warnings: list[str] = []
         self._interrupted = False
         self._signal: int | None = None
+        self._resume = resume
+        self._deadline = None if walltime is None else clock.monotonic() + walltime
+        if resume and folder is None:
+            raise ValueError("a run without a folder has no checkpoint to resume from")
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._told}>"
@@ -153,38 +192,59 @@ class Simulation(Base):
         return f"{self.introduction().splitlines()[0]}; {where}"
 
     def run(self, progress: bool | None = None) -> Results:
-        """Run all stretches. Raises OutputError before anything is computed, SimulationError if a run has to stop.
+        """Run all stretches. Raises OutputError before anything is computed, SimulationError if a run has to stop,
+        CheckpointError if it cannot be resumed.
 
         progress : show progress: a bar on a terminal or in a notebook, elsewhere a line every 30 s on standard error;
             default: only in notebooks
         """
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
-        if self.folder is not None:
-            check_folder(self.folder, self._force, inputs)
-        self._interrupted, self._signal = False, None
-        self._warnings.clear()
-        self._reset()
-        began = clock.perf_counter()
-        self._prepare()
-        prepared = clock.perf_counter() - began
-        own = self._own_observers()
-        observers = [*own, *self._observers]
-        if self.folder is not None:
-            names = [name for observer in observers for name in observer.files()]
-            make_folder(self.folder, self._force, [*names, SUMMARY], inputs)
-        with self._stops_at_signals(), contextlib.ExitStack() as stack:
-            for observer in observers:
+        with contextlib.ExitStack() as stack:
+            kept = None
+            if self.folder is not None:
+                stack.callback((lock := FolderLock(self.folder)).release)
+                lock.take()
+                kept = self._kept() if self._resume else None
+                if kept is None:
+                    check_folder(self.folder, self._force, inputs)
+            self._interrupted, self._signal, self._out_of_time = False, None, False
+            self._keeper = Keeper(self.folder, settled(self.scene.output.checkpoint_minutes), self._deadline)
+            stack.enter_context(self._asks_at_signals())
+            self._warnings.clear()
+            self._reset()
+            began = clock.perf_counter()
+            if kept is None:
+                self._prepare()
+            else:
+                with fitting(self.folder):
+                    self._recall(kept)
+            prepared = clock.perf_counter() - began
+            observers = [*self._own_observers(), *self._observers]
+            if self.folder is not None:
+                names = [name for observer in observers for name in observer.files()]
+                names += [SUMMARY, CHECKPOINT, PREVIOUS]
+                if kept is None:
+                    make_folder(self.folder, self._force, names, inputs, lock)
+                else:
+                    continue_folder(self.folder, names)
+            stack.enter_context(self._stops_at_signals())
+            for k, observer in enumerate(observers):
                 stack.callback(observer.close)
-                observer.begin(self)
+                if kept is None:
+                    observer.begin(self)
+                else:
+                    with fitting(self.folder):
+                        observer.resume(self, kept.of(_owner(k, observer)))
             began = clock.perf_counter()
             try:
-                computing = self._run_stretches(observers, progress)
-            except SimulationError as error:
+                computing = self._run_stretches(observers, progress, kept)
+            except (SimulationError, OutputError) as error:
                 raise self._failed(error, observers) from None
             costs = Costs(prepared, clock.perf_counter() - began, computing)
             results = Results(self.system, self.state, self._samples())
             results.interrupted, results.signal = self._interrupted, self._signal
+            results.out_of_time = self._out_of_time
             results.summary = self._summary(results.samples, costs)
             for observer in observers:
                 observer.end(self, results)
@@ -226,6 +286,18 @@ class Simulation(Base):
         """Prepare stretch k and return it."""
 
     @abstractmethod
+    def _reenter(self, k: int) -> Stretch:
+        """Return stretch k again, in which the run goes on."""
+
+    @abstractmethod
+    def _memory(self) -> dict[str, Any]:
+        """What `_recall` needs besides the state and the engine's memory, as JSON has it."""
+
+    @abstractmethod
+    def _recall(self, kept: Checkpoint) -> None:
+        """Return to a checkpoint, in place of `_prepare`. Raises CheckpointError if it is of another scene."""
+
+    @abstractmethod
     def _look(self, moment: Moment) -> Any:
         """The observation at a moment, in internal units; observers see its `reading` if it has one."""
 
@@ -260,60 +332,113 @@ class Simulation(Base):
         return list(self._warnings)
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _failed(self, error: SimulationError, observers: list[Observer]) -> SimulationError:
+    def _failed(self, error: SimulationError | OutputError, observers: list[Observer]) -> RigidMDError:
         """The error with its step, time and explanation."""
         time, origin = self.state.time
         step = int(self.state.step[ORIGIN]) + round((time - origin) / self.stretch.dt)
+        where = f"stopped at step {step} ({time:g} {self.time_unit}): "
+        if isinstance(error, OutputError):
+            return OutputError(f"{where}{error}{self._last_chance()}")
         saved = "".join(observer.failed(self) for observer in observers)
-        return SimulationError(f"stopped at step {step} ({time:g} {self.time_unit}): {self._explain(error)}{saved}")
+        return SimulationError(f"{where}{self._explain(error)}{saved}")
 
-    def _run_stretches(self, observers: list[Observer], progress: bool | None) -> list[float]:
-        """Advance through all stretches; seconds of computing in each."""
-        computing: list[float] = []
+    def _last_chance(self) -> str:
+        """What a run that could not write can be resumed from."""
+        if not self._keeper.keeps:
+            return ""
+        return f". Make room and go on from the last checkpoint: rigidmd resume {self.folder}"
+
+    def _kept(self) -> Checkpoint | None:
+        """The checkpoint to go on from; None if there is no run yet."""
+        folder = cast(Path, self.folder)
+        if is_empty(folder):
+            self._say(f"{folder} holds no run yet: beginning it")
+            return None
+        kept, faults = latest(folder)
+        for fault in faults:
+            self._warn(f"{fault}. The checkpoint before it is used")
+        return kept
+
+    def _checkpoint(self, observers: list[Observer], place: "Place") -> None:
+        """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
+        if not self._keeper.keeps or (memory := self.engine.memory()) is None:
+            return
+        of, arrays = {}, {}
+        for k, observer in enumerate(observers):
+            owner = _owner(k, observer)
+            of[owner], own = observer.memory()
+            arrays |= {f"{owner}/{name}": array for name, array in own.items()}
+        arrays |= {f"state/{name}": array for name, array in self.state._asdict().items()}
+        arrays |= {f"engine/{name}": array for name, array in memory.items()}
+        told = {"rigidmd": version("rigidmd"), "place": place._asdict(), "run": self._memory(), "of": of}
+        self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW])))
+
+    def _run_stretches(
+        self, observers: list[Observer], progress: bool | None, kept: Checkpoint | None = None
+    ) -> Sequence[float]:
+        """Advance through all stretches, from a checkpoint on; seconds of computing in each."""
+        place = Place() if kept is None else Place(**kept.told["place"])
         durations = self._durations()
         self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
-        time = 0.0  # of whole stretches
         whole = sum(durations)
         with progress_of(whole, self.time_unit, progress if whole > 0 else False) as advanced:
-            for k in range(len(durations)):
-                self.stretch = stretch = self._enter(k)
-                first = int(self.state.step[NOW])
-                if k == 0:
+            for k in range(place.stretch, len(durations)):
+                if resumed := kept is not None and k == kept.told["place"]["stretch"]:
+                    self.stretch = stretch = self._reenter(k)
+                    done = int(self.state.step[NOW]) - place.first
+                    advanced(place.time + done * stretch.dt)
+                else:
+                    self.stretch = stretch = self._enter(k)
+                    place = place._replace(stretch=k, first=int(self.state.step[NOW]), seconds=0.0)
+                    done = 0
+                if k == 0 and not resumed:
                     self._show(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
+                    self._checkpoint(observers, place)
                 every = [self._every(observer, stretch.dt) for observer in observers]
-                seconds, done, shown = 0.0, 0, True
-                if stretch.act is not None:
+                if stretch.act is not None and not resumed:
                     began = clock.perf_counter()
                     stretch.act(progress)
-                    seconds = clock.perf_counter() - began
+                    place = place._replace(seconds=clock.perf_counter() - began)
                     due = [observer.interval is not None or observer.ends for observer in observers]
-                    self._show(observers, Moment(self, first, time, k), due)
+                    self._show(observers, Moment(self, place.first, place.time, k), due)
+                shown, pace = None, 0.0
                 while done < stretch.steps and not self._interrupted:
                     counts = [self._counted(observer, stretch) + done for observer in observers]
                     ahead = [n - count % n for count, n in zip(counts, every, strict=True) if n]
+                    ahead += [max(1, int(PIECE / pace))] if pace > 0 else []
                     to = min([stretch.steps, *(done + steps for steps in ahead)])
                     began = clock.perf_counter()
-                    self.engine.advance(self.state, stretch.row, stretch.dt, first + to)
-                    seconds += clock.perf_counter() - began
+                    self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to)
+                    seconds = clock.perf_counter() - began
+                    pace = seconds / (to - done)
+                    place = place._replace(seconds=place.seconds + seconds)
                     if not self.state.is_finite:
                         raise NotFiniteError(self.state)
                     advanced(stretch.dt * (to - done))
                     done = to
-                    last = done == stretch.steps or self._interrupted
-                    due = [
-                        (n > 0 and (self._counted(observer, stretch) + done) % n == 0) or (last and observer.ends)
+                    shown = [
+                        (n > 0 and (self._counted(observer, stretch) + done) % n == 0)
+                        or (done == stretch.steps and observer.ends)
                         for observer, n in zip(observers, every, strict=True)
                     ]
-                    self._show(observers, Moment(self, first + done, time + done * stretch.dt, k), due)
-                    shown = last
-                if not shown:  # a signal arrived while observers were called
-                    due = [observer.ends for observer in observers]
-                    self._show(observers, Moment(self, first + done, time + done * stretch.dt, k), due)
-                computing.append(seconds)
-                time += done * stretch.dt
+                    self._show(observers, self._moment(place, done), shown)
+                    if self._keeper.time_is_up:
+                        self._interrupted = self._out_of_time = True
+                    elif done < stretch.steps and self._keeper.is_due:
+                        self._checkpoint(observers, place)
+                if not (stretch.act is not None and self._interrupted):
+                    self._checkpoint(observers, place)
+                if done < stretch.steps and shown is not None:  # looks that a run without a stop does not have
+                    due = [observer.ends and not seen for observer, seen in zip(observers, shown, strict=True)]
+                    self._show(observers, self._moment(place, done), due)
+                place = place._replace(time=place.time + done * stretch.dt, computing=[*place.computing, place.seconds])
                 if self._interrupted:
                     break
-        return computing
+        return place.computing
+
+    def _moment(self, place: "Place", done: int) -> Moment:
+        """The moment after so many steps of the present stretch."""
+        return Moment(self, place.first + done, place.time + done * self.stretch.dt, place.stretch)
 
     @staticmethod
     def _every(observer: Observer, dt: float) -> int:
@@ -332,6 +457,23 @@ class Simulation(Base):
         for observer, now in zip(observers, due, strict=True):
             if now:
                 observer.see(moment)
+
+    @contextlib.contextmanager
+    def _asks_at_signals(self) -> Iterator[None]:
+        """SIGUSR1 asks for a checkpoint, where there is such a signal."""
+        number = getattr(signal, "SIGUSR1", None)
+        if number is None or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def ask(signum, frame):
+            self._keeper.asked = True
+
+        before = signal.signal(number, ask)
+        try:
+            yield
+        finally:
+            signal.signal(number, before)
 
     @contextlib.contextmanager
     def _stops_at_signals(self) -> Iterator[None]:

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from rigidmd.core.state import State
+from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
 from rigidmd.measure import watch
 from rigidmd.measure.samples import Samples
+from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.output.log import Log
 from rigidmd.output.report import draw_energy, drawn
@@ -35,6 +36,14 @@ class LogFile(Observer):
     def begin(self, run: "MolecularSimulation") -> None:
         """Open it."""
         self._log = Log(run.path(LOG), self._tensor)
+
+    def memory(self) -> Checkpoint:
+        """Its size."""
+        return Checkpoint({"kept": None if self._log is None else self._log.kept}, {})
+
+    def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
+        """Open it where the checkpoint left it."""
+        self._log = Log(run.path(LOG), self._tensor, kept.told["kept"])
 
     def see(self, moment: Moment) -> None:
         """A line."""
@@ -94,6 +103,18 @@ class Sampler(Observer):
             raise finding
         self._check.rescale(seen.kinetic)
         self.last_good = Good(moment.step, moment.time, run.state.copy())
+
+    def memory(self) -> Checkpoint:
+        """The samples, and what the checks remember."""
+        told = {"begins": list(self._begins.items()), "thermal": self._check.thermal}
+        return Checkpoint(told, {"samples": self.samples.table()})
+
+    def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
+        """Restore them. The state of the checkpoint is the last good one."""
+        self.samples = Samples.of_table(kept.arrays["samples"], [stage.label for stage in run.scene.stages])
+        self._begins = {int(stage): int(row) for stage, row in kept.told["begins"]}
+        self._check.thermal = kept.told["thermal"]
+        self.last_good = Good(int(run.state.step[NOW]), float(run.state.time[NOW]), run.state.copy())
 
     def failed(self, run: "MolecularSimulation") -> str:
         """Save the last good state."""

@@ -12,7 +12,7 @@ from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
-from rigidmd.core.state import HEAT, TAKEN, WORK, State, state_of
+from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure import watch
@@ -25,6 +25,7 @@ from rigidmd.measure.shadow import choose_for_averages
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.subjects import choose_for_molecules
 from rigidmd.measure.summary import summarise
+from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.progress import progress_of
 from rigidmd.output.report import summary_text
 from rigidmd.output.scene_file import input_names, write_scene
@@ -35,7 +36,9 @@ from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.relief import Relief, relieve
 from rigidmd.run.results import Results
+from rigidmd.run.resuming import check_same_scene, digests, state_from
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
 
 
@@ -119,6 +122,48 @@ class MolecularSimulation(Simulation):
         self._origins: dict[int, float] = {}
         self._stage = 0
         self._conserved: float | None = None
+
+    def _memory(self) -> dict[str, Any]:
+        return {
+            "scene": self._built.scene.model_dump(mode="json", exclude_none=True),
+            "inputs": digests(self._built.scene),
+            "stages": [stage.model_dump(mode="json", exclude_none=True) for stage in self.scene.stages],
+            "relief": None if self._relief is None else self._relief._asdict(),
+            "choices": list(self._choices.items()),
+            "stable": list(self._stable.items()),
+            "moves": list(self._moves.items()),
+            "minima": [(k, found._replace(pressure=found.pressure.tolist())) for k, found in self._minima.items()],
+            "origins": list(self._origins.items()),
+            "stage": self._stage,
+            "conserved": self._conserved,
+            "notes": self.notes,
+        }
+
+    def _recall(self, kept: Checkpoint) -> None:
+        told = kept.told["run"]
+        self.state = state_from(kept.of("state").arrays, self._built.state)
+        check_same_scene(self._built.scene, told["scene"], told["inputs"], int(self.state.step[NOW]))
+        stages = [Stage.model_validate(stage) for stage in told["stages"]]
+        stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
+        self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
+        self.system = replace(self.system, scene=self.scene)
+        self._relief = None if told["relief"] is None else Relief(**told["relief"])
+        self._choices = dict(told["choices"])
+        self._stable = dict(told["stable"])
+        self._moves = {k: (tried, accepted) for k, (tried, accepted) in told["moves"]}
+        self._minima = {k: Minimum(*figures)._replace(pressure=np.array(figures[8])) for k, figures in told["minima"]}
+        self._origins = dict(told["origins"])
+        self._stage, self._conserved = told["stage"], told["conserved"]
+        self._warnings.extend(told["notes"])
+        self.engine = self.system.engine()
+        self.engine.recall(self.state, kept.of("engine").arrays)
+
+    def _reenter(self, k: int) -> Stretch:
+        stage = self.scene.stages[k]
+        step = stage.timestep_fs * FEMTOSECOND
+        if stage.is_minimisation:
+            return Stretch(stage.scheme, step, 0, act=self._minimise)
+        return Stretch(row_of_stage(self.system, k), step, stage.steps)
 
     def _durations(self) -> list[float]:
         return [stage.duration for stage in self.scene.stages]

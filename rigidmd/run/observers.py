@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.folder import SCENE
 from rigidmd.output.frame import Frame
 from rigidmd.run.moment import Moment
@@ -37,6 +38,14 @@ class Observer:
 
     def see(self, moment: Moment) -> None:
         """Look. Raises SimulationError to stop the run."""
+
+    def memory(self) -> Checkpoint:
+        """What `resume` needs, for a checkpoint; its files are on the disk as far as they go."""
+        return Checkpoint({}, {})
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        """Called instead of `begin` when a run goes on from a checkpoint: restore what `memory` gave for it."""
+        self.begin(run)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         """Called after the last step or an interruption: complete the files."""
@@ -101,11 +110,26 @@ class Frames(Observer):
         """Write the topology and open the trajectory."""
         self._run, self._frames = run, []
         if run.folder is not None:
-            from rigidmd.output.trajectory import TrajectoryFile, write_topology  # MDAnalysis is slow to import
+            from rigidmd.output.trajectory import write_topology  # MDAnalysis is slow to import
 
-            topology, trajectory = (run.path(name) for name in self._names)
-            write_topology(topology, run.system, run.state, self._wrapped)
-            self._file = TrajectoryFile(trajectory, run.system, self.interval, self._velocities, self._wrapped)
+            write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)
+            self._open(None)
+
+    def memory(self) -> Checkpoint:
+        """Size of the trajectory, times of its frames."""
+        kept = None if self._file is None else self._file.kept
+        return Checkpoint({"kept": kept}, {"time": np.array([frame.time for frame in self._frames])})
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        """Go on with the trajectory where the checkpoint left it."""
+        self._run, self._frames = run, [Frame(time) for time in kept.arrays["time"].tolist()]
+        self._open(tuple(kept.told["kept"]))
+
+    def _open(self, kept: tuple[int, int] | None) -> None:
+        from rigidmd.output.trajectory import TrajectoryFile
+
+        run, path = self._run, self._run.path(self._names[1])
+        self._file = TrajectoryFile(path, run.system, self.interval, self._velocities, self._wrapped, kept)
 
     def see(self, moment: Moment) -> None:
         """A frame."""

@@ -30,7 +30,8 @@ class Results:
     summary : values with units in their keys, as in summary.json
     state : the final one, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units
     files : paths of the files written
-    interrupted : whether a signal ended the run early; signal : its number, 2 for Ctrl-C, 15 for SIGTERM
+    interrupted : whether the run ended early, by a signal or because its time was up (`out_of_time`)
+    signal : number of the signal, 2 for Ctrl-C, 15 for SIGTERM
     """
 
     system: "System | BodySystem"
@@ -40,6 +41,7 @@ class Results:
     files: list[Path] = field(default_factory=list)
     interrupted: bool = False
     signal: int | None = None
+    out_of_time: bool = False
     _frames: "list[Frame]" = field(default_factory=list)
 
     def __repr__(self) -> str:

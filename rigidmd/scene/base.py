@@ -46,6 +46,10 @@ class Scene(Section):
         """The file it was read from, for messages."""
         return self._source
 
+    def lasting(self, until: float) -> "Scene":
+        """The same scene with an end at a time of the run. Raises SceneError where it has none to set."""
+        raise SceneError(self.source, ["--until is for molecules; set run.duration_s of a single body"])
+
     def path(self, file: str) -> Path:
         """A file named in the scene: relative to the scene's own folder."""
         return self._folder / file

@@ -319,6 +319,9 @@ class BodyOutput(Section):
     """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second becomes a ps"""
     figures: Flag = True
     """Draw the motion"""
+    checkpoint_minutes: Annotated[float, Strict(), Field(gt=0, le=1e9)] | Literal[False] = 5.0
+    """Wall time between checkpoints, from which a run goes on after a stop; false for none. Runs by radau have
+    none"""
     axis: Vector | None = None
     """Body axis whose path is drawn; default: towards the centre of mass, else the axis of symmetry, else axis 3"""
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, field_validator, model_validator
 
+from rigidmd.errors import SceneError
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
@@ -19,6 +20,7 @@ WITH_VELOCITIES = (".trr", ".nc")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
+Minutes = Interval | Literal[False]
 
 
 class Throughout(Section):
@@ -49,6 +51,8 @@ class Output(Section):
     """Write velocities; default: if the format holds them"""
     figure: Flag = True
     """Draw energy.png"""
+    checkpoint_minutes: Minutes = 5.0
+    """Wall time between checkpoints, from which a run goes on after a stop; false for none"""
 
     @field_validator("trajectory")
     @classmethod
@@ -91,6 +95,18 @@ class MolecularScene(Scene):
     run: Throughout = Throughout()
     output: Output = Output()
     watch: Watch = Watch()
+
+    def lasting(self, until: float) -> "MolecularScene":
+        """The same scene with a last stage that ends at a time of the run, ps. Raises SceneError."""
+        before = sum(stage.duration for stage in self.stages[:-1])
+        last = self.stages[-1]
+        if last.is_minimisation or last.ramps:
+            what = "is a minimisation" if last.is_minimisation else "changes temperature or pressure over its duration"
+            raise SceneError(self.source, [f"the last stage {what}: --until cannot set its end"])
+        if not until > before:
+            raise SceneError(self.source, [f"--until {until:g} ps: the last stage begins at {before:g} ps"])
+        stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": until - before}))
+        return self.model_copy(update={"stages": stages})
 
     def resolved(self) -> "MolecularScene":
         """The same scene with every number that a run of it uses; it runs to the same bits.

@@ -344,6 +344,13 @@ class Stage(Section):
         return _tensor(ends[0]), _tensor(ends[1])
 
     @property
+    def ramps(self) -> bool:
+        """Whether its temperature or its pressure changes with time, so that its duration decides how fast."""
+        first, last = self.temperatures
+        begin, end = self.pressures if self.changes_box else ((), ())
+        return first != last or begin != end
+
+    @property
     def barostat_time(self) -> float:
         """ps"""
         return self.barostat_time_ps or BAROSTAT_TIME

@@ -245,6 +245,19 @@ def _pair_up(order, at, width, first, end):
 
 
 @kernel(counted=False)
+def settle_again(clusters):
+    """Positions and distances as `settle_block` left them, from order, origin and reference."""
+    width = width_of(clusters.local)
+    for slot in range(len(clusters.order)):
+        clusters.moved[slot] = 0.0
+        clusters.square[slot] = 0.0
+        for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
+            clusters.local[n] = clusters.reference[n]
+            clusters.square[slot] += clusters.local[n] ** 2
+    clusters.farthest[:] = 0.0
+
+
+@kernel(counted=False)
 def place_block(clusters, cell, sites, state, block):
     """Set `local` of the sites of a share of the molecules to the present positions of the molecules."""
     width = width_of(clusters.local)

@@ -136,6 +136,41 @@ def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) ->
     return min(count, ceil(count * (min(layers, 0.5) + 1 / blocks)))
 
 
+#: Arrays of `Clusters` from which a list is built again as it was.
+REMEMBERED = ("order", "boxes", "origin", "reference")
+
+
+def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
+    """What `recalled` needs to have this list again, bit for bit, where sites have moved since it was built."""
+    found = {"skin": np.array(pairs.skin)}
+    if pairs.counters[USABLE] == 1:
+        found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED}
+    return found
+
+
+def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
+    """The list with the clusters and the skin of a memory; `update.refill` must follow if there are clusters.
+
+    Raises ValueError if the memory is that of another list.
+    """
+    skin = float(memory["skin"])
+    pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
+    clusters = pairs.clusters
+    for name in REMEMBERED:
+        array = getattr(clusters, name)
+        if name in memory:
+            if (memory[name].shape, memory[name].dtype) != (array.shape, array.dtype):
+                raise ValueError(f"{name} of a list has another shape or type")
+            array[:] = memory[name]
+    if "order" in memory:
+        sites = len(clusters.slot)
+        if not np.array_equal(np.sort(clusters.order[:sites]), np.arange(sites)):
+            raise ValueError("order of a list is none of its sites")
+        clusters.slot[clusters.order[:sites]] = np.arange(sites)
+        clusters.group[: len(clusters.order)] = pairs.group[clusters.order]
+    return pairs
+
+
 def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
     """The list with the room that its last build needed and a tenth more, and with a skin that fits into the cell.
 

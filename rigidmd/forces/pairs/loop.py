@@ -45,7 +45,7 @@ from rigidmd.forces.pairs.lists import (
     most_needed,
 )  # fmt: skip
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
-from rigidmd.forces.pairs.update import list_code, update_list
+from rigidmd.forces.pairs.update import list_code, refill, update_list
 from rigidmd.forces.terms import Setup
 
 
@@ -121,6 +121,17 @@ class PairWorkspace(NamedTuple):
             others = _room_for_others(pairs, len(others), int(1.1 * clusters) + 1)
         return self._replace(pairs=pairs, sums=self.sums._replace(others=others))
 
+    def memory(self) -> dict[str, np.ndarray]:
+        """Its list as last built."""
+        return neighbors.memory_of(self.pairs)
+
+    def recall(self, memory: dict[str, np.ndarray]) -> "PairWorkspace":
+        """With the list of a memory; has machine code. Raises ValueError if the memory is that of another term."""
+        found = self._replace(pairs=neighbors.recalled(self.pairs, memory))
+        while "order" in memory and _refill(found):
+            found = found.with_room(found.pairs.cell)
+        return found
+
 
 def _room_for_others(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
     dtype = pairs.clusters.local.dtype
@@ -193,11 +204,29 @@ def _find(parcel, block):
     builds = pairs.counters[BUILDS]
     status = update_list(pairs, code, sites, state)
     if pairs.counters[BUILDS] != builds:
-        arrange(law, arranged, pairs.clusters.order)
-        if 3 * width_of(sums.others) * most_needed(pairs, WINDOW) > sums.others.shape[1]:
-            pairs.counters[USABLE] = 0
-            status = LIST_FULL
+        status = _arranged(law, arranged, pairs, sums)
     pairs.counters[STATUS] = status
+
+
+@kernel
+def _arranged(law, arranged, pairs, sums):
+    """Put the law's numbers into the slots of a new list; a status code."""
+    arrange(law, arranged, pairs.clusters.order)
+    if 3 * width_of(sums.others) * most_needed(pairs, WINDOW) > sums.others.shape[1]:
+        pairs.counters[USABLE] = 0
+        return LIST_FULL
+    return OK
+
+
+@kernel(outer=True)
+def _refill(term):
+    """Build a list again from its clusters; a status code, also in counters[STATUS]."""
+    pairs = term.pairs
+    status = refill(pairs, term.list_code)
+    if status == OK:
+        status = _arranged(term.law, term.arranged, pairs, term.sums)
+    pairs.counters[STATUS] = status
+    return status
 
 
 @task()

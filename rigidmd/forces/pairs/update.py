@@ -8,6 +8,7 @@ from rigidmd.forces.pairs.clusters import (
     bin_block,
     follow_block,
     place_block,
+    settle_again,
     settle_block,
     sort_into_clusters,
     wrap_block,
@@ -72,6 +73,23 @@ def update_list(pairs, code, sites, state):
     call_blocks(code, "settle", placed, blocks)
     call(code, "grow", parcel)
     call_blocks(code, "fill", parcel, blocks)
+    return _judged(pairs)
+
+
+@kernel(counted=False)
+def refill(pairs, code):
+    """Build the list again from the clusters that `lists.recalled` has put in; a status code."""
+    settle_again(pairs.clusters)
+    pairs.counters[IMAGES_FOUND] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+    parcel = packed(pairs)
+    call(code, "grow", parcel)
+    call_blocks(code, "fill", parcel, len(pairs.needed))
+    return _judged(pairs)
+
+
+@kernel(counted=False)
+def _judged(pairs):
+    """Whether a list that has been filled is whole, into its counters; a status code."""
     if most_needed(pairs, ENTRIES) > pairs.entries.shape[1] or most_needed(pairs, MASKED) > pairs.masked.shape[1]:
         return LIST_FULL
     pairs.counters[USABLE] = 1

@@ -1,0 +1,285 @@
+"""Runs that are stopped and go on: to the same bits as one that never stopped."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigidmd import cli
+from rigidmd.errors import CheckpointError, OutputError
+from rigidmd.output.checkpoint import read_checkpoint
+from rigidmd.output.folder import CHECKPOINT, PREVIOUS, FolderLock
+from rigidmd.run import Simulation
+from rigidmd.run.observers import Every
+from rigidmd.scene import Scene
+
+WATER = {
+    "box": {"density_g_cm3": 0.9},
+    "molecules": [{"model": "spce", "count": 40}],
+    "forces": {"cutoff_A": 5.0, "truncation": "smooth_switch"},
+    "start": {"temperature_K": 298.0},
+    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figure": False},
+}
+NVT = {"ensemble": "nvt", "temperature_K": 298.0, "duration_ps": 0.1, "timestep_fs": 1.0}
+NPT = NVT | {"ensemble": "npt", "pressure_bar": 1.0, "barostat_interval_ps": 0.007, "temperature_K": [298.0, 320.0]}
+NVE = {"duration_ps": 0.1, "timestep_fs": 2.0}
+NPH = NVE | {"ensemble": "nph", "pressure_bar": 1.0}
+MINIMISE = {"ensemble": "minimise", "most_iterations": 5}
+
+
+def scene(*stages: dict, **changes) -> dict:
+    """Forty waters."""
+    return WATER | {"stages": list(stages)} | changes
+
+
+def stopped_at(steps: set[int]) -> Every:
+    """An observer that sends SIGTERM to this process after some of the steps of a run."""
+
+    def stop(moment):
+        if moment.step in steps:
+            steps.discard(moment.step)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    return Every(0.001, stop)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of a run that have to be the same to the bit."""
+    names = [path.name for path in folder.iterdir() if path.name.startswith(("trajectory", "log", "topology", "motion"))]
+    found = {name: (folder / name).read_bytes() for name in names}
+    if (folder / "final.npz").exists():
+        with np.load(folder / "final.npz") as data:
+            found |= {name: data[name].tobytes() for name in data.files}
+    return found
+
+
+def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
+    """Run once without a stop, once with stops after these steps, each time with another number of threads."""
+    looks = Every(0.001, lambda moment: None)  # the same looks in both runs
+    Simulation(Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=looks).run()
+    left, runs = set(steps), 0
+    while True:
+        simulation = Simulation(
+            Scene.from_dict(data | {"threads": 1 + runs % 2}), folder / "parts", observers=stopped_at(left), resume=True
+        )
+        results = simulation.run()
+        runs += 1
+        if not results.interrupted:
+            break
+        assert results.signal == signal.SIGTERM
+    assert runs == len(steps) + 1
+    whole, parts = contents(folder / "whole"), contents(folder / "parts")
+    assert whole.keys() == parts.keys() and len(whole) > 3
+    assert [name for name in whole if whole[name] != parts[name]] == []
+
+
+def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
+    """Two stages, mixed precision, a box that moves, a ramp."""
+    same_after_stops(scene(NVT, NPT, NVE, precision="mixed"), [3, 61, 100, 133, 207], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+@pytest.mark.parametrize(
+    "stages",
+    [
+        (NVT | {"thermostat": "langevin"}, NVE),
+        (NVT | {"thermostat": "nose_hoover"}, NPH),
+        (NVT | {"thermostat": "andersen"}, NVE | {"integrator": "srkn_4"}),
+        (NPT | {"barostat": "monte_carlo"}, NVE | {"integrator": "position_verlet"}),
+        (NPT | {"thermostat": "langevin", "pressure_coupling": "flexible"}, NVE | {"integrator": "chin_4a"}),
+        (MINIMISE, NVT, MINIMISE, NVE),
+        (NVT, NVE | {"integrator": "auto", "timestep_fs": 2.0, "energy_error_kT": 0.01}),
+    ],
+    ids=["langevin", "nose_hoover", "andersen", "monte_carlo", "flexible", "minimise", "auto"],
+)
+def test_every_ensemble_goes_on_to_the_same_bits(stages, precision, tmp_path):
+    same_after_stops(scene(*stages, precision=precision), [17, 60, 111, 140], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["trajectory.trr", "trajectory.dcd", "trajectory.nc", "trajectory.xyz", "trajectory.pdb"])
+def test_every_format_goes_on(name, tmp_path):
+    same_after_stops(scene(NVT, output=WATER["output"] | {"trajectory": name}), [31, 80], tmp_path)
+
+
+@pytest.mark.slow
+def test_pme_goes_on(tmp_path):
+    forces = {"cutoff_A": 5.0, "truncation": "shift", "electrostatics": "pme"}
+    same_after_stops(scene(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path)
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
+def test_a_body_goes_on(integrator, tmp_path):
+    data = {
+        "body": {"mass_kg": 0.15, "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4], "pinned": True, "inertia_about": "pivot",
+                 "centre_of_mass_m": [0.0, 0.0, 0.04]},
+        "gravity": {},
+        "start": {"euler_angles_deg": [0.0, 40.0, 0.0], "euler_rates_rad_s": [0.0, 0.0, 60.0]},
+        "run": {"duration_s": 0.5, "timestep_s": 0.005, "integrator": integrator},
+        "output": {"interval_s": 0.02, "figures": False},
+    }
+    looks = Every(0.005, lambda moment: None)
+    Simulation(Scene.from_dict(data), tmp_path / "whole", observers=looks).run()
+    left = {30, 71}
+    for _ in range(3):
+        stops = stopped_at(left)
+        stops.interval = 0.005
+        results = Simulation(Scene.from_dict(data), tmp_path / "parts", observers=stops, resume=True).run()
+    assert not results.interrupted
+    whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
+    assert [name for name in whole if whole[name] != parts[name]] == []
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run that was stopped after 60 of 100 steps, with checkpoints at 0 and 60: its folder, its scene."""
+    folder = tmp_path_factory.mktemp("stopped")
+    (folder / "water.toml").write_text(
+        "[box]\ndensity_g_cm3 = 0.9\n[[molecules]]\nmodel = 'spce'\ncount = 40\n"
+        "[forces]\ncutoff_A = 5.0\ntruncation = 'smooth_switch'\n[start]\ntemperature_K = 298.0\n"
+        "[[stages]]\nensemble = 'nvt'\ntemperature_K = 298.0\nduration_ps = 0.1\ntimestep_fs = 1.0\n"
+        "[output]\nlog_interval_ps = 0.01\ntrajectory_interval_ps = 0.02\nfigure = false\n"
+    )
+    own = Scene.read(folder / "water.toml", {"threads": 1})
+    Simulation(own, folder / "run", observers=stopped_at({60})).run()
+    return folder
+
+
+@pytest.fixture
+def again(stopped, tmp_path):
+    """A copy of it."""
+    shutil.copytree(stopped, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_the_command_resume_goes_on_and_lengthens(again, capsys):
+    folder = str(again / "run")
+    assert cli.main(["resume", folder]) == 0
+    assert read_checkpoint(again / "run" / CHECKPOINT).told["place"]["first"] == 0
+    assert cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"]) == 0
+    steps = [int(line.split(",")[0]) for line in (again / "run" / "log.csv").read_text().splitlines()[1:]]
+    assert steps == list(range(0, 121, 10))
+    capsys.readouterr()
+    assert cli.main(["resume", folder, "--until", "0.05ps"]) == 2
+    assert "longer already, 120 steps" in capsys.readouterr().err
+
+
+def test_another_scene_is_not_gone_on_with(again, capsys):
+    command = ["run", str(again / "water.toml"), "-o", str(again / "run"), "--resume"]
+    assert cli.main([*command, "--set", "stages.0.timestep_fs=0.5", "--set", "seed=3"]) == 2
+    said = capsys.readouterr().err
+    assert "stages.0.timestep_fs is 0.5, there 1.0" in said and "seed is 3, there 1" in said
+    before = contents(again / "run")
+    assert cli.main([*command, "--set", "threads=2"]) == 0
+    assert contents(again / "run") != before
+
+
+@pytest.mark.parametrize("damage", ["flipped", "cut", "empty"])
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, capsys):
+    path = again / "run" / CHECKPOINT
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes({"flipped": bytes(data), "cut": bytes(data[: len(data) // 3]), "empty": b""}[damage])
+    assert cli.main(["resume", str(again / "run")]) == 0
+    said = capsys.readouterr().err
+    assert "checkpoint.npz: is damaged" in said and "The checkpoint before it is used" in said
+    shutil.copy(again / "run" / CHECKPOINT, again / "run" / "kept.npz")
+    for name in (CHECKPOINT, PREVIOUS):
+        (again / "run" / name).write_bytes(b"nothing")
+    before = contents(again / "run")
+    assert cli.main(["resume", str(again / "run")]) == 2
+    assert contents(again / "run") == before
+
+
+def test_every_flipped_bit_of_a_checkpoint_is_seen(again):
+    whole = (again / "run" / CHECKPOINT).read_bytes()
+    kept = read_checkpoint(again / "run" / CHECKPOINT)
+    rng = np.random.default_rng(1)
+    for place in rng.integers(0, len(whole), 200).tolist():
+        data = bytearray(whole)
+        data[place] ^= 1 << int(rng.integers(8))
+        (again / "bad.npz").write_bytes(bytes(data))
+        try:
+            found = read_checkpoint(again / "bad.npz")
+        except CheckpointError:
+            continue
+        # bits of the archive that mean nothing, such as times
+        assert found.told == kept.told
+        assert all(np.array_equal(found.arrays[name], array) for name, array in kept.arrays.items())
+
+
+def test_a_folder_without_a_checkpoint(again, capsys):
+    for name in (CHECKPOINT, PREVIOUS):
+        (again / "run" / name).unlink()
+    assert cli.main(["resume", str(again / "run")]) == 2
+    assert "holds no checkpoint (it holds final.npz, log.csv" in capsys.readouterr().err
+    assert cli.main(["resume", str(again)]) == 2
+    assert "is not the folder of a run" in capsys.readouterr().err
+
+
+def test_one_run_at_a_time_writes_into_a_folder(again, capsys):
+    lock = FolderLock(again / "run")
+    lock.take()
+    command = ["run", str(again / "water.toml"), "-o", str(again / "run")]
+    for more in ("--force", "--resume"):
+        assert cli.main([*command, more]) == 2
+        assert "another run is writing in" in capsys.readouterr().err
+    lock.release()
+
+
+def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys):
+    command = ["run", str(stopped / "water.toml"), "-o", str(tmp_path / "run"), "--set", "stages.0.duration_ps=1000"]
+    assert cli.main([*command, "--walltime", "0:00:04"]) == 75
+    assert "goes on with it" in capsys.readouterr().out
+    assert cli.main([*command, "--resume", "--walltime", "0:00:04"]) == 75
+    log = (tmp_path / "run" / "log.csv").read_text().splitlines()
+    steps = [int(line.split(",")[0]) for line in log[1:-1]]
+    assert steps == list(range(0, 10 * len(steps), 10))
+    assert len(steps) > 20
+
+
+def killed(command: list[str], after: float) -> int:
+    """Kill a command, and everything about it, so many seconds after its folder has a log."""
+    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    log = Path(command[command.index("-o") + 1]) / "log.csv"
+    while run.poll() is None and not log.exists():
+        time.sleep(0.01)
+    try:
+        return run.wait(after)
+    except subprocess.TimeoutExpired:
+        run.kill()
+        return run.wait()
+
+
+@pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
+    """kill -9 at random moments; a checkpoint every few milliseconds."""
+    command = [sys.executable, "-m", "rigidmd", "run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-4"]
+    duration = f"stages.0.duration_ps={0.5 * times}"
+    assert cli.main([*command[3:], "--set", duration, "-o", str(tmp_path / "whole")]) == 0
+    rng = np.random.default_rng(times)
+    command += ["--set", duration, "-o", str(tmp_path / "parts"), "--resume", "--threads", "1"]
+    kills = 0
+    while killed(command, 10.0 if kills == times else float(rng.uniform(0.01, 0.5))) != 0:
+        kills += 1
+        assert kills < 3 * times
+    assert kills > times / 4
+    whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
+    assert [name for name in whole if whole[name] != parts[name]] == []
+
+
+def test_a_failed_write_stops_the_run(stopped, tmp_path):
+    """A limit on the size of files stands for a full disk; what was written before is whole."""
+    command = f"ulimit -f 40; {sys.executable} -m rigidmd run {stopped / 'water.toml'} -o {tmp_path / 'run'} "
+    command += "--set stages.0.duration_ps=20 --set output.log_interval_ps=0.002 --set output.checkpoint_minutes=false"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "cannot be written: File too large" in done.stderr
+    assert (tmp_path / "run" / "log.csv").read_bytes().endswith(b"\n")
