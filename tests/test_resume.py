@@ -51,7 +51,9 @@ def stopped_at(steps: set[int]) -> Every:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """The files of a run that have to be the same to the bit."""
-    names = [path.name for path in folder.iterdir() if path.name.startswith(("trajectory", "log", "topology", "motion"))]
+    names = [
+        path.name for path in folder.iterdir() if path.name.startswith(("trajectory", "log", "topology", "motion"))
+    ]
     found = {name: (folder / name).read_bytes() for name in names}
     if (folder / "final.npz").exists():
         with np.load(folder / "final.npz") as data:
@@ -104,7 +106,9 @@ def test_every_ensemble_goes_on_to_the_same_bits(stages, precision, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["trajectory.trr", "trajectory.dcd", "trajectory.nc", "trajectory.xyz", "trajectory.pdb"])
+@pytest.mark.parametrize(
+    "name", ["trajectory.trr", "trajectory.dcd", "trajectory.nc", "trajectory.xyz", "trajectory.pdb"]
+)
 def test_every_format_goes_on(name, tmp_path):
     same_after_stops(scene(NVT, output=WATER["output"] | {"trajectory": name}), [31, 80], tmp_path)
 
@@ -118,8 +122,13 @@ def test_pme_goes_on(tmp_path):
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
 def test_a_body_goes_on(integrator, tmp_path):
     data = {
-        "body": {"mass_kg": 0.15, "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4], "pinned": True, "inertia_about": "pivot",
-                 "centre_of_mass_m": [0.0, 0.0, 0.04]},
+        "body": {
+            "mass_kg": 0.15,
+            "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4],
+            "pinned": True,
+            "inertia_about": "pivot",
+            "centre_of_mass_m": [0.0, 0.0, 0.04],
+        },
         "gravity": {},
         "start": {"euler_angles_deg": [0.0, 40.0, 0.0], "euler_rates_rad_s": [0.0, 0.0, 60.0]},
         "run": {"duration_s": 0.5, "timestep_s": 0.005, "integrator": integrator},
@@ -261,7 +270,15 @@ def killed(command: list[str], after: float) -> int:
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
     """kill -9 at random moments; a checkpoint every few milliseconds."""
-    command = [sys.executable, "-m", "rigidmd", "run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-4"]
+    command = [
+        sys.executable,
+        "-m",
+        "rigidmd",
+        "run",
+        str(stopped / "water.toml"),
+        "--set",
+        "output.checkpoint_minutes=1e-4",
+    ]
     duration = f"stages.0.duration_ps={0.5 * times}"
     assert cli.main([*command[3:], "--set", duration, "-o", str(tmp_path / "whole")]) == 0
     rng = np.random.default_rng(times)

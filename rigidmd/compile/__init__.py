@@ -4,7 +4,19 @@ The names that the author of a term needs are exported here; `lanes` has the vec
 """
 
 from rigidmd.compile import threads  # noqa: F401  (before Numba is loaded)
-from rigidmd.compile.code import Code, Parcel, Task, call, call_blocks, opened, packed, task
+from rigidmd.compile.code import (
+    Code,
+    Parcel,
+    Task,
+    address_of,
+    call,
+    call_blocks,
+    jump_to,
+    laid_down,
+    opened,
+    packed,
+    task,
+)
 from rigidmd.compile.kernels import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, SIMD_BITS
 
@@ -15,11 +27,14 @@ __all__ = [
     "Code",
     "Parcel",
     "Task",
+    "address_of",
     "call",
     "call_blocks",
     "implements",
     "is_a",
+    "jump_to",
     "kernel",
+    "laid_down",
     "opened",
     "packed",
     "task",

@@ -91,6 +91,11 @@ class Code:
         self._addresses = np.array([tasks[name][0].address(parcel) for name, parcel in parcels.items()], np.uintp)
         self.table = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(parcels.items()))
+        self._names = list(tasks)
+
+    def address(self, name: str) -> int:
+        """Address of a task."""
+        return int(self._addresses[self._names.index(name)])
 
 
 class CodeType(types.Type):
@@ -131,8 +136,8 @@ def _unbox_code(kind, value, context):
 
 
 @intrinsic(prefer_literal=True)
-def _address_of(typing, code, name, parcel):
-    """Address of the machine code of a task."""
+def address_of(typing, code, name, parcel):
+    """Address of the machine code of a task, for a parcel of the type that it was compiled for."""
     if not isinstance(name, types.StringLiteral):
         raise TypingError("the name of a task must be a literal")
     place = code.place(name.literal_value, parcel)
@@ -154,6 +159,52 @@ def _jump(typing, address, parcel, block):
         return context.get_dummy_value()
 
     return types.void(types.intp, parcel, types.intp), emit
+
+
+@intrinsic
+def laid_down(typing, content, room):
+    """Write a value into an array (n,) of float64, from where `jump_to` can take it as a parcel; the room it needs.
+
+    Nothing is written if the room is too small. References to arrays in it are not counted: whoever keeps the room must
+    also keep them.
+    """
+
+    def emit(context, builder, signature, arguments):
+        there = context.make_array(signature.args[1])(context, builder, arguments[1])
+        value = _uncounted(context, builder, signature.args[0], arguments[0])
+        size = ir.IntType(64)(-(-context.get_abi_sizeof(value.type) // 8))
+        with builder.if_then(builder.icmp_signed("<=", size, builder.extract_value(there.shape, 0))):
+            builder.store(value, builder.bitcast(there.data, value.type.as_pointer()))
+        return size
+
+    return types.int64(content, room), emit
+
+
+def _uncounted(context, builder, kind: types.Type, value):
+    """A value whose arrays have no owner."""
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        for owner in ("meminfo", "parent"):
+            setattr(array, owner, ir.Constant(getattr(array, owner).type, None))
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        for k, inner in enumerate(kind.types):
+            part = _uncounted(context, builder, inner, builder.extract_value(value, k))
+            value = builder.insert_value(value, part, k)
+    return value
+
+
+@intrinsic
+def jump_to(typing, address, content, block):
+    """Call the task at an address for a value that `laid_down` has written at another."""
+
+    def emit(context, builder, signature, arguments):
+        kind = ir.FunctionType(ir.VoidType(), [ADDRESS, ir.IntType(64)])
+        parcel = builder.inttoptr(arguments[1], ADDRESS)
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), [parcel, arguments[2]])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp, types.intp), emit
 
 
 @kernel(parallel=True)
@@ -182,9 +233,9 @@ def call_blocks(code, name, parcel, blocks):
 
 @overload(call, prefer_literal=True, jit_options=options_of(False, True))
 def _call(code, name, parcel):
-    return lambda code, name, parcel: _jump(_address_of(code, name, parcel), parcel, 0)
+    return lambda code, name, parcel: _jump(address_of(code, name, parcel), parcel, 0)
 
 
 @overload(call_blocks, prefer_literal=True, jit_options=options_of(False, True))
 def _call_blocks(code, name, parcel, blocks):
-    return lambda code, name, parcel, blocks: _jump_blocks(_address_of(code, name, parcel), parcel, blocks)
+    return lambda code, name, parcel, blocks: _jump_blocks(address_of(code, name, parcel), parcel, blocks)

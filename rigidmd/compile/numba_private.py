@@ -3,6 +3,7 @@
 - `FunctionCache` reads its folder from `numba.config.CACHE_DIR` when it is created, and keeps its index in an
   `IndexDataCacheFile`, whose class may be changed.
 - A dispatcher uses `_cache` only when it compiles.
+- `get_call_template` compiles for the types of arguments that it is given.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for Python.
 - `_nrt` is an option too: if it is False, references are not counted.
 - A `CFunc` compiles for given types and accepts a cache that we set.
@@ -39,6 +40,10 @@ class Index(IndexDataCacheFile):
             return {}
 
 
+def _of_any_value(kind: types.Type) -> types.Type:
+    return types.unliteral(kind) if isinstance(kind, types.IntegerLiteral | types.BooleanLiteral) else kind
+
+
 class Kernel(CPUDispatcher):
     """A dispatcher with our own cache, which is opened at the first compilation."""
 
@@ -52,6 +57,10 @@ class Kernel(CPUDispatcher):
     @_cache.setter
     def _cache(self, none) -> None:
         """Ignored: Numba sets a null cache when it creates a dispatcher."""
+
+    def get_call_template(self, args, kws):
+        """As Numba's, for numbers of any value: it would compile a function again for each constant argument."""
+        return super().get_call_template(tuple(map(_of_any_value, args)), {k: _of_any_value(v) for k, v in kws.items()})
 
 
 class Inner(Kernel):

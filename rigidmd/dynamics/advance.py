@@ -11,7 +11,7 @@ from rigidmd.dynamics.baths import apply, bath_code
 from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import SERIAL
-from rigidmd.forces.terms import total_energy_rate
+from rigidmd.forces.terms import is_driven, total_energy_rate
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
@@ -66,7 +66,8 @@ def row_of(scheme: Scheme) -> Row:
 def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, cursor):
     """Step until `until` steps of dt have been taken, counted in state.step.
 
-    code : see `code_of`. terms : workspaces. probe : room for gradients; None compiles none. heat, room : of a bath, of
+    code : see `code_of`. terms : of a body its workspaces, of molecules a `Loader`. probe : room for gradients; None
+    compiles none. heat, room : of a bath, of
     a box (`baths.heat_room`, `boxes.box_room`). cursor (3,) : flows done in this step; whether `load` is that of the
     present positions (1) or that with the gradient (2); whether a move of the box is made and not yet judged.
 
@@ -221,11 +222,11 @@ def _add_gyration_of_molecules(model, load, tau, gain):
 def _pay_for_molecules(model, terms, state, h):
     if not is_a(model, Model):
         return None
-    if not any(getattr(term.instance_class, "drives", False) for term in terms.types):
+    if not is_driven(terms):
         return lambda model, terms, state, h: None
 
     def pay_for_molecules(model, terms, state, h):
-        state.books[WORK] += h * total_energy_rate(terms, state)
+        state.books[WORK] += h * total_energy_rate(terms)
 
     return pay_for_molecules
 

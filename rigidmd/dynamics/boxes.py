@@ -17,10 +17,11 @@ from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.schemes import BOX
 from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
 from rigidmd.dynamics.baths import scale_array, translational_energy
+from rigidmd.dynamics.gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
 from rigidmd.forces.pairs.space import volume_of
-from rigidmd.forces.terms import load_bodies
+from rigidmd.forces.terms import PLAIN, TALLIED, load_now
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -151,14 +152,14 @@ def stretch(box, state, h):
 @implements(load_for, inline=True)
 def _load_for(box, terms, state, load, room, row):
     if is_a(box, NoBox):
-        return lambda box, terms, state, load, room, row: load_bodies(terms, state, load, None)
+        return lambda box, terms, state, load, room, row: load_now(terms, state, load, PLAIN)
 
     def with_energies(box, terms, state, load, room, row):
         room.known[0] = 0
         for k in range(len(row.kind)):
             if row.kind[k] == BOX and (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] == 0:
                 return tally_bodies(terms, state, load, room)
-        return load_bodies(terms, state, load, None)
+        return load_now(terms, state, load, PLAIN)
 
     return with_energies
 
@@ -166,8 +167,9 @@ def _load_for(box, terms, state, load, room, row):
 @kernel(inline=True)
 def tally_bodies(terms, state, load, room):
     """Forces and torques, energies and virial at the present positions; a status code."""
-    room.tally[0, :] = 0.0
-    status = load_bodies(terms, state, load, room.tally[0])
+    status = load_now(terms, state, load, TALLIED)
+    for k in range(TALLY_SIZE):
+        room.tally[0, k] = terms.tally[k]
     room.known[0] = 1 if status == OK else 0
     return status
 
@@ -257,23 +259,23 @@ def asked(pressure, state, k):
 @kernel
 def keep(state, load, room):
     """Remember what a move changes."""
-    room.position[:] = state.position
-    room.velocity[:] = state.velocity
-    room.load.force[:] = load.force
-    room.load.torque_body[:] = load.torque_body
-    room.tally[1] = room.tally[0]
-    room.cell[:] = state.cell
+    copy(state.position, room.position)
+    copy(state.velocity, room.velocity)
+    copy(load.force, room.load.force)
+    copy(load.torque_body, room.load.torque_body)
+    copy(room.tally[:1], room.tally[1:])
+    copy(state.cell, room.cell)
 
 
 @kernel
 def take_back(state, load, room):
     """Undo a move."""
-    state.position[:] = room.position
-    state.velocity[:] = room.velocity
-    load.force[:] = room.load.force
-    load.torque_body[:] = room.load.torque_body
-    room.tally[0] = room.tally[1]
-    state.cell[:] = room.cell
+    copy(room.position, state.position)
+    copy(room.velocity, state.velocity)
+    copy(room.load.force, load.force)
+    copy(room.load.torque_body, load.torque_body)
+    copy(room.tally[1:], room.tally[:1])
+    copy(room.cell, state.cell)
 
 
 def propose(box, model, state, room, h, draw):

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import OK, Load, State, no_load
-from rigidmd.forces.terms import load_bodies
+from rigidmd.forces.terms import OTHER, PLAIN, load_now
 
 #: The difference is taken over this fraction of tau a. Over the whole of tau a (Wisdom, Holman & Touma 1996), the kick
 #: is not the gradient of a potential at order tau². With this fraction that defect is below the scheme's own error, and
@@ -56,7 +56,7 @@ def evaluate(model, state, load, terms, probe, tau, known):
         copy(state.position, probe.position)
         copy(state.rotation, probe.rotation)
         displace(model, state, load, FRACTION * tau)
-    status = load_bodies(terms, state, probe.load if known else load, None)
+    status = load_now(terms, state, probe.load if known else load, OTHER if known else PLAIN)
     if known:
         copy(probe.position, state.position)
         copy(probe.rotation, state.rotation)

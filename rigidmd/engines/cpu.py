@@ -16,7 +16,6 @@ from rigidmd.core.state import (
     NOT_FINITE,
     NOW,
     ORIGIN,
-    TALLY_SIZE,
     Load,
     State,
     no_load,
@@ -30,7 +29,7 @@ from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import Asked, answer
 from rigidmd.forces.external.walls import Behind, LennardJonesWalls
-from rigidmd.forces.terms import NoForce, Setup, add_term, with_code, with_room, workspace_of
+from rigidmd.forces.terms import Loading, NoForce, Setup, tally_one, with_code, with_room, workspace_of
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
 Precision = Literal["double", "mixed"]
@@ -70,6 +69,7 @@ class Engine:
         self.load: Load | None = None
         self._probe: Probe | None = None
         self._heat = heat_room()
+        self._loading: Loading | None = None
         self._room: BoxRoom | None = None
         self._stale = True
         self._moved: State | None = None
@@ -109,15 +109,28 @@ class Engine:
         if row.box is not None and self._room is None:
             self._room = box_room(state)
         model, bath, box = self.model_for(row), row.bath or NoBath(), row.box or NoBox()
+        room = self._room if row.box is not None else None
+        cursor = np.array([0, not self._stale, 0], np.int64)
+        rest = (bath, box, row_of(row), probe, self._heat, room, float(dt), int(until), cursor)
+        while status := self._step(model, state, self.load, workspaces, rest):
+            workspaces = self._answer(status, state)
+        self._stale = cursor[1] == 0  # true also if there was no step, so that no forces were evaluated
+
+    def _step(self, model: Model | Body, state: State, load: Load, workspaces: tuple, rest: tuple) -> int:
+        """`advance`, with the terms as it takes them; a status code."""
+        if not isinstance(model, Model):
+            return advance(model, None, state, load, workspaces, *rest)
+        bath, _, _, probe, *_ = rest
         kind = (type(model.rotor), type(bath))
         if kind not in self._codes:
             self._codes[kind] = code_of(model, bath)
-        moved = (model, self._codes[kind], state, self.load)
-        flows, room = row_of(row), self._room if row.box is not None else None
-        cursor = np.array([0, not self._stale, 0], np.int64)
-        while status := advance(*moved, workspaces, bath, box, flows, probe, self._heat, room, dt, until, cursor):
-            workspaces = self._answer(status, state)
-        self._stale = cursor[1] == 0  # true also if there was no step, so that no forces were evaluated
+        loader = self._loading_of(workspaces).bind(workspaces, state, load, probe and probe.load)
+        return advance(model, self._codes[kind], state, load, loader, *rest)
+
+    def _loading_of(self, workspaces: tuple[NamedTuple, ...]) -> Loading:
+        if self._loading is None:
+            self._loading = Loading(workspaces, isinstance(self.model, Model))
+        return self._loading
 
     def model_for(self, scheme: Scheme) -> Model | Body:
         """The model with the rotor that a scheme needs; only asymmetric bodies turn differently with an exact one."""
@@ -129,12 +142,14 @@ class Engine:
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
         workspaces = self._prepare(state)
-        load = no_load(state)
-        tallies = {}
+        load, tallies = no_load(state), {}
+        loading = self._loading_of(workspaces)
+        loader = loading.bind(workspaces, state, load)
         for k, name in enumerate(self.names):
-            tally = np.zeros(TALLY_SIZE)
-            while status := add_term(workspaces[k], state, load, tally):
+            while status := tally_one(loader, k):
                 workspaces = self._answer(status, state)
+                loader = loading.bind(workspaces, state, load)
+            tally = loader.tally.copy()
             tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
         return load, tallies
 

@@ -10,10 +10,21 @@ write one file with a NamedTuple and an `@implements(add_forces)` (or, for a law
 from typing import NamedTuple
 
 import numpy as np
-from numba import literal_unroll
+from numba import literal_unroll, types
 
-from rigidmd.compile import implements, is_a, kernel
-from rigidmd.core.state import OK
+from rigidmd.compile import (
+    Code,
+    address_of,
+    implements,
+    is_a,
+    jump_to,
+    kernel,
+    laid_down,
+    opened,
+    packed,
+    task,
+)
+from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State
 
 
 class Setup(NamedTuple):
@@ -81,10 +92,141 @@ def _add_no_force(term, state, load, tally):
         return lambda term, state, load, tally: OK
 
 
+#: What is asked of `load_now`: forces; forces with energies and virial; forces into the other load.
+PLAIN, TALLIED, OTHER = 0, 1, 2
+
+
+class Loader(NamedTuple):
+    """Terms as addresses of machine code and of what it works on.
+
+    So each term is compiled once, for all scenes that have it, and the loop over steps once for all terms of molecules.
+    A loader counts no references: see `Loading`.
+    """
+
+    plain: np.ndarray  # (terms,) intp, of `_add_plain`; 0 of a body, whose terms are compiled into its loop
+    tallied: np.ndarray  # (terms,) of `_add_tallied`
+    rate: np.ndarray | None  # (terms,) of `_add_rate`; None where no term drives
+    content: np.ndarray  # (terms,)
+    tally: np.ndarray  # (10,) where energies and virials add up
+    status: np.ndarray  # (1,) the worst status code
+    power: np.ndarray  # (1,) sum of the rates
+
+
+def loader_for(terms: int, drives: bool) -> Loader:
+    """An empty loader for so many terms."""
+    plain, tallied, rate, content = np.zeros((4, terms), np.intp)
+    single = np.zeros(1, np.int64), np.zeros(1)
+    return Loader(plain, tallied, rate if drives else None, content, np.zeros(TALLY_SIZE), *single)
+
+
+def term_code(term: NamedTuple, loader: Loader, called: bool) -> Code:
+    """The machine code of a term for a loader. called : whether the loop over steps calls it by address."""
+    content = (term, *EXAMPLE, EXAMPLE[1], loader.tally, loader.status, loader.power)
+    tasks = {"tallied": (_add_tallied, content)}
+    if called:
+        tasks["plain"] = (_add_plain, content)
+    if called and loader.rate is not None:
+        tasks["rate"] = (_add_rate, content)
+    return Code(**tasks)
+
+
+@task()
+def _add_plain(parcel, block):
+    term, state, load, other, _, status, _ = opened(parcel)
+    status[0] = max(status[0], add_forces(term, state, other if block == OTHER else load, None))
+
+
+@task()
+def _add_tallied(parcel, block):
+    term, state, load, _, tally, status, _ = opened(parcel)
+    status[0] = max(status[0], add_forces(term, state, load, tally))
+
+
+@task()
+def _add_rate(parcel, block):
+    term, state, _, _, _, _, power = opened(parcel)
+    power[0] += energy_rate(term, state)
+
+
 @kernel(outer=True)
-def add_term(term, state, load, tally):
-    """`add_forces` of one term, for calls from Python."""
-    return add_forces(term, state, load, tally)
+def _lay_down(loader, k, code, term, state, load, other, room):
+    content = (term, state, load, other, loader.tally, loader.status, loader.power)
+    loader.tallied[k] = address_of(code, "tallied", packed(content))  # checks the type
+    return laid_down(content, room)
+
+
+class Loading:
+    """The terms of an engine behind their loader; keeps alive what it refers to."""
+
+    def __init__(self, workspaces: tuple[NamedTuple, ...], called: bool):
+        drives = any(getattr(type(own), "drives", False) for own in workspaces)
+        self.loader = loader_for(len(workspaces), called and drives)
+        self._codes = [term_code(own, self.loader, called) for own in workspaces]
+        self._rooms = [np.zeros(64) for _ in workspaces]
+        for k, code in enumerate(self._codes):
+            self.loader.plain[k] = code.address("plain") if called else 0
+            if self.loader.rate is not None:
+                self.loader.rate[k] = code.address("rate")
+
+    def bind(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None) -> Loader:
+        """The loader of these workspaces, of the same types as the first, for a state and its loads."""
+        self._kept = (workspaces, state, load, other)
+        for k, (own, code) in enumerate(zip(workspaces, self._codes, strict=True)):
+            content = (self.loader, k, code, own, state, load, other or load)
+            while (needed := _lay_down(*content, self._rooms[k])) > len(self._rooms[k]):
+                self._rooms[k] = np.zeros(needed)
+            self.loader.content[k] = self._rooms[k].ctypes.data
+        return self.loader
+
+
+@kernel(outer=True)
+def tally_one(loader, k):
+    """Forces of term k, with its energy and virial in `loader.tally`; a status code."""
+    loader.status[0] = OK
+    loader.tally[:] = 0.0
+    jump_to(loader.tallied[k], loader.content[k], TALLIED)
+    return loader.status[0]
+
+
+def is_driven(loader: types.Type) -> bool:
+    """Whether the type of a loader has the rates of terms that drive."""
+    return is_a(loader, Loader) and loader.types[Loader._fields.index("rate")] is not types.none
+
+
+def load_now(terms, state, load, which):
+    """Write the forces and torques of all terms at the present positions; the worst status code.
+
+    terms : a tuple of terms, or a `Loader`. which : PLAIN, TALLIED or OTHER. A loader knows its loads, and `load` must
+    be the one asked for; energies and virial go into its tally. Of a tuple there are only forces.
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(load_now)
+def _load_now(terms, state, load, which):
+    if not is_a(terms, Loader):
+        return lambda terms, state, load, which: load_bodies(terms, state, load, None)
+
+    def load_by_address(terms, state, load, which):
+        clear(load.force)
+        clear(load.torque_body)
+        terms.status[0] = OK
+        if which == TALLIED:
+            terms.tally[:] = 0.0
+        for k in range(len(terms.content)):
+            address = terms.tallied[k] if which == TALLIED else terms.plain[k]
+            jump_to(address, terms.content[k], which)
+        return terms.status[0]
+
+    return load_by_address
+
+
+@kernel
+def clear(values):
+    """values[:] = 0 of an array (n, 3), as a loop, which compiles ten times faster."""
+    for m in range(len(values)):
+        for k in range(3):
+            values[m, k] = 0.0
 
 
 @kernel(inline=True)
@@ -111,9 +253,9 @@ def total_power(terms, state, velocity, omega):
 
 
 @kernel
-def total_energy_rate(terms, state):
+def total_energy_rate(loader):
     """`energy_rate` of all terms."""
-    total = 0.0
-    for term in literal_unroll(terms):
-        total += energy_rate(term, state)
-    return total
+    loader.power[0] = 0.0
+    for k in range(len(loader.content)):
+        jump_to(loader.rate[k], loader.content[k], PLAIN)
+    return loader.power[0]
