@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 import sys
+import warnings
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,11 +35,17 @@ def main(arguments: list[str] | None = None) -> int:
 
     Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a signal.
     """
-    from rigidmd.errors import RigidMDError, SimulationError
+    from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
 
     options = _parser().parse_args(arguments)
+
+    def show(message, category, *where, **more):
+        _warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
+
     try:
-        return options.command(options)
+        with warnings.catch_warnings():
+            others, warnings.showwarning = warnings.showwarning, show
+            return options.command(options)
     except SimulationError as error:
         print(f"rigidmd: {error}", file=sys.stderr)
         return FAILED

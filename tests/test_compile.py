@@ -199,6 +199,59 @@ def test_threads_are_there_for_code_that_comes_from_the_cache(tmp_path):
         assert done.stdout.strip() == "10.0", done.stderr
 
 
+KERNEL = "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef twice(x):\n    return 2 * x\n"
+
+
+def compiled_in(folder, tmp_path, before=""):
+    """Run a kernel with the cache in a folder: what it printed, what it warned of."""
+    (tmp_path / "own.py").write_text(KERNEL)
+    environment = os.environ | {
+        "RIGIDMD_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+    }  # fmt: skip
+    script = f"{before}\nfrom own import twice; print(twice(21), sum(twice.stats.cache_hits.values()))"
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip(), done.stderr
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])
+def test_a_damaged_file_of_the_cache_counts_as_absent(ending, damage, tmp_path):
+    assert compiled_in(tmp_path / "cache", tmp_path) == ("42 0", "")
+    assert compiled_in(tmp_path / "cache", tmp_path) == ("42 1", "")
+    (path,) = (path for path in (tmp_path / "cache").rglob(f"*twice*{ending}*") if ending in path.name)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 16
+    path.write_bytes({"empty": b"", "cut": bytes(data[:40]), "flipped": bytes(data)}[damage])
+    printed, warned = compiled_in(tmp_path / "cache", tmp_path)
+    assert printed == "42 0" and warned.count("is damaged; its code is compiled again") == 1
+    assert compiled_in(tmp_path / "cache", tmp_path) == ("42 1", "")
+
+
+def test_a_cache_that_cannot_be_written_is_read(tmp_path):
+    compiled_in(tmp_path / "cache", tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    read_only = (
+        "import tempfile\n"
+        "def refuse(*, dir): raise OSError(30, 'Read-only file system')\n"
+        "tempfile.TemporaryFile = refuse"
+    )
+    assert compiled_in(tmp_path / "cache", tmp_path, read_only) == ("42 1", "")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_kernel_is_compiled_once_for_all_constant_arguments():
+    @kernel
+    def plus(x, n):
+        return x + n
+
+    @kernel(outer=True)
+    def several(x):
+        return plus(x, 1) + plus(x, 2) + plus(x, 3)
+
+    assert several(1.0) == 9.0
+    assert len(plus.signatures) == 1
+
+
 # --- rules that sources keep -----------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rigidmd import cli
-from rigidmd.errors import CheckpointError, OutputError
+from rigidmd.errors import CheckpointError
 from rigidmd.output.checkpoint import read_checkpoint
 from rigidmd.output.folder import CHECKPOINT, PREVIOUS, FolderLock
 from rigidmd.run import Simulation
@@ -254,12 +254,13 @@ def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys):
     assert len(steps) > 20
 
 
-def killed(command: list[str], after: float) -> int:
-    """Kill a command, and everything about it, so many seconds after its folder has a log."""
-    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def killed(command: list[str], after: float | None) -> int:
+    """Kill a command so many seconds after it has written to its log, or let it end; its exit code."""
     log = Path(command[command.index("-o") + 1]) / "log.csv"
-    while run.poll() is None and not log.exists():
-        time.sleep(0.01)
+    before = log.stat().st_mtime_ns if log.exists() else None
+    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while run.poll() is None and (not log.exists() or log.stat().st_mtime_ns == before):
+        time.sleep(0.005)
     try:
         return run.wait(after)
     except subprocess.TimeoutExpired:
@@ -269,25 +270,15 @@ def killed(command: list[str], after: float) -> int:
 
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
-    """kill -9 at random moments; a checkpoint every few milliseconds."""
-    command = [
-        sys.executable,
-        "-m",
-        "rigidmd",
-        "run",
-        str(stopped / "water.toml"),
-        "--set",
-        "output.checkpoint_minutes=1e-4",
-    ]
-    duration = f"stages.0.duration_ps={0.5 * times}"
-    assert cli.main([*command[3:], "--set", duration, "-o", str(tmp_path / "whole")]) == 0
+    """kill -9 at random moments, with a checkpoint at every look."""
+    scene = ["run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-9", "--threads", "1"]
+    scene += ["--set", f"stages.0.duration_ps={2.0 * times}", "--set", "output.log_interval_ps=0.004"]
+    assert cli.main([*scene, "-o", str(tmp_path / "whole")]) == 0
+    command = [sys.executable, "-m", "rigidmd", *scene, "-o", str(tmp_path / "parts"), "--resume"]
     rng = np.random.default_rng(times)
-    command += ["--set", duration, "-o", str(tmp_path / "parts"), "--resume", "--threads", "1"]
-    kills = 0
-    while killed(command, 10.0 if kills == times else float(rng.uniform(0.01, 0.5))) != 0:
-        kills += 1
-        assert kills < 3 * times
-    assert kills > times / 4
+    for _ in range(times):
+        assert killed(command, float(rng.uniform(0.01, 1.0))) == -signal.SIGKILL
+    assert killed(command, None) == 0
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
 

@@ -40,19 +40,32 @@ def _sources(place: Path) -> list[Path]:
     return [place] if place.is_file() else list(place.rglob("*.py"))
 
 
-@functools.cache
-def cache_folder() -> str:
-    """A writable folder for compiled code. Caches of older sources that were not used for a month are removed.
-
-    Nothing is read, created or removed before the first kernel is compiled.
-    """
+def _named_folder() -> Path:
+    """The folder for compiled code of these sources, writable or not."""
     if named := os.environ.get("RIGIDMD_CACHE"):
         base = Path(named)
     else:
         import platformdirs
 
         base = Path(platformdirs.user_cache_path("rigidmd"))
-    folder = base / f"kernels-{source_digest()}"
+    return base / f"kernels-{source_digest()}"
+
+
+@functools.cache
+def shared_folder() -> str | None:
+    """A folder of compiled code that can be read but not written, such as one for all users; None if there is none."""
+    folder = _named_folder()
+    return str(folder) if cache_folder() != str(folder) and folder.is_dir() else None
+
+
+@functools.cache
+def cache_folder() -> str:
+    """A writable folder for compiled code. Caches of older sources that were not used for a month are removed.
+
+    Nothing is read, created or removed before the first kernel is compiled.
+    """
+    folder = _named_folder()
+    base = folder.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)

@@ -1,7 +1,7 @@
 """The private parts of Numba that this package relies on. tests/test_compile.py tests each assumption.
 
 - `FunctionCache` reads its folder from `numba.config.CACHE_DIR` when it is created, and keeps its index in an
-  `IndexDataCacheFile`, whose class may be changed.
+  `IndexDataCacheFile`, whose class may be changed. That loads and saves index and data by the methods that `Index` has.
 - A dispatcher uses `_cache` only when it compiles.
 - `get_call_template` compiles for the types of arguments that it is given.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for Python.
@@ -10,8 +10,14 @@
 """
 
 import contextlib
+import copy
+import functools
+import hashlib
+import pickle
 import secrets
+import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numba
 from numba import types
@@ -19,7 +25,8 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.registry import CPUDispatcher
 
-from rigidmd.compile.cache import cache_folder
+from rigidmd.compile.cache import cache_folder, shared_folder
+from rigidmd.errors import RigidMDWarning
 
 
 class Index(IndexDataCacheFile):
@@ -28,16 +35,59 @@ class Index(IndexDataCacheFile):
     An index with a type from a module that cannot be imported, for example a user's own term, counts as empty, so that
     other programs can still use the cache. The files of machine code have random names: Numba numbers them, and two
     processes that compiled at the same time for different types wrote to the same file, after which every run crashed.
+    Every file begins with a checksum; one that is damaged counts as absent, and its code is compiled again. What a
+    folder for all users has is read from there, see `cache.shared_folder`.
     """
+
+    def load(self, key):
+        """A compiled function; None if there is none."""
+        found = super().load(key)
+        shared = shared_folder()
+        if found is None and shared is not None:
+            there = copy.copy(self)
+            there._cache_path = self._cache_path.replace(cache_folder(), shared, 1)
+            there._index_path = self._index_path.replace(cache_folder(), shared, 1)
+            found = super(Index, there).load(key)
+        return found
 
     def _data_name(self, number):
         return f"{super()._data_name(number)}.{secrets.token_hex(8)}"
 
     def _load_index(self):
         try:
-            return super()._load_index()
-        except (ImportError, AttributeError):
+            version, stamp, overloads = self._read(self._index_path)
+        except (OSError, ImportError, AttributeError):
             return {}
+        return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
+
+    def _save_index(self, overloads):
+        self._write(self._index_path, (self._version, self._source_stamp, overloads))
+
+    def _load_data(self, name):
+        return self._read(self._data_path(name))
+
+    def _save_data(self, name, data):
+        self._write(self._data_path(name), data)
+
+    def _write(self, path: str, value) -> None:
+        content = self._dump(value)
+        with self._open_for_write(path) as file:
+            file.write(hashlib.sha256(content).digest() + content)
+
+    def _read(self, path: str):
+        data = Path(path).read_bytes()
+        size = hashlib.sha256().digest_size
+        if hashlib.sha256(data[size:]).digest() != data[:size]:
+            fault = f"{path} is damaged; its code is compiled again"
+            say_once(fault)
+            raise OSError(fault)
+        return pickle.loads(data[size:])
+
+
+@functools.cache
+def say_once(sentence: str) -> None:
+    """Warn of something, the first time."""
+    warnings.warn(sentence, RigidMDWarning, stacklevel=2)
 
 
 def _of_any_value(kind: types.Type) -> types.Type:
