@@ -126,6 +126,11 @@ class Molecule:
     mixing: Mixing | None = None
 
     @property
+    def marks(self) -> tuple[float, ...]:
+        """Mass, u, moments of inertia, u Å², and number of sites (5,): by them a saved state knows its model."""
+        return (self.mass, *map(float, self.inertia), float(len(self.masses)))
+
+    @property
     def degrees_of_freedom(self) -> int:
         """Degrees of freedom: three of translation and those of rotation."""
         return 3 + rotational_freedom(self.kind)

@@ -231,8 +231,11 @@ def test_a_cache_that_cannot_be_written_is_read(tmp_path):
     compiled_in(tmp_path / "cache", tmp_path)
     before = sorted(tmp_path.rglob("*"))
     read_only = (
-        "import tempfile\n"
-        "def refuse(*, dir): raise OSError(30, 'Read-only file system')\n"
+        "import os, tempfile\n"
+        "allow = tempfile.TemporaryFile\n"
+        "def refuse(*, dir):\n"
+        "    if str(dir).startswith(os.environ['RIGIDMD_CACHE']): raise OSError(30, 'Read-only file system')\n"
+        "    return allow(dir=dir)\n"
         "tempfile.TemporaryFile = refuse"
     )
     assert compiled_in(tmp_path / "cache", tmp_path, read_only) == ("42 1", "")

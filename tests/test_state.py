@@ -95,6 +95,8 @@ DAMAGES = {
     "nan": (lambda s: s.update(books=np.full(3, np.nan)), "books: damaged"),
     "species": (lambda s: s.update(species=s["species"] + 5), "species: damaged"),
     "rotation": (lambda s: s.update(rotation=1.1 * s["rotation"]), "rotation: damaged"),
+    "mirror": (lambda s: s.update(rotation=-s["rotation"]), "rotation: damaged"),
+    "models": (lambda s: s.update(models=s["models"][:, :3]), "models: damaged"),
 }
 
 

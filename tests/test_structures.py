@@ -1,5 +1,6 @@
 """Structure files as people have them: read rightly, or refused with one clear message."""
 
+import dataclasses
 import re
 from math import inf
 from pathlib import Path
@@ -170,7 +171,7 @@ def pdb(atoms, cryst, names=None, element_column=True, number=None, residue="HOH
             f"HETATM{(i + 1) % 100000:5d} {label} {residue:>3} A{serial}    {x[0]:8.3f}{x[1]:8.3f}{x[2]:8.3f}"
             f"  1.00  0.00{tail}"
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "END"]) + "\n"
 
 
 def cryst1(cell) -> str:
@@ -493,6 +494,41 @@ def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
     again = build(Scene.from_dict(data, tmp_path))
     assert not any("box counts" in note for note in again.notes)
     assert any("the scene's box: its lattice is described by" in note and "c' = c - a" in note for note in again.notes)
+
+
+def test_a_pdb_that_is_cut_off_says_so(tmp_path):
+    """Cut between two molecules it is a whole file of fewer, but for its end."""
+    system = build(small_scene({"spce": 8}, 20.0))
+    write_topology(tmp_path / "whole.pdb", system, system.state, wrapped=True)
+    lines = (tmp_path / "whole.pdb").read_text().splitlines(keepends=True)
+    last = max(k for k, line in enumerate(lines) if line.startswith(("ATOM", "HETATM")))
+    (tmp_path / "cut.pdb").write_text("".join(lines[: last - 5]))
+    told = {name: read_structure(tmp_path / name, system.species, None, True, TOLERANCE, None) for name in
+            ("whole.pdb", "cut.pdb")}  # fmt: skip
+    assert [len(found.position) for found in told.values()] == [8, 6]
+    assert not any("truncated" in note for note in told["whole.pdb"].notes)
+    assert any("it ends with an atom, without END: is it truncated?" in note for note in told["cut.pdb"].notes)
+
+
+def test_a_state_is_not_taken_for_one_of_another_model_of_that_name(tmp_path):
+    """Masses, moments and number of sites tell, and whether there are rotations."""
+    system = build(small_scene({"tip4p2005": 8}, 20.0))
+    write_state(tmp_path / "water.npz", system.saved(system.state))
+
+    def read_as(other, name="water.npz"):
+        species = dataclasses.replace(build(small_scene({other: 8}, 20.0)).species[0], name="tip4p2005")
+        return read_structure(tmp_path / name, [species], None, True, TOLERANCE, None)
+
+    assert len(read_as("tip4p2005").position) == 8
+    with pytest.raises(StructureError, match=r"holds another tip4p2005 than the scene \(.*number of sites: 4, here 3"):
+        read_as("spce")
+    with pytest.raises(StructureError, match=r"mass, u: 18.0154, here 39.948"):
+        read_as("argon")
+    saved = system.saved(system.state)
+    points = system.state._replace(rotation=np.zeros((0, 3, 3)), angular_momentum_body=np.zeros((0, 3)))
+    write_state(tmp_path / "points.npz", saved._replace(state=points, models=None))
+    with pytest.raises(StructureError, match="holds no rotations, but tip4p2005 can turn"):
+        read_as("tip4p2005", "points.npz")
 
 
 def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):

@@ -80,6 +80,8 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
 def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The models of a .pdb, each with the last CRYST1 before it (which ASE forgets from model to model)."""
     models, cryst, body = [], [], []
+    ends = next((line for line in reversed(lines) if line.strip()), "")
+    notes = ["it ends with an atom, without END: is it truncated?"] if ends.startswith(("ATOM", "HETATM")) else []
     for number, line in enumerate([*lines, "END"], 1):
         if line.startswith("CRYST1"):
             if len(line[6:54].split()) < 6:
@@ -92,12 +94,12 @@ def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         elif line.startswith("ORIGX"):
             cryst = [*cryst, line]
         elif line.startswith("END") and body:
-            models.append(partial(_pdb_model, path, cryst, body))
+            models.append(partial(_pdb_model, path, cryst, body, notes if number > len(lines) else []))
             body = []
     return models
 
 
-def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
+def _pdb_model(path: Path, head: list[str], body: list[str], notes: list[str]) -> Atoms:
     """One model through ASE, in lines as ASE expects them: an element in each, residues numbered anew."""
     if len(places := {line[16:17] for line in body} - {"", " "}) > 1:
         raise StructureError(str(path), [f"has alternate locations {', '.join(sorted(places))}; keep one of them"])
@@ -115,7 +117,7 @@ def _pdb_model(path: Path, head: list[str], body: list[str]) -> Atoms:
     found = read_by_ase(path, io.StringIO("\n".join([*head, *lines]) + "\n"), format="proteindatabank")
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
-    return from_ase(path, found[0], names, elements, residue)
+    return from_ase(path, found[0], names, elements, residue, notes=notes)
 
 
 def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:

@@ -28,6 +28,8 @@ from rigidmd.validation import meant, settled
 MOST_NAMED = 5  # molecules that a message names; of more it gives the number
 ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge
 SAME_BOX = 1e-4  # relative difference between boxes of file and scene that printing explains
+#: Masses, moments and numbers of sites of one model agree to this fraction.
+SAME_MODEL = 1e-6
 #: Units (Å) in which coordinates are sometimes given by mistake.
 OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
 CLOSE = 1.2  # factor by which nearest distances may differ from the bonds of the templates
@@ -294,13 +296,35 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
     return [] if min(bonds) / CLOSE <= nearest <= max(bonds) * CLOSE else found
 
 
+def _other_model(molecule: Molecule, marks: np.ndarray) -> str:
+    """What tells a molecule from the one of a saved state with these `Molecule.marks`; empty if nothing does."""
+    own = np.array(molecule.marks)
+    names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
+    size = np.array([own[0], *[max(own[1:4].max(), marks[1:4].max())] * 3, 1.0])
+    differs = [
+        f"{name}: {there:.6g}, here {here:.6g}"
+        for name, there, here, scale in zip(names, marks, own, size, strict=True)
+        if abs(there - here) > SAME_MODEL * scale
+    ]
+    return f"holds another {molecule.name} than the scene ({'; '.join(differs)})" if differs else ""
+
+
 def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
     """The final state of an earlier run, bit for bit."""
     saved = read_state(path)
     known = [molecule.name for molecule in species]
     if missing := [name for name in saved.names if name not in known]:
         raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
+    of_name = {molecule.name: molecule for molecule in species}
+    faults = [_other_model(of_name[name], marks) for name, marks in zip(saved.names, saved.models, strict=True)] if (
+        saved.models is not None
+    ) else []
     state, n, turning = saved.state, len(saved.species), len(saved.state.rotation) > 0
+    turned = [name for name in saved.names if of_name[name].inertia.any()]
+    if turned and not turning:
+        faults.append(f"holds no rotations, but {', '.join(turned)} can turn")
+    if faults := [fault for fault in faults if fault]:
+        raise StructureError(str(path), faults)
     return Arrangement(
         species=np.array([known.index(name) for name in saved.names])[saved.species],
         position=state.position,

@@ -101,7 +101,8 @@ class System:
         """A state with the names and numbers that its file holds, where frozen and free molecules are one species."""
         names = list(dict.fromkeys(m.name for m in self.species))
         index = np.array([names.index(m.name) for m in self.species])
-        return Saved(state, names, index[self.model.species], self.residue_number)
+        first = [next(m for m in self.species if m.name == name) for name in names]
+        return Saved(state, names, index[self.model.species], self.residue_number, np.array([m.marks for m in first]))
 
     @property
     def residue_names(self) -> np.ndarray:

@@ -21,11 +21,13 @@ class Saved(NamedTuple):
     names: list[str]  # of species
     species: np.ndarray  # (n,) index into the names
     residue_number: np.ndarray | None  # (n,); older files have none
+    models: np.ndarray | None = None  # (names, 5) mass, u, moments of inertia, u Å², and number of sites of each species
 
 
 def write_state(path: Path, saved: Saved) -> None:
     """Write a state of molecules. No pickle in it. Raises OutputError."""
-    more = {} if saved.residue_number is None else {"residue_number": saved.residue_number}
+    more = {"residue_number": saved.residue_number, "models": saved.models}
+    more = {name: array for name, array in more.items() if array is not None}
     with whole_file(path) as temporary:
         np.savez(
             temporary,
@@ -54,7 +56,7 @@ def read_state(path: Path) -> Saved:
         raise StructureError(str(path), [fault])
     example = state_of()
     if schema == 1:
-        arrays = {key: arrays[key] for key in ("species", "residue_number", *State._fields[:5]) if key in arrays}
+        arrays = {key: arrays[key] for key in ("species", "residue_number", "models", *State._fields[:5]) if key in arrays}
         arrays |= {key: getattr(example, key) for key in State._fields[5:]}
     if missing := [key for key in State._fields if key not in arrays]:
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])
@@ -62,7 +64,7 @@ def read_state(path: Path) -> Saved:
         raise StructureError(str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"])
     kinds = (getattr(example, key).dtype for key in State._fields)
     state = State(*(np.array(arrays[key], kind) for key, kind in zip(State._fields, kinds, strict=True)))
-    return Saved(state, names, species, arrays.get("residue_number"))
+    return Saved(state, names, species, arrays.get("residue_number"), arrays.get("models"))
 
 
 def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
@@ -72,6 +74,7 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3), "rotation": (m, 3, 3)}
     shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (3,)}
     shapes |= {"residue_number": (n,)} if "residue_number" in arrays else {}
+    shapes |= {"models": (len(names), 5)} if "models" in arrays else {}
     bad = {key for key, shape in shapes.items() if arrays[key].shape != shape or arrays[key].dtype.kind not in "fi"}
     finite = [key for key in (*shapes, "bath") if key not in (*bad, "cell")]
     bad |= {key for key in finite if not np.isfinite(arrays[key]).all()}
@@ -80,6 +83,6 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
         bad.add("species")
     if "rotation" not in bad and m:
         gap = np.swapaxes(arrays["rotation"], 1, 2) @ arrays["rotation"] - np.eye(3)
-        if np.abs(gap).max() > NOT_A_ROTATION:
+        if np.abs(gap).max() > NOT_A_ROTATION or (np.linalg.det(arrays["rotation"]) < 0).any():
             bad.add("rotation")
     return bad
