@@ -316,9 +316,11 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
     if missing := [name for name in saved.names if name not in known]:
         raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
     of_name = {molecule.name: molecule for molecule in species}
-    faults = [_other_model(of_name[name], marks) for name, marks in zip(saved.names, saved.models, strict=True)] if (
-        saved.models is not None
-    ) else []
+    faults = (
+        [_other_model(of_name[name], marks) for name, marks in zip(saved.names, saved.models, strict=True)]
+        if (saved.models is not None)
+        else []
+    )
     state, n, turning = saved.state, len(saved.species), len(saved.state.rotation) > 0
     turned = [name for name in saved.names if of_name[name].inertia.any()]
     if turned and not turning:

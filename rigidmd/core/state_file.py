@@ -21,7 +21,9 @@ class Saved(NamedTuple):
     names: list[str]  # of species
     species: np.ndarray  # (n,) index into the names
     residue_number: np.ndarray | None  # (n,); older files have none
-    models: np.ndarray | None = None  # (names, 5) mass, u, moments of inertia, u Å², and number of sites of each species
+    models: np.ndarray | None = (
+        None  # (names, 5) mass, u, moments of inertia, u Å², and number of sites of each species
+    )
 
 
 def write_state(path: Path, saved: Saved) -> None:
@@ -56,7 +58,8 @@ def read_state(path: Path) -> Saved:
         raise StructureError(str(path), [fault])
     example = state_of()
     if schema == 1:
-        arrays = {key: arrays[key] for key in ("species", "residue_number", "models", *State._fields[:5]) if key in arrays}
+        known = ("species", "residue_number", *State._fields[:5])
+        arrays = {key: arrays[key] for key in known if key in arrays}
         arrays |= {key: getattr(example, key) for key in State._fields[5:]}
     if missing := [key for key in State._fields if key not in arrays]:
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])

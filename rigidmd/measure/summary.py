@@ -24,6 +24,9 @@ OF_MOTION = (
     "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
     "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
 )  # fmt: skip
+#: Drift of the conserved energy, kT/ns per degree of freedom, and difference of the temperatures of translation and
+#: rotation, as a fraction, that are told, where they exceed that by so many standard errors, of so many samples.
+DRIFTS, DIFFER, SURE, LEAST = 0.1, 0.02, 5.0, 20
 #: Largest share of the translational temperature in a common drift of all molecules without a note.
 SHOWS = 1e-4
 
@@ -90,7 +93,12 @@ def summarise(
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
         "momentum_removed": _removed(system, state),
         "stages": stages,
-        "notes": [*system.notes, *_drifting(system, state, samples.rows[-1]), *warnings],
+        "notes": [
+            *system.notes,
+            *_drifting(system, state, samples.rows[-1]),
+            *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples.rows, k)),
+            *warnings,
+        ],
     }
 
 
@@ -118,6 +126,39 @@ def _drifting(system: System, state: State, last: Sample) -> list[str]:
         f"the molecules drift together with |P| = {momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
         "run.remove_momentum_interval_ps removes the total momentum"
     ]
+
+
+def _doubts(system: System, samples: list[Sample], k: int) -> list[str]:
+    """What tells that the averages of stage k are wrong: energy that drifts, temperatures that differ.
+
+    A thermostat hides the energy that a long step adds: it takes it out again, faster from some motions than from
+    others.
+    """
+    own = [sample for sample in samples if sample.stage == k]
+    if not own:
+        return []
+    found, stage = [], system.scene.stages[k]
+    line = slope([s.time for s in own], [s.drift for s in own])
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean([s.temperature for s in own])[0] or 0.0) * system.freedom_in(k).total
+    limit = DRIFTS * thermal / 1000  # kJ/mol/ps
+    if thermal > 0 and abs(line.value) > limit + SURE * line.error:
+        found.append(
+            f"stages.{k}: the conserved energy drifts by {line.value * 1000 / thermal:+.2g} kT/ns per degree of "
+            "freedom: timestep_fs is too long, or forces jump at the cut-off; a thermostat hides this and leaves "
+            "temperatures wrong"
+        )
+    late = own[len(own) // 2 :]
+    apart, error = mean([s.temperature_translation - s.temperature_rotation for s in late])
+    if stage.has_thermostat and len(late) >= LEAST and apart is not None and error is not None:
+        level = mean([s.temperature for s in late])[0] or 0.0
+        if abs(apart) > DIFFER * level + SURE * error:
+            moving = mean([s.temperature_translation for s in late])[0]
+            turning = mean([s.temperature_rotation for s in late])[0]
+            found.append(
+                f"stages.{k}: in its second half T_trans is {moving:.4g} K and T_rot {turning:.4g} K, which sampling "
+                "does not explain: timestep_fs is too long, or translation and rotation hardly exchange energy"
+            )
+    return found
 
 
 def _relative_momentum(system: System, state: State, momentum: float) -> float:
