@@ -1,6 +1,7 @@
 """Runs that are stopped and go on: to the same bits as one that never stopped."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from rigidmd import cli
 from rigidmd.errors import CheckpointError
@@ -291,3 +293,25 @@ def test_a_failed_write_stops_the_run(stopped, tmp_path):
     assert done.returncode == 2
     assert "cannot be written: File too large" in done.stderr
     assert (tmp_path / "run" / "log.csv").read_bytes().endswith(b"\n")
+
+
+@pytest.mark.slow
+def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
+    """The recipe of the manual, with a scheduler that starts the next job at once."""
+    manual = (ROOT / "rigidmd" / "docs" / "manual.md").read_text()
+    job = next(block for block in re.findall(r"```text\n(.*?)```", manual, re.DOTALL) if "#SBATCH" in block)
+    (tmp_path / "job.sh").write_text(job.replace("3:55:00", "0:00:05"))
+    stub = tmp_path / "bin" / "sbatch"
+    stub.parent.mkdir()
+    stub.write_text('#!/bin/bash\necho job >> jobs\nexec bash "$1"\n')
+    stub.chmod(0o755)
+    scene = (stopped / "water.toml").read_text().replace("duration_ps = 0.1", "duration_ps = 12.0")
+    (tmp_path / "water.toml").write_text(scene)
+    path = os.pathsep.join([str(stub.parent), str(Path(sys.executable).parent), os.environ["PATH"]])
+    subprocess.run(
+        ["bash", "job.sh"], cwd=tmp_path, env=os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}, check=True
+    )
+    assert len((tmp_path / "jobs").read_text().splitlines()) >= 2
+    assert cli.main(["run", str(tmp_path / "water.toml"), "-o", str(tmp_path / "whole")]) == 0
+    whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "runs" / "water")
+    assert [name for name in whole if whole[name] != parts[name]] == []

@@ -210,7 +210,7 @@ def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
     """It takes out in every step what the step has added, so that the temperature of all motion looks right."""
     stage = {"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": timestep, "duration_ps": 12.0}
     warm = stage | {"timestep_fs": 2.0, "duration_ps": 1.0}
-    stages = [warm, stage | {"thermostat_time_ps": 0.012}]
+    stages = [warm, stage | {"thermostat_time_ps": 0.01}]
     scene = small_scene({"tip4p2005": 40}, 11.0, stages=stages, forces={"cutoff_A": 5.4, "truncation": "smooth_switch"},
                         watch=dict.fromkeys(("move", "turn_rad", "kick"), False))  # fmt: skip
     results = Simulation(scene).run()
