@@ -29,6 +29,7 @@ def energy_error(results):
     return float(np.sqrt(np.mean((energy - energy[0]) ** 2)) / (2 * kinetic.mean()))
 
 
+@pytest.mark.slow
 def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(tmp_path):
     results = Simulation(liquid(integrator="auto", energy_error_kT=1e-5), tmp_path / "a").run()
     stage = results.summary["stages"][1]
@@ -69,6 +70,7 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
     assert simulation.scene.run.integrator == results.summary["integrator"] != "auto"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_kept_is_said(capsys, tmp_path):
     command = ["run", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-30", "-o", str(tmp_path)]
     assert main(command) != 0

@@ -233,8 +233,17 @@ def test_wheels_drives_and_friction_in_a_turning_accelerated_frame():
     assert np.log2(gaps[0] / gaps[1]) == pytest.approx(2, abs=0.1)
 
 
-@pytest.mark.parametrize("scene", [PINNED | ROTOR, FREE | {"fluid": FLUID}], ids=["rotor", "fluid"])
-@pytest.mark.parametrize("formulation", ["matrix", "quaternion", "euler_angles"])
+@pytest.mark.parametrize(
+    ("formulation", "scene"),
+    [
+        pytest.param("matrix", PINNED | ROTOR, id="matrix-rotor"),
+        pytest.param("quaternion", FREE | {"fluid": FLUID}, id="quaternion-fluid"),
+        pytest.param("euler_angles", PINNED | ROTOR, id="euler_angles-rotor"),
+        pytest.param("quaternion", PINNED | ROTOR, id="quaternion-rotor", marks=pytest.mark.slow),
+        pytest.param("matrix", FREE | {"fluid": FLUID}, id="matrix-fluid", marks=pytest.mark.slow),
+        pytest.param("euler_angles", FREE | {"fluid": FLUID}, id="euler_angles-fluid", marks=pytest.mark.slow),
+    ],
+)
 def test_the_textbook_systems_are_the_same_motion(scene, formulation):
     exact = kirchhoff_end(1.0)[2:] if "fluid" in scene else rotor_end(1.0)
     options = {"run__formulation": formulation}

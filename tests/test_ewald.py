@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from itertools import product
 
 import numba
 import numpy as np
@@ -178,7 +179,7 @@ def check_nist_moments(seen, rotation, moments):
     assert torque == pytest.approx(np.array(moments["mol1_torque_K"]), abs=2e-4 * np.abs(torque).max())
 
 
-@pytest.mark.parametrize("config", [1, 3])
+@pytest.mark.parametrize("config", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_nist_spce_component_by_component(reference, config, tmp_path):
     table = json.loads((reference / "nist_spce_cuboid" / "REFERENCE.json").read_text())
     file = reference / "nist_spce_cuboid" / f"spce_sample_config_periodic{config}.txt"
@@ -244,7 +245,7 @@ def test_nist_spce_in_a_monoclinic_cell_that_leans_by_half_an_edge(reference, tm
     assert found["potential"] == published(-1.60912e5)
 
 
-@pytest.mark.parametrize("method", ["ewald", "pme"])
+@pytest.mark.parametrize("method", [pytest.param("ewald", marks=pytest.mark.slow), "pme"])
 def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
     """Energy and forces of OpenMM's test, which has them from GROMACS: Lennard-Jones cut at 10 Å."""
     given = json.loads((reference / "openmm" / "REFERENCE.json").read_text())["triclinic_8_ions"]
@@ -616,8 +617,18 @@ def test_virial_is_the_slope_of_the_energy_with_the_volume(method, surface, angl
 # --- accuracy --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["ewald", "pme"])
-@pytest.mark.parametrize("asked", [1e-3, 1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize(
+    ("asked", "method"),
+    [
+        (1e-5, "ewald"),
+        (1e-4, "pme"),
+        *(
+            pytest.param(asked, method, marks=pytest.mark.slow)
+            for asked, method in product([1e-3, 1e-4, 1e-5, 1e-6], ["ewald", "pme"])
+            if (asked, method) not in ((1e-5, "ewald"), (1e-4, "pme"))
+        ),
+    ],
+)
 def test_forces_are_as_accurate_as_asked_for(method, asked):
     """Measured against a tight Ewald sum: within a factor 2 of the request, either way; and as estimated."""
     forces = {"cutoff_A": 7.7, "electrostatics": method, "ewald_accuracy": asked}
@@ -627,7 +638,7 @@ def test_forces_are_as_accurate_as_asked_for(method, asked):
     assert found.estimated == pytest.approx(found.measured, rel=0.6)
 
 
-@pytest.mark.parametrize("order", [3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize("order", [4, 7, *(pytest.param(order, marks=pytest.mark.slow) for order in (3, 5, 6, 8))])
 def test_every_order_of_splines_keeps_to_its_estimate(order):
     forces = {
         "cutoff_A": 7.7,
@@ -650,8 +661,15 @@ def test_single_precision_is_good_enough_for_1e_5():
     assert errors[1] == pytest.approx(errors[0], rel=0.1)
 
 
-@pytest.mark.parametrize("method", ["ewald", "pme"])
-@pytest.mark.parametrize("precision", ["double", "mixed"])
+@pytest.mark.parametrize(
+    ("precision", "method"),
+    [
+        ("mixed", "pme"),
+        ("double", "ewald"),
+        pytest.param("double", "pme", marks=pytest.mark.slow),
+        pytest.param("mixed", "ewald", marks=pytest.mark.slow),
+    ],
+)
 def test_same_bits_for_any_number_of_threads(method, precision):
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("one core")
@@ -746,7 +764,7 @@ def conserved(rows):
     return np.array([row.time for row in rows]), np.array([row.conserved for row in rows]) / 216
 
 
-@pytest.mark.parametrize("model", ["spce", "tip4p2005"])
+@pytest.mark.parametrize("model", ["spce", pytest.param("tip4p2005", marks=pytest.mark.slow)])
 def test_energy_errors_of_pme_are_of_order_2(model):
     """The energy that the grid gives is kept: its fluctuation falls with the square of the step."""
     spread = [np.std(conserved(nve(model, dt, 0.4))[1]) for dt in (2.0, 1.0)]

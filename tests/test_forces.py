@@ -13,7 +13,7 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.lists import BUILDS, USABLE
 from rigidmd.forces.pairs.space import cell_of
-from rigidmd.forces.terms import add_term
+from rigidmd.forces.terms import Loading
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector
 
@@ -36,8 +36,16 @@ def energies(engine, state):
     return {name: tally.energy for name, tally in engine.evaluate(state)[1].items()}
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize(("counts", "edge"), MIXTURES)
+@pytest.mark.parametrize(
+    ("ending", "counts", "edge"),
+    [
+        pytest.param(
+            ending, *which, id=f"{ending}-{k}", marks=[] if k == 1 or ending == ENDINGS[k] else pytest.mark.slow
+        )
+        for ending in ENDINGS
+        for k, which in enumerate(MIXTURES)
+    ],
+)
 def test_energies_are_those_of_the_oracle(counts, edge, ending):
     forces = ended(ending) | {"reaction_field_permittivity": 78.5}
     for seed, mixing in enumerate(["lorentz-berthelot", "geometric"]):
@@ -265,7 +273,9 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
     own = engine.workspaces["lennard_jones"]
     sites = own.sites._replace(first=own.sites.first.astype(np.int64))
     with pytest.raises(TypingError, match="find was compiled for parcel"):
-        add_term(own._replace(sites=sites), state, no_load(state), None)
+        Loading((own._replace(sites=sites),), called=False)
+    with pytest.raises(TypingError, match="tallied was compiled for parcel"):
+        Loading((own,), called=False).bind((own._replace(sites=sites),), state, no_load(state))
 
 
 def test_the_list_is_rebuilt_for_moves_and_for_turns():

@@ -55,6 +55,8 @@ def test_every_system_runs_a_few_steps(path, tmp_path):
         "topology.gro",
         "final.npz",
         "energy.png",
+        "checkpoint.npz",
+        "checkpoint_previous.npz",
     }
     universe = results.universe()
     assert universe.atoms.n_atoms == len(results.system.sites.name)

@@ -29,7 +29,17 @@ from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import Asked, answer
 from rigidmd.forces.external.walls import Behind, LennardJonesWalls
-from rigidmd.forces.terms import Loading, NoForce, Setup, tally_one, with_code, with_room, workspace_of
+from rigidmd.forces.terms import (
+    Loading,
+    NoForce,
+    Setup,
+    memory_of,
+    recalled,
+    tally_one,
+    with_code,
+    with_room,
+    workspace_of,
+)
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
 Precision = Literal["double", "mixed"]
@@ -162,10 +172,7 @@ class Engine:
     def memory(self) -> dict[str, np.ndarray] | None:
         """Lists as last built, forces at the present positions, what the box knows: for `recall`."""
         found = {
-            f"{name}.{key}": array
-            for name, own in self.workspaces.items()
-            if hasattr(own, "memory")
-            for key, array in own.memory().items()
+            f"{name}.{key}": array for name, own in self.workspaces.items() for key, array in memory_of(own).items()
         }
         if self.load is not None and not self._stale:
             found |= self._named(self.load, LOAD)
@@ -175,13 +182,8 @@ class Engine:
         """Go on from a state with what `memory` gave for it, to the same bits. Raises ValueError if they do not fit."""
         own = self._prepare(state)
         kept = {name: {key: memory[f"{name}.{key}"] for key in of} for name, of in _by_owner(memory).items()}
-        self._workspaces = (
-            tuple(
-                workspace.recall(kept[name]) if name in kept else workspace
-                for name, workspace in zip(self.names, own, strict=False)
-            )
-            or own
-        )
+        pairs = zip(self.names, own, strict=False)
+        self._workspaces = tuple(recalled(workspace, kept.get(name, {})) for name, workspace in pairs) or own
         self.load, self._stale = no_load(state), LOAD not in kept
         if LOAD in kept:
             _fill(self.load, kept[LOAD])

@@ -50,6 +50,16 @@ def with_room(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
     return workspace.with_room(cell) if hasattr(workspace, "with_room") else workspace
 
 
+def memory_of(workspace: NamedTuple) -> dict[str, np.ndarray]:
+    """Arrays on which the next forces depend besides the state, for `recalled`; none of most workspaces."""
+    return workspace.memory() if hasattr(workspace, "memory") else {}
+
+
+def recalled(workspace: NamedTuple, memory: dict[str, np.ndarray]) -> NamedTuple:
+    """The workspace, which has machine code, with what `memory_of` gave. Raises ValueError if that does not fit."""
+    return workspace.recall(memory) if memory else workspace
+
+
 def add_forces(term, state, load, tally):
     """Add a term's forces and torques to `load`, its energy and virial to `tally` unless None; a status code."""
     raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")

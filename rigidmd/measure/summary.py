@@ -2,6 +2,7 @@
 
 import platform
 from collections import Counter
+from collections.abc import Sequence
 from importlib.metadata import version
 from math import isnan, sqrt
 
@@ -39,7 +40,7 @@ def summarise(
     threads: int,
     preparing: float,
     wall: float,
-    computing: list[float],
+    computing: Sequence[float],
     interrupted: bool,
     choices: dict[int, str],
     stable: dict[int, float],

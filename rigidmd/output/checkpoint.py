@@ -37,7 +37,8 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     with whole_file(path) as temporary:
         told = json.dumps(checkpoint.told | {"schema": SCHEMA}).encode()
         with temporary.open("wb") as file:
-            np.savez(file, **{TOLD: np.frombuffer(told, np.uint8)}, **checkpoint.arrays)
+            arrays: dict[str, Any] = {TOLD: np.frombuffer(told, np.uint8), **checkpoint.arrays}
+            np.savez(file, **arrays)
         with zipfile.ZipFile(temporary, "a") as archive:
             archive.writestr(CONTENTS, _contents(archive))
         sync_file(temporary)

@@ -39,7 +39,6 @@ from rigidmd.run.observers import Every, Observer
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import fitting
 from rigidmd.scene import BodyScene, MolecularScene, Scene
-from rigidmd.validation import settled
 
 if TYPE_CHECKING:
     from rigidmd.assemble.body import BodySystem, Pose
@@ -209,7 +208,8 @@ class Simulation(Base):
                 if kept is None:
                     check_folder(self.folder, self._force, inputs)
             self._interrupted, self._signal, self._out_of_time = False, None, False
-            self._keeper = Keeper(self.folder, settled(self.scene.output.checkpoint_minutes), self._deadline)
+            scene = cast(MolecularScene | BodyScene, self.scene)
+            self._keeper = Keeper(self.folder, scene.output.checkpoint_minutes, self._deadline)
             stack.enter_context(self._asks_at_signals())
             self._warnings.clear()
             self._reset()

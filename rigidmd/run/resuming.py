@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from rigidmd.core.state import NOW, State
 from rigidmd.errors import CheckpointError
@@ -76,7 +75,7 @@ def fitting(folder: Path | None) -> Iterator[None]:
     """Turns whatever does not fit in a checkpoint into a CheckpointError."""
     try:
         yield
-    except (KeyError, ValueError, TypeError, IndexError, ValidationError) as error:
+    except (KeyError, ValueError, TypeError, IndexError) as error:
         raise CheckpointError(
             f"the checkpoint in {folder} does not fit this run: {error}. --force begins a new run"
         ) from None
