@@ -182,6 +182,23 @@ def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     assert "longer already, 120 steps" in capsys.readouterr().err
 
 
+def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
+    """`rigidmd resume` reads the scene that the run has written: its inputs are copies, and what was open is decided."""
+    auto = {"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-2}
+    data = scene(NVT, auto, structure={"file": "final.npz"}, start={"temperature_K": 298.0}, box={})
+    data["molecules"] = [{"model": "spce"}]
+    folder = stopped / "run"
+    looks = stopped_at(set())
+    Simulation(Scene.from_dict(data, folder), tmp_path / "whole", observers=looks).run()
+    parts = tmp_path / "parts"
+    Simulation(Scene.from_dict(data, folder), parts, observers=stopped_at({40})).run()
+    for step in (130, None):
+        again = Scene.read(parts / "scene.toml")
+        Simulation(again, parts, resume=True, observers=stopped_at({step} if step else set())).run()
+    assert contents(tmp_path / "whole") == contents(parts)
+    assert [path.name for path in parts.iterdir() if path.name.startswith("input_")] == ["input_structure_final.npz"]
+
+
 def test_another_scene_is_not_gone_on_with(again, capsys):
     command = ["run", str(again / "water.toml"), "-o", str(again / "run"), "--resume"]
     assert cli.main([*command, "--set", "stages.0.timestep_fs=0.5", "--set", "seed=3"]) == 2

@@ -11,11 +11,9 @@ from rigidmd.scene import Scene
 
 
 def input_names(scene: Scene) -> dict[str, str]:
-    """Names for the copies of a scene's input files: dotted key -> unique name."""
-    return {
-        key: f"input_{key.removesuffix('.file').replace('molecules.', '')}_{path.name}"
-        for key, path in scene.inputs.items()
-    }
+    """Names for the copies of a scene's input files: dotted key -> unique name. A copy keeps its name."""
+    starts = {key: f"input_{key.removesuffix('.file').replace('molecules.', '')}_" for key in scene.inputs}
+    return {key: starts[key] + path.name.removeprefix(starts[key]) for key, path in scene.inputs.items()}
 
 
 def write_scene(folder: Path, scene: Scene) -> None:

@@ -219,6 +219,7 @@ class Simulation(Base):
             else:
                 with fitting(self.folder):
                     self._recall(kept)
+                self._say(f"going on from step {self.state.step[NOW]}")
             prepared = clock.perf_counter() - began
             observers = [*self._own_observers(), *self._observers]
             if self.folder is not None:

@@ -142,7 +142,13 @@ class MolecularSimulation(Simulation):
     def _recall(self, kept: Checkpoint) -> None:
         told = kept.told["run"]
         self.state = state_from(kept.of("state").arrays, self._built.state)
-        check_same_scene(self._built.scene, told["scene"], told["inputs"], int(self.state.step[NOW]))
+        # the scene in the folder has decided what was open before
+        decided = [
+            then if now.is_open else chosen
+            for now, then, chosen in zip(self.scene.stages, told["scene"]["stages"], told["stages"], strict=False)
+        ]
+        before = told["scene"] | {"stages": decided or told["scene"]["stages"]}
+        check_same_scene(self._built.scene, before, told["inputs"], int(self.state.step[NOW]))
         stages = [Stage.model_validate(stage) for stage in told["stages"]]
         stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
