@@ -23,6 +23,7 @@ from rigidmd.units import KJ_PER_MOL
 
 COUNT, CUTOFF, TEMPERATURE, STEP = 512, 9.0, 298.15, 2.0  # Å, K, fs
 EVERY = 0.1  # ps between samples
+RELAXATION = 0.4  # ps, of the barostats: shorter than the volume's own, near 1 ps, so that it hardly lengthens it
 
 
 def scene(model: str, *stages: dict) -> dict:
@@ -42,7 +43,7 @@ def scene(model: str, *stages: dict) -> dict:
 
 def own_density(model: str, duration: float) -> np.ndarray:
     """Density over time by rigidmd, g/cm³."""
-    npt = {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": 1.0}
+    npt = {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": RELAXATION}
     results = Simulation(Scene.from_dict(scene(model, npt | {"duration_ps": duration}))).run(progress=True)
     return results["density"][1:]
 
@@ -70,7 +71,7 @@ def begin_gromacs(model: str, duration: float, folder: Path) -> subprocess.Popen
         "gen-temp": TEMPERATURE, "cutoff-scheme": "verlet", "nstlist": 20, "verlet-buffer-tolerance": 1e-4,
         "rvdw": CUTOFF / 10, "rcoulomb": CUTOFF / 10, "vdw-modifier": "potential-shift", "DispCorr": "EnerPres",
         "coulombtype": "PME", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.5, "ref-t": TEMPERATURE,
-        "pcoupl": "C-rescale", "tau-p": 1.0, "ref-p": 1.0, "compressibility": 4.5e-5,
+        "pcoupl": "C-rescale", "tau-p": RELAXATION, "ref-p": 1.0, "compressibility": 4.5e-5,
         "nstenergy": every, "nstlog": 0,
     }  # fmt: skip
     (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
