@@ -295,9 +295,9 @@ def test_energies_at_two_temperatures(thermostat):
 def test_energies_of_water_at_two_temperatures():
     """The same of SPC/E with a reaction field, langevin."""
     found = []
-    for temperature in (290.0, 330.0):
+    for temperature in (280.0, 340.0):
         stage = {"temperature_K": temperature, "timestep_fs": 1.0} | WARM
-        scene = liquid("spce", stage | {"duration_ps": 10.0}, stage | {"duration_ps": 150.0})
+        scene = liquid("spce", stage | {"duration_ps": 10.0}, stage | {"duration_ps": 450.0})
         found.append(state_data(follow(scene, 0.15), temperature))
     assert ensemble_judged("SPC/E, langevin, U", *found) < FEW
 
@@ -313,20 +313,21 @@ BAROSTATS = {
 def test_volumes_and_enthalpies_at_two_states(barostat):
     """Slopes (p1 - p2)/kT of V, 1/kT1 - 1/kT2 of the enthalpy, and both together of U and V."""
     found = []
-    for temperature, pressure in ((200.0, 1000.0), (200.0, 1450.0), (240.0, 1000.0)):
+    # Hotter and pressed more, the volume is nearly that of the first: only so the distributions of both overlap enough.
+    for temperature, pressure in ((200.0, 1000.0), (200.0, 1450.0), (240.0, 1000.0), (240.0, 1450.0)):
         common = {"temperature_K": temperature, "timestep_fs": 4.0}
         stage = common | {"ensemble": "npt", "thermostat": "langevin", "pressure_bar": pressure, "barostat": barostat}
         stage |= THERMOSTATS["langevin"] | BAROSTATS[barostat]
         forces = {"cutoff_A": 6.3, "truncation": "smooth_switch"}
-        scene = dumbbells(50, forces, stage | {"duration_ps": 20.0}, stage | {"duration_ps": 400.0})
+        scene = dumbbells(50, forces, stage | {"duration_ps": 20.0}, stage | {"duration_ps": 1200.0})
         course = follow(scene, 0.2)
         tried, accepted = (course.results.summary["stages"][-1][f"moves_{what}"] for what in ("tried", "accepted"))
         print(f"{barostat}: {accepted / tried:.2f} of the moves accepted")
         found.append(state_data(course, temperature, pressure))
-    base, squeezed, warm = found
+    base, squeezed, warm, both = found
     assert ensemble_judged(f"{barostat}, V", base, squeezed) < FEW
     assert ensemble_judged(f"{barostat}, H", base, warm) < FEW
-    assert ensemble_judged(f"{barostat}, U and V", squeezed, warm) < FEW
+    assert ensemble_judged(f"{barostat}, U and V", base, both) < FEW
 
 
 @pytest.mark.slow
@@ -456,9 +457,12 @@ def test_a_piston_keeps_the_mean_pressure():
     warm = WARM | {"temperature_K": 200.0, "timestep_fs": 4.0, "duration_ps": 10.0}
     nph = {"ensemble": "nph", "pressure_bar": 1000.0, "timestep_fs": 2.0, "barostat_time_ps": 0.5}
     forces = {"cutoff_A": 6.3, "truncation": "smooth_switch", "tail_correction": True}
-    course = follow(dumbbells(50, forces, warm, nph | {"duration_ps": 10.0}, nph | {"duration_ps": 150.0}), 0.05)
+    course = follow(dumbbells(50, forces, warm, nph | {"duration_ps": 10.0}, nph | {"duration_ps": 300.0}), 0.05)
     pressure = course["pressure_bar"]
-    error = error_of(pressure)
+    # The piston's swings cancel over whole periods, which a statistical inefficiency of at least 1 does not see:
+    # means over ten periods each.
+    means = pressure[len(pressure) % 100 :].reshape(-1, 100).mean(axis=1)
+    error = float(means.std(ddof=1) / np.sqrt(len(means)))
     assert error < 10
     assert told("nph, pressure, bar", pressure.mean(), error, 1000.0) < FEW
     assert np.ptp(course["volume"]) > 0.03 * course["volume"].mean()
