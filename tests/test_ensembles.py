@@ -463,7 +463,7 @@ def test_a_piston_keeps_the_mean_pressure():
     # means over ten periods each.
     means = pressure[len(pressure) % 100 :].reshape(-1, 100).mean(axis=1)
     error = float(means.std(ddof=1) / np.sqrt(len(means)))
-    assert error < 10
+    assert error < 3
     assert told("nph, pressure, bar", pressure.mean(), error, 1000.0) < FEW
     assert np.ptp(course["volume"]) > 0.03 * course["volume"].mean()
 
