@@ -8,6 +8,7 @@ standard errors: 4.5 where many figures are compared at once, else 3.5.
 import contextlib
 import io
 import re
+import shutil
 import warnings
 from typing import NamedTuple
 
@@ -557,3 +558,39 @@ def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
     told("lean under shear", strain, np.hypot(error, strain * own / constant), -SHEAR / constant)
     assert -SHEAR / strain == pytest.approx(constant, rel=0.15)
     assert by_fluctuations == pytest.approx(constant, rel=0.15 + FEW * spread / constant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coupling", ["anisotropic", "flexible"])
+def test_ice_keeps_its_cell(coupling, reference, tmp_path):
+    """Proton-disordered ice Ih of TIP4P/2005 at 250 K and 1 bar: 0.921 g/cm³ (Abascal & Vega 2005, table IV), its three
+    axes in the proportions of the crystal, and its angles right ones."""
+    shutil.copy(reference / "structures" / "genice_ice1h_tip4p_seed42.gro", tmp_path / "ice.gro")
+    stage = {
+        "ensemble": "npt", "temperature_K": 250.0, "timestep_fs": 2.0, "thermostat": "langevin", "pressure_bar": 1.0,
+        "pressure_coupling": coupling, "barostat_time_ps": 0.5, "compressibility_per_bar": 1e-5,
+    }  # fmt: skip
+    scene = {
+        "structure": {"file": "ice.gro"},
+        "molecules": [{"model": "tip4p2005"}],
+        "forces": {"cutoff_A": 7.0, "truncation": "shift", "tail_correction": True, "electrostatics": "pme"},
+        "precision": "mixed",
+        "start": {"temperature_K": 250.0},
+        "stages": [stage | {"duration_ps": 10.0}, stage | {"duration_ps": 60.0}],
+    }
+    course = follow(scene, 0.1, folder=tmp_path)
+    begin = np.array([course.results[name][0] for name in "abc"])
+    density = course["density"]
+    told(f"ice Ih, {coupling}, density, g/cm³", density.mean(), error_of(density), 0.921)
+    assert error_of(density) < 0.002
+    assert density.mean() == pytest.approx(0.921, rel=0.005)
+    edges = np.array([course[name] for name in "abc"])
+    growth = edges.mean(axis=1) / begin
+    for name, values, whole in zip("abc", edges, begin, strict=True):
+        told(f"ice Ih, {coupling}, {name}, Å", values.mean(), error_of(values), whole * np.cbrt(growth.prod()))
+    assert growth / np.cbrt(growth.prod()) == pytest.approx(np.ones(3), rel=0.01)
+    for name in ("alpha", "beta", "gamma"):
+        if coupling == "flexible":
+            assert told(f"ice Ih, {name}, °", course[name].mean(), error_of(course[name]), 90.0) < MANY
+        else:
+            assert course[name] == pytest.approx(90)

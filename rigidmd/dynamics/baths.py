@@ -160,6 +160,11 @@ def _stir(parcel, block):
     step, key = state.step[NOW], bath.key
     thermal = present(bath.thermal_energy, state)
     keep, spread, keep_turning, spread_turning = shares(bath, h)
+    new = np.empty((len(model.mass), 4))  # of each species: size of what is new of a velocity and of angular momenta
+    for kind in range(len(model.mass)):
+        new[kind, 3] = spread * sqrt(thermal * model.inverse_mass[kind])
+        for k in range(3):
+            new[kind, k] = spread_turning * sqrt(thermal * model.inertia[kind, k])
     words = np.empty((4 * NORMALS, BATCH), np.uint64)
     heat = 0.0
     for start in range(first, end, BATCH):
@@ -174,7 +179,7 @@ def _stir(parcel, block):
             for k in range(3):
                 before = state.velocity[m, k]
                 xi = normal_of(words[k, m - start], key, draw + FURTHER * (k + 1), m, step)
-                after = keep * before + spread * sqrt(thermal * model.inverse_mass[kind]) * xi
+                after = keep * before + new[kind, 3] * xi
                 gained += after * after - before * before
                 state.velocity[m, k] = after
             heat += 0.5 * model.mass[kind] * gained
@@ -182,7 +187,7 @@ def _stir(parcel, block):
                 for k in range(3):
                     before = state.angular_momentum_body[m, k]
                     xi = normal_of(words[3 + k, m - start], key, draw + FURTHER * (k + 4), m, step)
-                    after = keep_turning * before + spread_turning * sqrt(thermal * model.inertia[kind, k]) * xi
+                    after = keep_turning * before + new[kind, k] * xi
                     heat += 0.5 * (after * after - before * before) * model.inverse_inertia[kind, k]
                     state.angular_momentum_body[m, k] = after
     room[block] = heat
