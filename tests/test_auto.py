@@ -58,7 +58,7 @@ def test_a_crude_error_is_kept_crudely():
     assert (second["integrator"], second["timestep_fs"]) == (coarse["integrator"], coarse["timestep_fs"])
 
 
-@pytest.mark.parametrize("target", [1e-3, 1e-8])
+@pytest.mark.parametrize("target", [1e-8, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_the_error_of_a_top_is_what_was_asked_for(target):
     changes = {"run.integrator": "auto", "run.trajectory_error": target, "run.timestep_s": 0.05}
     simulation = Simulation(Scene.read(TOP, changes))
@@ -104,6 +104,7 @@ def test_check_says_that_it_is_open(capsys):
     assert "integrator and step chosen at its start for an error of 0.0001 kT" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
     stages = [{"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-30}]
     with pytest.raises(SimulationError, match=r"stopped at step 0 \(0 ps\): no integrator keeps its error below 1e-30"):
