@@ -252,6 +252,16 @@ def test_a_folder_without_a_checkpoint(again, capsys):
     assert "is not the folder of a run" in capsys.readouterr().err
 
 
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_again(again):
+    whole = contents(again / "run")
+    for name in (CHECKPOINT, PREVIOUS, "final.npz", "summary.json"):
+        (again / "run" / name).unlink()
+    log = (again / "run" / "log.csv").read_text().splitlines(keepends=True)
+    (again / "run" / "log.csv").write_text("".join(log[:2]))
+    assert cli.main(["resume", str(again / "run"), "--until", "0.06ps"]) == 0
+    assert contents(again / "run") == whole
+
+
 def test_one_run_at_a_time_writes_into_a_folder(again, capsys):
     lock = FolderLock(again / "run")
     lock.take()

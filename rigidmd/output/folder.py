@@ -101,6 +101,15 @@ class FolderLock:
         self._lock.release()
 
 
+def never_began(folder: Path) -> bool:
+    """Whether a run was ended in a folder before its first checkpoint: nothing is lost if it begins again."""
+    ended = (CHECKPOINT, PREVIOUS, FINAL, LAST_GOOD, SUMMARY, MOTION)
+    if CHECKPOINT not in _written(folder) or any((folder / name).exists() for name in ended):
+        return False
+    log = folder / LOG
+    return not log.exists() or len(log.read_bytes().splitlines()) <= 2  # its header, its start
+
+
 def is_empty(folder: Path) -> bool:
     """Whether a folder is absent or holds nothing but a lock."""
     return not folder.exists() or all(path.name == LOCK for path in folder.iterdir())

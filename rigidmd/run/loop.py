@@ -30,6 +30,7 @@ from rigidmd.output.folder import (
     continue_folder,
     is_empty,
     make_folder,
+    never_began,
 )
 from rigidmd.output.progress import progress_of
 from rigidmd.output.report import write_summary
@@ -200,12 +201,13 @@ class Simulation(Base):
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
         with contextlib.ExitStack() as stack:
-            kept = None
+            kept, stays = None, False  # whether files of the folder stay
             if self.folder is not None:
                 stack.callback((lock := FolderLock(self.folder)).release)
                 lock.take()
                 kept = self._kept() if self._resume else None
-                if kept is None:
+                stays = kept is not None or (self._resume and never_began(self.folder))
+                if not stays:
                     check_folder(self.folder, self._force, inputs)
             self._interrupted, self._signal, self._out_of_time = False, None, False
             scene = cast(MolecularScene | BodyScene, self.scene)
@@ -224,8 +226,8 @@ class Simulation(Base):
             observers = [*self._own_observers(), *self._observers]
             if self.folder is not None:
                 names = [name for observer in observers for name in observer.files()]
-                names += [SUMMARY, CHECKPOINT, PREVIOUS]
-                if kept is None:
+                names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self._keeper.keeps else [])]
+                if not stays:
                     make_folder(self.folder, self._force, names, inputs, lock)
                 else:
                     continue_folder(self.folder, names)
@@ -352,7 +354,7 @@ class Simulation(Base):
     def _kept(self) -> Checkpoint | None:
         """The checkpoint to go on from; None if there is no run yet."""
         folder = cast(Path, self.folder)
-        if is_empty(folder):
+        if is_empty(folder) or never_began(folder):
             self._say(f"{folder} holds no run yet: beginning it")
             return None
         kept, faults = latest(folder)
