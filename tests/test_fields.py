@@ -517,6 +517,7 @@ def test_fields_that_are_tied_to_places_say_so():
     assert not build(scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})).external  # a sweep may pass through nothing
 
 
+@pytest.mark.slow
 def test_a_resolved_scene_with_fields_runs_again_to_the_same_bits(tmp_path):
     scene = slit(OSCILLATING | {"restraints": [{"molecules": "1-3", "stiffness_kJ_mol_A2": 4.0}]})
     first = Simulation(scene, tmp_path / "a").run()

@@ -59,7 +59,8 @@ def test_vectors_compute_as_arrays_do(dtype):
     assert sums[3] == 3
 
 
-@pytest.mark.parametrize("precision", ["mixed", pytest.param("double", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_pair_loops_of_water_are_vectorised(precision):
     _, engine, state = built({"spce": 30}, 20.0, forces=W1, precision=precision)
     engine.evaluate(state)

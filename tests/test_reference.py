@@ -37,7 +37,7 @@ def five_digits(printed):
     return pytest.approx(printed, abs=0.501 * 10 ** (np.floor(np.log10(abs(printed))) - 4))
 
 
-@pytest.mark.parametrize("config", ["config1", "config4"])
+@pytest.mark.parametrize("config", [pytest.param("config1", marks=pytest.mark.slow), "config4"])
 def test_nist_lennard_jones(reference, config):
     table = json.loads((reference / "nist_lj_cuboid" / "REFERENCE.json").read_text())["table"][config]
     file = reference / "nist_lj_cuboid" / f"lj_sample_config_periodic{config[-1]}.txt"
