@@ -103,6 +103,18 @@ def _parser() -> argparse.ArgumentParser:
     _going_on(resume)
     resume.set_defaults(overrides=[], force=False, resume=True)
 
+    compare = _command(
+        commands,
+        "compare",
+        _compare,
+        "tell where two runs part and what differs in what they were made from; exit code 0 if they are the same to "
+        "the last bit, else 1",
+        "rigidmd compare runs/water runs/water2",
+    )
+    compare.add_argument("first", metavar="RUN", help="folder of a run")
+    compare.add_argument("second", metavar="RUN", help="folder of another run")
+    compare.add_argument("--json", action="store_true", help="print JSON")
+
     energy = _command(
         commands,
         "energy",
@@ -344,6 +356,14 @@ def _resume(options: argparse.Namespace) -> int:
         raise OutputError(f"{folder} is not the folder of a run")
     options.scene, options.output = str(folder / SCENE), options.folder
     return _run(options)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from rigidmd.study.compare import compare, in_words
+
+    found = compare(Path(options.first), Path(options.second))
+    print(json.dumps(found.told(), indent=2) if options.json else in_words(found))
+    return 0 if found.same else FAILED
 
 
 def _say(sentence: str) -> None:

@@ -1,5 +1,6 @@
 """Runs that are stopped and go on: to the same bits as one that never stopped."""
 
+import json
 import os
 import re
 import shutil
@@ -197,6 +198,35 @@ def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
         Simulation(again, parts, resume=True, observers=stopped_at({step} if step else set())).run()
     assert contents(tmp_path / "whole") == contents(parts)
     assert [path.name for path in parts.iterdir() if path.name.startswith("input_")] == ["input_structure_final.npz"]
+
+
+def test_compare_tells_where_two_runs_part(again, stopped, tmp_path, capsys):
+    """A run beside itself, beside its continuation, and beside one of another scene whose log was changed in a bit."""
+    one, other = str(stopped / "run"), again / "run"
+    assert cli.main(["compare", one, str(other)]) == 0
+    assert "the runs are the same to the last bit\n" in capsys.readouterr().out
+    assert cli.main(["resume", str(other)]) == 0
+    capsys.readouterr()
+    assert cli.main(["compare", one, str(other)]) == 1
+    said = capsys.readouterr().out
+    assert "7 and 11 samples, 7 in common, the same to the last bit" in said
+    assert "position by up to" in said and "as far as both have samples" in said
+    log = other / "log.csv"
+    lines = [line.split(",") for line in log.read_text().splitlines()]
+    column = lines[0].index('"Kinetic Energy (kJ/mole)"')
+    lines[3][column] = repr(float(np.nextafter(float(lines[3][column]), np.inf)))
+    log.write_text("\n".join(",".join(line) for line in lines) + "\n")
+    scene = other / "scene.toml"
+    scene.write_text(scene.read_text().replace("seed = 1", "seed = 5"))
+    assert cli.main(["compare", one, str(other)]) == 1
+    said = capsys.readouterr().out
+    assert "seed: 1 against 5" in said
+    assert "the runs part at Step 20, sample 3 of 7" in said and "last 1 of 53 bits" in said
+    assert cli.main(["compare", one, str(other), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert [apart["column"] for apart in told["course"]["first"]] == ["Kinetic Energy (kJ/mole)"]
+    assert cli.main(["compare", one, str(tmp_path)]) == 2
+    assert "is not the folder of a run" in capsys.readouterr().err
 
 
 def test_another_scene_is_not_gone_on_with(again, capsys):

@@ -43,7 +43,7 @@ LIBRARIES = {
         "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lane_types.py", "compile/lanes.py",
         "compile/machine.py",
         "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",
-        "run/molecules.py", "measure/summary.py", "measure/body_summary.py",  # number of threads, version
+        "run/molecules.py",  # number of threads
     },
 }  # fmt: skip
 

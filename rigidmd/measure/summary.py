@@ -1,12 +1,9 @@
 """The summary of a run: one dictionary with units in its keys."""
 
-import platform
 from collections import Counter
 from collections.abc import Sequence
-from importlib.metadata import version
 from math import isnan, sqrt
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -37,7 +34,6 @@ def summarise(
     samples: Samples,
     state: State,
     relief_steps: int,
-    threads: int,
     preparing: float,
     wall: float,
     computing: Sequence[float],
@@ -48,7 +44,8 @@ def summarise(
     minima: dict[int, Minimum],
     warnings: list[str],
 ) -> dict:
-    """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
+    """The summary of a run but for what it was computed with; times in s: preparing (compiling, relief), wall (stages
+    with output), computing (steps).
 
     choices : choice and reason for stages that left their integrator open
     stable : the longest stable step (ps) of stages, as estimated at their start
@@ -68,12 +65,6 @@ def summarise(
         if any(sample.stage == k for sample in samples.rows)
     ]
     return {
-        "scene": scene.name,
-        "rigidmd_version": version("rigidmd"),
-        "numba_version": numba.__version__,
-        "machine": platform.processor() or platform.machine(),
-        "threads": threads,
-        "seed": scene.seed,
         "interrupted": interrupted,
         "molecules": len(system.model.species),
         "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),

@@ -21,6 +21,7 @@ from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
 from rigidmd.run.loop import Costs, Options, Simulation, Stretch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.provenance import plain
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import check_same_scene, state_from
 from rigidmd.scene import BodyScene
@@ -91,7 +92,7 @@ class BodySimulation(Simulation):
 
     def _memory(self) -> dict[str, Any]:
         return {
-            "scene": self.scene.model_dump(mode="json", exclude_none=True),
+            "scene": plain(self.scene),
             "stable": self._stable,
             "notes": self.notes,
         }

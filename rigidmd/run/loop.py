@@ -9,7 +9,6 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack, cast, overload
 
@@ -37,8 +36,9 @@ from rigidmd.output.report import write_summary
 from rigidmd.run.keeper import PIECE, Keeper
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Every, Observer
+from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import fitting
+from rigidmd.run.resuming import changed_since, fitting
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
@@ -214,6 +214,7 @@ class Simulation(Base):
             self._keeper = Keeper(self.folder, scene.output.checkpoint_minutes, self._deadline)
             stack.enter_context(self._asks_at_signals())
             self._warnings.clear()
+            self._inputs = input_digests(self.scene)
             self._reset()
             began = clock.perf_counter()
             if kept is None:
@@ -221,6 +222,9 @@ class Simulation(Base):
             else:
                 with fitting(self.folder):
                     self._recall(kept)
+                    changed = changed_since(kept.told["with"])
+                if changed is not None:
+                    self.note(changed)
                 self._say(f"going on from step {self.state.step[NOW]}")
             prepared = clock.perf_counter() - began
             observers = [*self._own_observers(), *self._observers]
@@ -248,7 +252,7 @@ class Simulation(Base):
             results = Results(self.system, self.state, self._samples())
             results.interrupted, results.signal = self._interrupted, self._signal
             results.out_of_time = self._out_of_time
-            results.summary = self._summary(results.samples, costs)
+            results.summary = provenance(self.scene, self.threads, self._inputs) | self._summary(results.samples, costs)
             for observer in observers:
                 observer.end(self, results)
             if self.folder is not None:
@@ -261,6 +265,7 @@ class Simulation(Base):
 
     system: "System | BodySystem"
     engine: Engine
+    threads: int
     stretch: Stretch  # the present one
     time_unit = ""
 
@@ -373,7 +378,7 @@ class Simulation(Base):
             arrays |= {f"{owner}/{name}": array for name, array in own.items()}
         arrays |= {f"state/{name}": array for name, array in self.state._asdict().items()}
         arrays |= {f"engine/{name}": array for name, array in memory.items()}
-        told = {"rigidmd": version("rigidmd"), "place": place._asdict(), "run": self._memory(), "of": of}
+        told = {"with": computed_with(), "place": place._asdict(), "run": self._memory(), "of": of}
         self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW])))
 
     def _run_stretches(
