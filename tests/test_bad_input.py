@@ -434,7 +434,7 @@ def test_sites_overlap_within_six_tenths_of_their_diameter(share, code, capsys, 
     (tmp_path / "two.xyz").write_text(f"2\n\nAr 5.0 5.0 5.0\nAr {5.0 + share * sigma:.9f} 5.0 5.0\n")
     (tmp_path / "two.toml").write_text(
         "box.lengths_A = 20.0\nforces.cutoff_A = 8.0\nstructure.file = 'two.xyz'\n"
-        "[[molecules]]\nmodel = 'argon'\n[[stages]]\nduration_ps = 0.01\n"
+        "start.temperature_K = 90.0\n[[molecules]]\nmodel = 'argon'\n[[stages]]\nduration_ps = 0.01\n"
     )
     assert main(["check", str(tmp_path / "two.toml")]) == code
     assert ("molecules 1 and 2 overlap" in capsys.readouterr().err) == (code == 2)
