@@ -36,14 +36,16 @@ def main(arguments: list[str] | None = None) -> int:
     Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a signal.
     """
     from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
+    from rigidmd.output.streams import checked_streams, open_streams
 
+    open_streams()
     options = _parser().parse_args(arguments)
 
     def show(message, category, *where, **more):
         _warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
 
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), checked_streams(lasting=options.writes):
             others, warnings.showwarning = warnings.showwarning, show
             return options.command(options)
     except SimulationError as error:
@@ -62,7 +64,6 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
-        sys.stderr.close()
         return 0
 
 
@@ -229,7 +230,7 @@ def _command(commands, name: str, function, about: str, example: str) -> argpars
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(command=function)
+    parser.set_defaults(command=function, writes=function in (_run, _resume, _precision, _stability))
     return parser
 
 

@@ -24,6 +24,7 @@ from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.provenance import plain
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import check_same_scene, state_from
+from rigidmd.run.signals import interruptible
 from rigidmd.scene import BodyScene
 from rigidmd.validation import settled
 
@@ -176,7 +177,8 @@ class BodySimulation(Simulation):
 
     def start_energy(self) -> dict:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""
-        self._prepare()
+        with interruptible():
+            self._prepare()
         load, _ = self.engine.evaluate(self.state)
         seen = motion(self.system, [Snapshot(0.0, self.state)])
         torque = load.torque_body @ self.system.axes.T

@@ -38,6 +38,7 @@ from rigidmd.run.provenance import plain
 from rigidmd.run.relief import Relief, relieve
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import check_same_scene, state_from
+from rigidmd.run.signals import interruptible
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
@@ -71,7 +72,8 @@ class MolecularSimulation(Simulation):
     def start(self) -> Relief | None:
         """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
         self._reset()
-        self._prepare()
+        with interruptible():
+            self._prepare()
         return self._relief
 
     def _reset(self) -> None:
