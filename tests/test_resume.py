@@ -1,13 +1,16 @@
 """Runs that are stopped and go on: to the same bits as one that never stopped."""
 
+import hashlib
 import json
 import os
+import platform
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +19,9 @@ from conftest import ROOT
 
 from rigidmd import cli
 from rigidmd.errors import CheckpointError
-from rigidmd.output.checkpoint import read_checkpoint
+from rigidmd.output.checkpoint import read_checkpoint, write_checkpoint
 from rigidmd.output.folder import CHECKPOINT, PREVIOUS, FolderLock
-from rigidmd.run import Simulation
+from rigidmd.run import Simulation, provenance
 from rigidmd.run.observers import Every
 from rigidmd.scene import Scene
 
@@ -227,6 +230,37 @@ def test_compare_tells_where_two_runs_part(again, stopped, tmp_path, capsys):
     assert [apart["column"] for apart in told["course"]["first"]] == ["Kinetic Energy (kJ/mole)"]
     assert cli.main(["compare", one, str(tmp_path)]) == 2
     assert "is not the folder of a run" in capsys.readouterr().err
+
+
+def test_the_summary_tells_what_a_run_was_made_with(stopped):
+    told = json.loads((stopped / "run" / "summary.json").read_text())
+    for package in ("numba", "llvmlite", "numpy"):
+        assert told[f"{package}_version"] == version(package)
+    assert (told["seed"], told["precision"], told["threads"], told["input_sha256"]) == (1, "double", 1, {})
+    assert "64bit" in told["processor_features"] or platform.machine() not in ("x86_64", "AMD64")
+    own = Scene.read(stopped / "run" / "scene.toml", {"threads": 2, "name": "other"})
+    assert provenance.scene_digest(own) == told["scene_sha256"]
+    assert provenance.scene_digest(own.model_copy(update={"seed": 2})) != told["scene_sha256"]
+
+
+def test_another_version_is_told(again, capsys):
+    kept = read_checkpoint(again / "run" / CHECKPOINT)
+    kept.told["with"]["numba_version"] = "0.1"
+    write_checkpoint(again / "run", kept)
+    assert cli.main(["resume", str(again / "run")]) == 0
+    assert "computed with numba 0.1 there, " in capsys.readouterr().err
+
+
+def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_path):
+    """Digests are those of the start, whatever happens to the files of a run that goes on."""
+    shutil.copy(stopped / "run" / "final.npz", tmp_path / "start.npz")
+    digest = hashlib.sha256((tmp_path / "start.npz").read_bytes()).hexdigest()
+    data = scene(NVT, structure={"file": "start.npz"}, box={})
+    data["molecules"] = [{"model": "spce"}]
+    away = Every(0.05, lambda moment: (tmp_path / "start.npz").unlink(missing_ok=True))
+    results = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "run", observers=away).run()
+    assert results.summary["input_sha256"] == {"structure.file": digest}
+    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).told["run"]["inputs"] == {"structure.file": digest}
 
 
 def test_another_scene_is_not_gone_on_with(again, capsys):
