@@ -201,12 +201,12 @@ class Simulation(Base):
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
         with contextlib.ExitStack() as stack:
-            kept, stays = None, False  # whether files of the folder stay
+            kept, stays = None, False
             if self.folder is not None:
                 stack.callback((lock := FolderLock(self.folder)).release)
                 lock.take()
-                kept = self._kept() if self._resume else None
-                stays = kept is not None or (self._resume and never_began(self.folder))
+                if self._resume:
+                    kept, stays = self._kept()
                 if not stays:
                     check_folder(self.folder, self._force, inputs)
             self._interrupted, self._signal, self._out_of_time = False, None, False
@@ -363,16 +363,16 @@ class Simulation(Base):
         kept = [name for name in (CHECKPOINT, PREVIOUS) if self.folder is not None and self.path(name).is_file()]
         return f". Make room and go on from the last checkpoint: rigidmd resume {self.folder}" if kept else ""
 
-    def _kept(self) -> Checkpoint | None:
-        """The checkpoint to go on from; None if there is no run yet."""
+    def _kept(self) -> tuple[Checkpoint | None, bool]:
+        """The checkpoint to go on from, None if the run has to begin, and whether the files of the folder stay."""
         folder = cast(Path, self.folder)
         if is_empty(folder) or never_began(folder):
             self._say(f"{folder} holds no run yet: beginning it")
-            return None
+            return None, not is_empty(folder)
         kept, faults = latest(folder)
         for fault in faults:
             self._warn(f"{fault}. The checkpoint before it is used")
-        return kept
+        return kept, True
 
     def _checkpoint(self, observers: list[Observer], place: "Place") -> None:
         """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
