@@ -12,7 +12,7 @@ from rigidmd.core.state import TAKEN, State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
-from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
 #: Figures of a stage that a minimisation does not have.
 OF_MOTION = (
@@ -27,6 +27,8 @@ OF_MOTION = (
 DRIFTS, DIFFER, SURE, LEAST = 0.1, 0.02, 5.0, 20
 #: Largest share of the translational temperature in a common drift of all molecules without a note.
 SHOWS = 1e-4
+#: Growth of the estimated error of Coulomb forces that is told.
+COARSER = 1.5
 
 
 def summarise(
@@ -88,6 +90,7 @@ def summarise(
         "notes": [
             *system.notes,
             *_drifting(system, state, samples.rows[-1]),
+            *box_notes(system, state),
             *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples.rows, k)),
             *warnings,
         ],
@@ -117,6 +120,22 @@ def _drifting(system: System, state: State, last: Sample) -> list[str]:
     return [
         f"the molecules drift together with |P| = {momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
         "run.remove_momentum_interval_ps removes the total momentum"
+    ]
+
+
+def box_notes(system: System, state: State) -> list[str]:
+    """A note if the box has grown or shrunk until waves or grid of the start no longer give the accuracy asked for."""
+    if system.force_error is None or not any(stage.changes_box for stage in system.scene.stages):
+        return []
+    from rigidmd.measure.accuracy import estimated_error  # SciPy is for such runs only
+
+    now = estimated_error(system, state.cell)
+    if now <= COARSER * system.force_error:
+        return []
+    before, after = (f"{error / COULOMB:.2g}" for error in (system.force_error, now))
+    return [
+        f"the box has changed, and with it the estimated error of Coulomb forces, from {before} to {after} e²/Å²: "
+        "alpha, waves and grid are those of the start. A run with structure.file = 'final.npz' chooses them anew"
     ]
 
 
