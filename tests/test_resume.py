@@ -393,16 +393,16 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     manual = (ROOT / "rigidmd" / "docs" / "manual.md").read_text()
     job = next(block for block in re.findall(r"```text\n(.*?)```", manual, re.DOTALL) if "#SBATCH" in block)
     (tmp_path / "job.sh").write_text(job.replace("3:55:00", "0:00:05"))
-    stub = tmp_path / "bin" / "sbatch"
-    stub.parent.mkdir()
-    stub.write_text('#!/bin/bash\necho job >> jobs\nexec bash "$1"\n')
-    stub.chmod(0o755)
+    (tmp_path / "bin").mkdir()
+    commands = {"sbatch": 'echo job >> jobs; exec bash "$1"', "rigidmd": f'exec {sys.executable} -m rigidmd "$@"'}
+    for name, line in commands.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/bash\n{line}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
     scene = (stopped / "water.toml").read_text().replace("duration_ps = 0.1", "duration_ps = 12.0")
     (tmp_path / "water.toml").write_text(scene)
-    path = os.pathsep.join([str(stub.parent), str(Path(sys.executable).parent), os.environ["PATH"]])
-    subprocess.run(
-        ["bash", "job.sh"], cwd=tmp_path, env=os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}, check=True
-    )
+    path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}
+    subprocess.run(["bash", "job.sh"], cwd=tmp_path, env=environment, check=True)
     assert len((tmp_path / "jobs").read_text().splitlines()) >= 2
     assert cli.main(["run", str(tmp_path / "water.toml"), "-o", str(tmp_path / "whole")]) == 0
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "runs" / "water")
