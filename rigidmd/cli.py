@@ -37,6 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
     """
     from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
 
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a letter that the terminal does not have must not end a run
+            stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(arguments)
 
     def show(message, category, *where, **more):
@@ -251,8 +254,8 @@ def _walltime(text: str) -> float:
     found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
-    days, hours, minutes, seconds = (int(part or 0) for part in found.groups())
-    return 86400.0 * days + 3600.0 * hours + 60.0 * minutes + seconds
+    days, hours, minutes, seconds = (float(part or 0) for part in found.groups())
+    return 86400 * days + 3600 * hours + 60 * minutes + seconds
 
 
 def _until(text: str) -> float:
@@ -352,7 +355,9 @@ def _say(sentence: str) -> None:
 
 
 def _warn(sentence: str) -> None:
-    print(f"rigidmd: warning: {sentence}", file=sys.stderr)
+    from rigidmd.errors import visible
+
+    print(f"rigidmd: warning: {visible(sentence)}", file=sys.stderr)
 
 
 def _energy(options: argparse.Namespace) -> int:
