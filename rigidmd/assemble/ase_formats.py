@@ -48,7 +48,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
     if names is not None and len(names) != len(atoms):
         raise StructureError(str(path), [f"has {len(names)} atoms, of which ASE reads {len(atoms)}"])
     shares = {(e, s) for site in (atoms.info.get("occupancy") or {}).values() for e, s in site.items()}
-    if untold := sorted({str(s) for _, s in shares if not isinstance(s, int | float) or not 0 <= s}):
+    if untold := sorted({str(s) for _, s in shares if not (isinstance(s, int | float) and s >= 0)}):
         raise StructureError(str(path), [f"says of some of its sites that they are occupied by {', '.join(untold)}"])
     if shares := sorted(f"{e} {s:g}" for e, s in shares if s < 1):
         raise StructureError(

@@ -24,9 +24,7 @@ def promised_atoms(path: Path, line: int, text: str, there: int) -> int:
     if count is None:
         raise StructureError(str(path), [f"line {line}: expected the number of atoms, found {text[:60]!r}"])
     if count > there:
-        raise StructureError(
-            str(path), [f"line {line} promises {count} atoms, {max(0, there)} are there: truncated?"]
-        )
+        raise StructureError(str(path), [f"line {line} promises {count} atoms, {max(0, there)} are there: truncated?"])
     return count
 
 

@@ -14,7 +14,10 @@ def free_memory() -> float:
     Infinite where the system does not tell.
     """
     free = _number_in("/proc/meminfo", "MemAvailable:") * 1024
-    for limit, used in (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")):
+    for limit, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
         free = min(free, _number_in(f"/sys/fs/cgroup/{limit}") - min(_number_in(f"/sys/fs/cgroup/{used}"), 1e18))
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     if soft != resource.RLIM_INFINITY:

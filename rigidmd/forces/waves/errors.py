@@ -17,6 +17,8 @@ FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
 PROXY = 32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
 ORDERS = (4, 5, 6, 7, 8)
 SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
+#: Along an edge: an edge of 0.1 mm has not more.
+MOST_POINTS = 2**16
 
 
 class Charges(NamedTuple):
@@ -158,7 +160,8 @@ def mesh_for(
     order, grid : fixed, if given
     """
     edges = np.linalg.norm(cell, axis=1)
-    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in SPACINGS] if grid is None else [grid]
+    sensible = SPACINGS[edges.max() / SPACINGS <= MOST_POINTS]
+    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
     best = None
     for p in ORDERS if order is None else (order,):
         low, high = 0, len(grids)
