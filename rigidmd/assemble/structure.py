@@ -176,6 +176,8 @@ def _read_molecules(
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
         raise StructureError(str(path), faults)
+    if len(matched.species) == 0:
+        raise StructureError(str(path), ["holds no atoms with mass, so no molecules"])
     notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]
