@@ -154,9 +154,9 @@ def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
     table: list = []
     counts: dict[tuple, int] = {}  # of tables in lists, by their path with the numbers of lists around them
     for number, line in enumerate(text.split("\n"), 1):
-        if header := re.match(r"\s*(\[\[?)\s*([\w.\"-]+)\s*\]", line):
+        if header := re.match(r"\s*(\[\[?)\s*([\w.\"'-]+)\s*\]", line):
             table = []
-            parts = header[2].split(".")
+            parts = _parts(header[2])
             for depth, part in enumerate(parts, 1):
                 table.append(part)
                 here = tuple(table)
@@ -165,5 +165,10 @@ def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
                 if here in counts:
                     table.append(counts[here])
             yield number, table, []
-        elif entry := re.match(r"\s*([\w.\"-]+)\s*=", line):
-            yield number, table, entry[1].split(".")
+        elif entry := re.match(r"\s*([\w.\"'-]+)\s*=", line):
+            yield number, table, _parts(entry[1])
+
+
+def _parts(key: str) -> list[str]:
+    """The parts of a dotted key without quotes. A dot in quotes divides too: what it names has no line then."""
+    return [part.strip("\"'") for part in key.split(".")]

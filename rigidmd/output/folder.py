@@ -22,8 +22,8 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
     """Raise OutputError if a run could not be written there, or would remove one of its inputs; changes nothing."""
     try:
         exists = folder.exists()
-    except (OSError, ValueError) as error:  # a name that is too long, a zero byte
-        raise OutputError(f"{cut(str(folder))} cannot be written: {getattr(error, 'strerror', error)}") from None
+    except OSError as error:  # a name that is too long
+        raise OutputError(f"{cut(str(folder))} cannot be written: {error.strerror}") from None
     if exists:
         if not folder.is_dir():
             raise OutputError(f"{folder} is a file; name another folder with -o")
