@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
+from scipy.spatial import KDTree
 
 from rigidmd.core.toml_text import impossible_values, read_toml
 from rigidmd.errors import MoleculeError
@@ -28,6 +29,8 @@ MODELS = Path(__file__).parent / "models"
 #: Absolute values of the numbers of molecules, in Å, u, e, kJ/mol, ps, unless they are 0: products of a few are finite.
 SIZES = (1e-30, 1e30)
 
+#: Of one rigid molecule.
+MOST_SITES = 5000
 #: Two sites closer than this fraction of the molecule's size count as coinciding.
 SAME_PLACE = 1e-6
 #: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
@@ -223,6 +226,8 @@ def molecule(
     faults = [
         f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
     ]
+    if len(sites) > MOST_SITES:
+        faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
     masses = np.array([s.mass_u for s in sites])
@@ -232,10 +237,8 @@ def molecule(
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
     frame = principal_frame(masses, positions, size)
     body = (positions - frame.centre) @ frame.axes
-    for i in range(len(sites)):
-        for j in range(i):
-            if np.linalg.norm(body[i] - body[j]) <= SAME_PLACE * size:
-                faults.append(f"sites {sites[j].name} and {sites[i].name} coincide")  # noqa: PERF401
+    near = KDTree(body).query_pairs(SAME_PLACE * size, output_type="ndarray")
+    faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
     if frame.kind == "point" and not faults:
         off = np.linalg.norm(body, axis=1)
         faults += [

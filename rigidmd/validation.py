@@ -21,6 +21,9 @@ Vector = tuple[Number, Number, Number]
 
 T = TypeVar("T")
 
+#: Tables in a list of tables. Scenes have a handful.
+MOST_TABLES = 1000
+
 #: With more similar names than this, no suggestion is made from a common beginning or end.
 MOST_MEANT = 8
 #: Names longer than this, and more of them, are compared with no others: that would take long and say nothing.

@@ -9,6 +9,7 @@ from math import inf, pi, prod, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from rigidmd.assemble.cells import basis_in_words, edges_in_words
 from rigidmd.core.schemes import RK4, SOLVERS
@@ -138,7 +139,7 @@ def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list
             f"{half:.3f} Å: a site would meet two images of another. Take a larger box or a shorter cut-off"
         )
     for m in facts.species:
-        extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
+        extent = pdist(m.positions_body).max(initial=0.0)
         if extent > half:
             faults.append(
                 f"a molecule of {m.name} is {extent:.2f} Å long, more than half {least} of the box, {half:.3f} Å"

@@ -34,7 +34,7 @@ from rigidmd.scene.actions import (
 )
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.watch import BodyWatch
-from rigidmd.validation import Flag, Number, Positive, Section, Vector, place
+from rigidmd.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, place
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -349,11 +349,11 @@ class BodyScene(Scene):
     body: BodyTable
     start: BodyStart = BodyStart()
     gravity: Gravity | None = None
-    applied: tuple[Applied, ...] = ()
+    applied: tuple[Applied, ...] = Field(default=(), max_length=MOST_TABLES)
     friction: Friction | None = None
     fluid: Fluid | None = None
     frame: Frame | None = None
-    wheels: tuple[Wheel, ...] = ()
+    wheels: tuple[Wheel, ...] = Field(default=(), max_length=MOST_TABLES)
     changing_inertia: ChangingInertia | None = None
     run: Run
     output: BodyOutput = BodyOutput()

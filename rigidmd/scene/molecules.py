@@ -15,7 +15,7 @@ from rigidmd.scene.place import Box, Start, Structure
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.watch import Watch
-from rigidmd.validation import Count, Flag, Section
+from rigidmd.validation import MOST_TABLES, Count, Flag, Section
 
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc")
@@ -91,11 +91,11 @@ class MolecularScene(Scene):
     """Number of threads; default: all cores. Results do not depend on it"""
     structure: Structure | None = None
     box: Box = Box()
-    molecules: tuple[Molecules, ...] = Field(min_length=1)
+    molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)
     forces: Forces = Forces()
     fields: Fields = Fields()
     start: Start = Start()
-    stages: tuple[Stage, ...] = Field(min_length=1)
+    stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
     run: Throughout = Throughout()
     output: Output = Output()
     watch: Watch = Watch()
