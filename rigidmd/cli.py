@@ -1,6 +1,7 @@
 """The commands. They print and never compute. Each imports what it needs only when it runs."""
 
 import argparse
+import io
 import json
 import re
 import shlex
@@ -38,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
 
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a letter that the terminal does not have must not end a run
+        if isinstance(stream, io.TextIOWrapper):  # a letter that the terminal does not have must not end a run
             stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(arguments)
 
@@ -59,10 +60,10 @@ def main(arguments: list[str] | None = None) -> int:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
     except MemoryError:
-        print(
-            f"rigidmd: {options.scene}: not enough memory; take fewer molecules or samples",
-            file=sys.stderr,
-        )
+        from rigidmd.core.memory import free_memory, in_words
+
+        what, free = getattr(options, "scene", "this"), in_words(free_memory())
+        print(f"rigidmd: {what}: not enough memory ({free} free); take fewer molecules or samples", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         sys.stderr.close()

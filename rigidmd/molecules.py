@@ -318,9 +318,13 @@ def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
     return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)
 
 
-@cache
-def available_models() -> tuple[str, ...]:
+def available_models() -> list[str]:
     """Names of the shipped models."""
+    return list(_shipped())
+
+
+@cache
+def _shipped() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in MODELS.glob("*.toml")))
 
 

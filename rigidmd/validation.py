@@ -82,7 +82,8 @@ def numbers_beyond(data: Any, least: float, largest: float) -> list[tuple[list, 
             inner = value.items() if isinstance(value, dict) else enumerate(value)
             rest += [([*keys, key], part) for key, part in inner]
         elif isinstance(value, float) and value != 0 and not least <= abs(value) <= largest and isfinite(value):
-            found.append((keys, f"is {value:g}, must be 0 or between {least:g} and {largest:g}"))
+            bounds = f"{least:g} and {largest:g}".replace("e+", "e")
+            found.append((keys, f"is {value:g}, must be 0 or between {bounds}"))
     return found[::-1]
 
 

@@ -12,12 +12,16 @@ import numpy as np
 
 from rigidmd.core.memory import free_memory, in_words, memory_fault
 from rigidmd.errors import SceneError
+from rigidmd.scene import BodyScene
+from rigidmd.validation import settled
 
 if TYPE_CHECKING:
     from rigidmd.assemble.system import System
 
 #: Bytes that a system takes while it is built; measured: 310 of argon, 500 of nitrogen, 640 of SPC/E, 690 of TIP4P.
 FOR_MOLECULE, FOR_SITE = 200, 130
+#: Of a body; measured: a snapshot of its state 1.6 kB, its columns and their text at the end 1 kB.
+FOR_SAMPLE = 2600
 FEWER = "take fewer molecules, a smaller box or a shorter cut-off"
 
 
@@ -26,6 +30,14 @@ def check_molecules(source: str, molecules: int, sites: int) -> None:
     needed = FOR_MOLECULE * molecules + FOR_SITE * sites
     if fault := memory_fault(needed, f"a system of {molecules} molecules with {sites} sites"):
         raise SceneError(source, [f"not enough memory: {fault}: take fewer molecules"])
+
+
+def check_samples(scene: BodyScene) -> None:
+    """Raise SceneError if there is no room for the samples of a resolved scene of a body."""
+    run, interval = scene.run, settled(scene.output.interval_s)
+    samples = run.duration_s / (interval if run.is_open else max(interval, run.timestep_s))
+    if fault := memory_fault(FOR_SAMPLE * samples, f"a run with {samples:.3g} samples"):
+        raise SceneError(scene.source, [f"not enough memory: {fault}: lengthen output.interval_s"])
 
 
 def check_room(system: "System") -> None:

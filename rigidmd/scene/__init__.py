@@ -22,7 +22,7 @@ def schema() -> dict[str, Any]:
         (kind, "validation") for kind in (BodyScene, MolecularScene)
     ]
     _, found = models_json_schema(scenes, schema_generator=_TomlSchema)
-    found["$defs"]["Molecules"]["properties"]["model"]["enum"] = list(available_models())
+    found["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "A scene of rigidmd",
