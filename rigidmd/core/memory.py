@@ -1,6 +1,6 @@
 """How much memory this process may still take, and sentences for what needs more."""
 
-import resource
+import importlib
 from math import inf
 from pathlib import Path
 
@@ -19,10 +19,7 @@ def free_memory() -> float:
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
     ):
         free = min(free, _number_in(f"/sys/fs/cgroup/{limit}") - min(_number_in(f"/sys/fs/cgroup/{used}"), 1e18))
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if soft != resource.RLIM_INFINITY:
-        free = min(free, soft - 1024 * _number_in("/proc/self/status", "VmSize:"))
-    return max(free, 0.0)
+    return max(0.0, min(free, _limit() - 1024 * _number_in("/proc/self/status", "VmSize:", 0.0)))
 
 
 def memory_fault(needed: float, what: str) -> str:
@@ -38,10 +35,20 @@ def in_words(size: float) -> str:
     return f"{size / 1e9:.3g} GB"
 
 
-def _number_in(file: str, label: str = "") -> float:
-    """The number after a label in a file of the system; infinite if there is none."""
+def _limit() -> float:
+    """Bytes that this process may have in all."""
+    try:
+        resource = importlib.import_module("resource")  # not on Windows
+    except ImportError:
+        return inf
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return inf if soft == resource.RLIM_INFINITY else float(soft)
+
+
+def _number_in(file: str, label: str = "", absent: float = inf) -> float:
+    """The number after a label in a file of the system; `absent` if there is none."""
     try:
         words = Path(file).read_text(encoding="ascii", errors="replace").split()
         return float(words[words.index(label) + 1 if label else 0])
     except (OSError, ValueError, IndexError):
-        return inf
+        return absent
