@@ -70,7 +70,7 @@ def keys_of(scene: Mapping[str, Any], apart: Iterable[str]) -> dict[str, Any]:
 
 def differences(first: Mapping[str, Any], second: Mapping[str, Any], left_out: Any = "left out") -> dict[str, tuple]:
     """Key -> both values, where two dictionaries differ."""
-    pairs = {key: (first.get(key, left_out), second.get(key, left_out)) for key in first | second}
+    pairs = {key: (first.get(key, left_out), second.get(key, left_out)) for key in {**first, **second}}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 

@@ -72,11 +72,10 @@ class Comparison:
 
     def told(self) -> dict[str, Any]:
         """As JSON has it."""
-        told = asdict(self) | {"same": self.same}
-        if self.course is not None:
-            for key in ("first", "last"):
-                told["course"][key] = [apart._asdict() for apart in getattr(self.course, key)]
-        return told
+        course = self.course and asdict(self.course) | {
+            key: [apart._asdict() for apart in getattr(self.course, key)] for key in ("first", "last")
+        }
+        return asdict(self) | {"same": self.same, "course": course}
 
 
 def compare(first: Path, second: Path) -> Comparison:
@@ -90,7 +89,8 @@ def compare(first: Path, second: Path) -> Comparison:
         found.scene = differences(*(keys_of(scene, ("name", "threads")) for scene in scenes))
     summaries = [_read(folder / SUMMARY, found, json.loads) for folder in (first, second)]
     if None not in summaries:
-        found.made = differences(*(_made(summary) for summary in summaries), "not told")
+        one, other = (_made(summary) for summary in summaries)
+        found.made = differences(one, other, "not told")
     for name in (LOG, MOTION):
         if any((folder / name).exists() for folder in (first, second)):
             tables = [_read(folder / name, found, _table) for folder in (first, second)]
