@@ -6,9 +6,12 @@ import re
 import shlex
 import sys
 import warnings
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from rigidmd.looking.commands import add_commands
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
@@ -175,6 +178,8 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/stability)")
     stability.add_argument("--force", action="store_true", help="replace earlier results in that folder")
     stability.set_defaults(scene="stability")
+
+    add_commands(partial(_command, commands))
 
     models = _command(
         commands,

@@ -22,6 +22,7 @@ ROOMS = [
     ("shipped",),
     ("run",),
     ("study",),
+    ("looking",),
     ("cli", "__main__"),
 ]
 RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
@@ -36,7 +37,8 @@ LIBRARIES = {
     "rocket_fft": {"forces/waves/mesh.py"},
     "matplotlib": {
         "output/figure.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
-        "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py",
+        "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
+        "looking/film.py",
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
     "numba": {

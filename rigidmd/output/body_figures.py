@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.output.figure import save_figure
-from rigidmd.output.report import COOL, FAINT, INK, WARM
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, thin_series
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
@@ -261,7 +260,7 @@ def _draw_series(figure, cells, time, series, labels, least: float, shown: float
         low, high = values.min(), values.max()
         moves = high - low > least
         dense = moves and np.abs(np.diff(values)).sum() > 300 * (high - low)
-        panel.plot(*_thin_series(time, values), color=color, lw=0.9, alpha=0.5 if dense else 1.0)
+        panel.plot(*thin_series(time, values), color=color, lw=0.9, alpha=0.5 if dense else 1.0)
         margin = 0.06 * (high - low) if moves else shown / 2
         panel.set(ylim=(low - margin, high + margin), ylabel=label, xmargin=0)
         panel.tick_params(labelbottom=row == len(labels) - 1)
@@ -347,17 +346,6 @@ def _plan(flat: np.ndarray, half) -> tuple[np.ndarray, dict]:
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).cumsum()])
     shown = np.flatnonzero(np.diff(np.floor(800 * way), prepend=-1.0) > 0)
     return shown, {"lw": max(0.25, 1.7 / (1 + way[-1] / 60)), "rasterized": len(shown) > MOST_POINTS}
-
-
-def _thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:
-    """A long series reduced to the lowest and highest value of each of its parts; its curve looks the same."""
-    size = len(time) // bins
-    if size < 4:
-        return time, values
-    starts = np.arange(0, len(time) // size * size, size)
-    parts = values[: len(starts) * size].reshape(-1, size)
-    kept = np.unique(np.concatenate([starts + parts.argmin(1), starts + parts.argmax(1), [0, len(time) - 1]]))
-    return time[kept], values[kept]
 
 
 def _range(degrees: np.ndarray) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.trials import Precision, Trial
-from rigidmd.output.figure import curve_style, save_figure
-from rigidmd.output.report import FAINT, INK, signed
+from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
+from rigidmd.output.report import signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
 #: Shorter titles, so that the table fits a terminal.

@@ -10,10 +10,8 @@ import numpy as np
 from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
-from rigidmd.output.figure import save_figure
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure
 from rigidmd.scene.stage import Stage
-
-INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 POSITIONS = {

@@ -12,8 +12,7 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
-from rigidmd.output.figure import save_figure
-from rigidmd.output.report import COOL, FAINT, INK, WARM
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")

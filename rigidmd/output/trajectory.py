@@ -3,12 +3,13 @@
 import contextlib
 import os
 import struct
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
@@ -26,7 +27,7 @@ from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.system import System
 from rigidmd.core.files import AppendedFile, whole_file
 from rigidmd.core.state import State
-from rigidmd.errors import SimulationError
+from rigidmd.errors import OutputError, SimulationError
 from rigidmd.output.frame import Frame
 
 #: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
@@ -103,6 +104,70 @@ def _checked(times: list[float]) -> list[float]:
             stacklevel=4,
         )
     return times
+
+
+class Frames(NamedTuple):
+    """Frames of a trajectory: times (f,) ps, positions (f, s, 3) Å, and cells (f, 3, 3), None without a box.
+
+    stride : which frames of the file these are: every one, every second, ...
+    is_cut : whether the file ends within a frame
+    """
+
+    time: np.ndarray
+    positions: np.ndarray
+    cells: np.ndarray | None
+    count: int  # frames in the file
+    stride: int
+    is_cut: bool
+
+
+def read_frames(path: Path, sites: int, most: int) -> Frames:
+    """At most so many evenly spaced frames of a trajectory. A last frame that is cut off is left out.
+
+    Raises OutputError if the file cannot be read, or holds another number of sites.
+    """
+    fault = ""
+    with _quiet():
+        try:
+            return _frames(path, sites, most)
+        except (OSError, EOFError, ValueError, TypeError, IndexError, StopIteration) as error:
+            fault = " ".join(str(error).split())
+    raise OutputError(f"{path} cannot be read as a trajectory: {fault}")
+
+
+def _frames(path: Path, sites: int, most: int) -> Frames:
+    reader = mda.coordinates.core.reader(str(path), format="NCDF" if path.suffix == ".nc" else path.suffix[1:])
+    with contextlib.closing(reader):
+        if reader.n_atoms != sites:
+            raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
+        count, is_cut = reader.n_frames, False
+        stride = max(1, -(-count // most))
+        times, positions, boxes = [], [], []
+        for k in range(0, count, stride):
+            try:
+                frame = reader[k]
+            except (OSError, EOFError, ValueError):
+                is_cut = True
+                break
+            times.append(frame.time)
+            positions.append(frame.positions.copy())
+            boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
+    if not times:
+        raise OutputError(f"{path} holds no whole frame")
+    boxed = all(box is not None for box in boxes)
+    return Frames(np.array(times), np.array(positions), np.array(boxes) if boxed else None, count, stride, is_cut)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the warnings of readers, and what one that could not open its file says when it is removed."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        sys.unraisablehook = hook
 
 
 class _Timed(ProtoReader):

@@ -1,0 +1,133 @@
+"""What the folder of a run holds: its scene, its summary, and the columns of its log or motion."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidmd.assemble.body import BodySystem, build_body
+from rigidmd.assemble.system import System, build
+from rigidmd.core.state import State
+from rigidmd.errors import CheckpointError, OutputError
+from rigidmd.measure import samples
+from rigidmd.measure.motion import Snapshot, motion
+from rigidmd.output.checkpoint import latest
+from rigidmd.output.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
+from rigidmd.scene import BodyScene, MolecularScene, Scene
+
+#: Name of a column -> its header in log.csv, and back.
+HEADERS = {column.header: name for name, column in samples.COLUMNS.items() if column.header}
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run as its folder tells it.
+
+    summary : None of a run that did not end
+    columns : (t,) each; of molecules by the names of `results[...]`, of a body by those of motion.csv
+    missing : sentences about what is not there, and why
+    """
+
+    folder: Path
+    scene: MolecularScene | BodyScene
+    system: System | BodySystem
+    summary: dict[str, Any] | None
+    columns: dict[str, np.ndarray]
+    missing: list[str]
+
+    @property
+    def is_body(self) -> bool:
+        """Whether it is a single body."""
+        return isinstance(self.scene, BodyScene)
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the samples, ps for molecules, s for a body."""
+        return self.columns["t" if self.is_body else "time"]
+
+    @property
+    def time_unit(self) -> str:
+        """Of `time`."""
+        return "s" if self.is_body else "ps"
+
+
+def read_record(folder: Path) -> Record:
+    """Read the folder of a run, ended or not. Raises OutputError if it is none, or holds nothing to look at."""
+    check_is_run(folder)
+    scene = Scene.read(folder / SCENE)
+    summary, missing = _summary(folder)
+    if isinstance(scene, BodyScene):
+        system = build_body(scene)
+        columns = _motion(folder, system, missing)
+    else:
+        system = build(scene)
+        columns = _log(folder)
+    if not columns or len(next(iter(columns.values()))) == 0:
+        raise OutputError(f"{folder}: the run wrote no samples yet; `rigidmd resume {folder}` goes on with it")
+    return Record(folder, scene, system, summary, columns, missing)
+
+
+def _summary(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
+    path = folder / SUMMARY
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None, [
+            f"This run has not ended: there is no {SUMMARY}. What follows is what it wrote so far; "
+            f"`rigidmd resume {folder}` goes on with it."
+        ]
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from None
+    ended = "This run was interrupted; what follows is what it wrote so far."
+    return found, [ended] if found.get("interrupted") else []
+
+
+def _log(folder: Path) -> dict[str, np.ndarray]:
+    """Columns of log.csv; a last line that is cut off is left out."""
+    path = folder / LOG
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            head, *lines = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeDecodeError) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from None
+    lines = [line for line in lines if len(line) == len(head)]
+    found = {}
+    for k, header in enumerate(head):
+        if (name := HEADERS.get(header)) is None:
+            continue
+        cells = [line[k] for line in lines]
+        try:
+            found[name] = np.array(cells) if name == "stage_name" else np.array([float(x or "nan") for x in cells])
+        except ValueError:
+            raise OutputError(f"{path}: column {header!r} holds what is no number") from None
+    if "time" not in found:
+        raise OutputError(f"{path} is no log of rigidmd: it has no column 'Time (ps)'")
+    return found
+
+
+def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
+    """Columns of motion.csv; of a run that did not write it, those of its last checkpoint."""
+    path = folder / MOTION
+    if path.is_file():
+        try:
+            table = np.genfromtxt(path, delimiter=",", names=True, invalid_raise=False, ndmin=1)
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{path} cannot be read: {error}") from None
+        if not table.dtype.names or "t" not in table.dtype.names:
+            raise OutputError(f"{path} is no motion of rigidmd: it has no column 't'")
+        return {name: table[name] for name in table.dtype.names}
+    try:
+        kept, _ = latest(folder)
+    except CheckpointError:
+        return {}
+    for owner in kept.told.get("of", {}):
+        part = kept.of(owner).arrays
+        if "t" in part and set(State._fields) <= set(part):
+            states = zip(*(part[name] for name in State._fields), strict=True)
+            snapshots = [Snapshot(t, State(*state)) for t, state in zip(part["t"].tolist(), states, strict=True)]
+            missing.append(f"{MOTION} is written at the end; the motion shown is that of the last checkpoint.")
+            return motion(system, snapshots).columns
+    return {}
