@@ -6,11 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from conftest import ROOT
 from matplotlib.image import imread
+from PIL import Image, ImageSequence
 
 from rigidmd import Scene, Simulation, cli
 from rigidmd.assemble.body import build_body
@@ -173,7 +175,67 @@ def test_a_film_of_a_thousand_frames_of_water(tmp_path):
     assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 0.2).mean() > 0.02
 
 
-@pytest.mark.parametrize("command", ["report", "view"])
+def frames_in(path):
+    """The frames of a .gif (f, h, w, 3), 0 to 1."""
+    with Image.open(path) as film:
+        return np.array([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]) / 255
+
+
+@pytest.mark.parametrize("kind", ["top", "water"])
+def test_a_film_moves(kind, request, tmp_path, capsys):
+    path = tmp_path / "film.gif"
+    plots = ["--plots"] if kind == "water" else []
+    assert cli.main(["film", str(request.getfixturevalue(kind)), "-o", str(path), "--seconds", "0.3", *plots]) == 0
+    seen = frames_in(path)
+    assert len(seen) == 4
+    picture = seen[:, 80:, : seen.shape[1]]  # below the clock
+    ink = (picture < 0.9).any(axis=-1)
+    assert 0.02 < ink.mean() < 0.9
+    for one, other in pairwise(picture):
+        assert (np.abs(one - other).max(axis=-1) > 0.2).mean() > 1e-3
+    if plots:
+        beside = seen[:, :, int(seen.shape[2] / 1.7) :]
+        red = (beside[..., 0] > beside[..., 2] + 0.2).mean(axis=1)
+        places = red.argmax(axis=1)  # a red line in each plot, which moves to the right
+        assert red.max(axis=1).min() > 0.3
+        assert np.all(np.diff(places) > 5)
+    assert "0.3 s of film" in capsys.readouterr().out
+
+
+def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
+    from rigidmd.looking import film
+
+    monkeypatch.setattr(film.shutil, "which", lambda name: None)
+    assert film.default_name() == "film.gif"
+    assert cli.main(["film", str(top), "-o", str(tmp_path / "film.mp4")]) == 2
+    assert "needs ffmpeg" in capsys.readouterr().err
+    assert cli.main(["film", str(top), "-o", str(tmp_path / "film.avi")]) == 2
+    assert "ends in .mp4 or .gif" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not shutil.which("ffmpeg"), reason="ffmpeg is not installed: .mp4 is not tested")
+def test_a_film_as_mp4(top, tmp_path):
+    path = tmp_path / "top.mp4"
+    assert cli.main(["film", str(top), "-o", str(path), "--seconds", "0.2"]) == 0
+    assert path.read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
+    from rigidmd.looking.body_film import body_film
+    from rigidmd.looking.film import _loop
+
+    record = read_record(top)
+    film = body_film(record)
+    half = np.pi * film.time / 0.13  # half the angle of a turn in 0.13 s, about z
+    turning = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
+    still = {name: np.tile(values[0], (len(values), 1)) for name, values in film.vectors.items()}
+    end, told = _loop(record, film._replace(quaternion=turning, vectors=still))
+    assert end == pytest.approx(0.39, abs=1e-9)
+    assert "returns to its start at 0.39 s" in told[0]
+    assert _loop(record, film) == (0.5, [])  # this top has fallen and risen, but turned elsewhere
+
+
+@pytest.mark.parametrize("command", ["report", "view", "film"])
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
@@ -194,9 +256,10 @@ def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
         shutil.copytree(water, folder)
         log = folder / "log.csv"
         log.unlink() if fault == "no log" else log.write_text(log.read_text().splitlines()[0] + "\n")
-    assert cli.main([command, str(folder), "-o", str(tmp_path / "page.html")]) == 2
+    path = tmp_path / ("film.gif" if command == "film" else "page.html")
+    assert cli.main([command, str(folder), "-o", str(path)]) == 2
     assert said in capsys.readouterr().err
-    assert not (tmp_path / "page.html").exists()
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("fault", ["missing", "other atoms", "other shapes", "noise", "empty"])

@@ -39,6 +39,8 @@ class BodyFilm(NamedTuple):
     gravity: np.ndarray | None  # (3,)
     centre: np.ndarray  # (3,) centre of mass in the body's axes
     unit: float  # m
+    axis: np.ndarray  # (3,) the body axis whose path is drawn
+    azimuth: float  # of the eye, rad
     told: list[str]  # what was thinned out or enlarged
 
 
@@ -93,6 +95,8 @@ def body_film(record: Record) -> BodyFilm:
         gravity=down,
         centre=system.centre * enlarged / unit,
         unit=unit,
+        axis=drawn_axis(system),
+        azimuth=float(np.arctan2(path[0, 1], path[0, 0])) - 0.6 if np.hypot(*path[0, :2]) > 1e-9 else 0.6,
         told=told,
     )
 

@@ -1,4 +1,4 @@
-"""The commands that look at a run: `report`, `view`. They print and never compute."""
+"""The commands that look at a run: `report`, `view`, `film`. They print and never compute."""
 
 import argparse
 import shlex
@@ -22,6 +22,10 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "rigidmd view runs/water -o water.html",
     )
     _run_arguments(view, "page (default: view.html in the folder of the run)")
+    film = add("film", _film, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots")
+    _run_arguments(film, ".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)")
+    film.add_argument("--seconds", type=_seconds, default=10.0, metavar="S", help="length of the film (default: 10)")
+    film.add_argument("--plots", action="store_true", help="put plots with a moving cursor beside it")
 
 
 def _run_arguments(parser: argparse.ArgumentParser, about: str) -> None:
@@ -29,6 +33,17 @@ def _run_arguments(parser: argparse.ArgumentParser, about: str) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help=about)
     parser.add_argument("--force", action="store_true", help="replace that file")
     parser.set_defaults(scene="this run")
+
+
+def _seconds(text: str) -> float:
+    """A length of a film."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.1 <= value <= 3600:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds from 0.1 to 3600")
+    return value
 
 
 def _target(options: argparse.Namespace, default: str, endings: tuple[str, ...]) -> Path:
@@ -61,6 +76,23 @@ def _view(options: argparse.Namespace) -> int:
 
     path, told = write_view(Path(options.folder), _target(options, VIEW, (".html",)))
     _written(path, told)
+    return 0
+
+
+def _film(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from rigidmd.looking.film import ENDINGS, check_writer, default_name, write_film
+
+    path = _target(options, default_name(), ENDINGS)
+    check_writer(path)
+    with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
+        path, told = write_film(
+            Path(options.folder), path, options.seconds, options.plots, lambda share: bar.update(share - bar.n)
+        )
+    for sentence in told:
+        print(sentence)
+    print(f"{path}: {path.stat().st_size / 1e6:.2g} MB")
     return 0
 
 

@@ -13,7 +13,6 @@ from rigidmd.core.files import whole_file
 from rigidmd.looking import plots, report
 from rigidmd.looking.body_film import BodyFilm, body_film
 from rigidmd.looking.record import Record, read_record
-from rigidmd.measure.motion import drawn_axis
 from rigidmd.output.page import items, page
 
 VIEW = "view.html"
@@ -72,8 +71,6 @@ def stage(picture: str, beneath: str, record: Record, told: list[str]) -> str:
 
 
 def _body(record: Record, film: BodyFilm) -> list[str]:
-    axis = drawn_axis(record.system)
-    start = film.path[0]
     flat = partial(packed, kind="<f4")
     data = {
         "time": packed(film.time, "<f8"),
@@ -88,11 +85,11 @@ def _body(record: Record, film: BodyFilm) -> list[str]:
         "faces": film.mesh.faces,
         "painted": film.mesh.painted,
         "sphere": film.sphere,
-        "axis": axis.tolist(),
+        "axis": film.axis.tolist(),
         "centre": film.centre.tolist(),
         "pinned": not record.system.flies,
         "unit": film.unit,
-        "azimuth": float(np.arctan2(start[1], start[0])) - 0.6 if np.hypot(*start[:2]) > 1e-9 else 0.6,
+        "azimuth": film.azimuth,
     }
     colours = {"L": ("#7a5ca3", "angular momentum L"), "ω": ("#b8862d", "angular velocity ω")}
     legend = "".join(

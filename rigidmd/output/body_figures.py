@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, thin_series
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle, save_figure, thin_series
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
@@ -75,23 +75,23 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     azimuth, lift = np.arctan2(path[0, 1], path[0, 0]) - np.radians(25), side * np.radians(25)
     eye = np.array([np.cos(azimuth) * np.cos(lift), np.sin(azimuth) * np.cos(lift), np.sin(lift)])
     sphere, disc = (figure := _new_figure("path of the body axis", 10, 5.4)).subplots(1, 2)
-    view, half = _camera(eye, UP), np.full(2, 1.12)
+    view, half = camera(eye, UP), np.full(2, 1.12)
     _shade(sphere, [(np.ones(3), FAINT)], view, half, np.zeros(2))
-    grid = [_circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
-    for circle in [*grid, *(_circle(UP, theta) for theta in range(30, 180, 30))]:
-        _front_and_back(sphere, circle, view, circle @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
-    for circle in (extremes := [_circle(UP, polar.min()), _circle(UP, polar.max())]):
-        _front_and_back(sphere, circle, view, circle @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
+    grid = [circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
+    for ring in [*grid, *(circle(UP, theta) for theta in range(30, 180, 30))]:
+        _front_and_back(sphere, ring, view, ring @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
+    for ring in (extremes := [circle(UP, polar.min()), circle(UP, polar.max())]):
+        _front_and_back(sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
     _draw_path(sphere, path, view, path @ eye, half, np.zeros(2), COOL)
     _triad(sphere, view, "xyz", down)
     sphere.set_title(f"from 25° {word} the horizon", **NOTE)
-    view = _camera(side * UP, np.eye(3)[1])
+    view = camera(side * UP, np.eye(3)[1])
     flat = path @ view[:2].T
     centre, near = (flat.max(0) + flat.min(0)) / 2, 0.625 * np.ptp(flat, axis=0).max()
     enlarged = 1e-6 < near < 0.4
     centre, half = (centre, np.full(2, near)) if enlarged else (np.zeros(2), half)
-    for circle, style in [(_circle(UP), "-"), *((circle, DASHED) for circle in extremes)]:
-        disc.plot(*view[:2] @ circle.T, color=FAINT, lw=0.9, ls=style)
+    for ring, style in [(circle(UP), "-"), *((ring, DASHED) for ring in extremes)]:
+        disc.plot(*view[:2] @ ring.T, color=FAINT, lw=0.9, ls=style)
     disc.plot([-1, 1, np.nan, 0, 0], [0, 0, np.nan, -1, 1], color=FAINT, lw=0.4, alpha=0.6)
     _draw_path(disc, path, view, path @ view[2], half, centre, COOL)
     _triad(disc, view, "xy")
@@ -143,7 +143,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     energy, momentum = np.sqrt(energies[at] / inertia), np.linalg.norm(inertia * omega[at]) / inertia
     order, mean = np.argsort(inertia, kind="stable"), omega.mean(0) / fastest
     eye = np.array([0.5, 0.75, 0.45])[np.argsort(order)]
-    view = _camera(eye * np.where(mean < -1e-6, -1.0, 1.0) + 0.6 * mean, np.eye(3)[order[2]])
+    view = camera(eye * np.where(mean < -1e-6, -1.0, 1.0) + 0.6 * mean, np.eye(3)[order[2]])
     depth = np.minimum(omega / energy**2 @ view[2], omega / momentum**2 @ view[2])
     flat = omega @ view[:2].T
     whole = [max(np.linalg.norm(semi * side) for semi in (energy, momentum)) for side in view[:2]]
@@ -271,20 +271,6 @@ def _draw_series(figure, cells, time, series, labels, least: float, shown: float
     return panels
 
 
-def _camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """An orthographic view from the direction `eye`: rows to the right, upwards and towards the eye."""
-    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(toward, right), toward])
-
-
-def _circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
-    """The circle on the unit sphere at this polar angle (degrees) from a direction."""
-    right, up, toward = _camera(normal, np.eye(3)[np.abs(normal).argmin()])
-    turn, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
-    return np.sin(polar) * (np.cos(turn) * right + np.sin(turn) * up) + np.cos(polar) * toward
-
-
 def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: np.ndarray, centre: np.ndarray) -> None:
     """An image of ellipsoids (semi-axes, colour) about the origin, lit from the upper left."""
     from matplotlib.colors import to_rgb
@@ -304,7 +290,7 @@ def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: n
         seen = (b * b >= a * c) & (depth > nearest + 1e-6 * half.max())
         image[seen, :3], image[seen, 3] = (1 - tint * (1 - np.array(to_rgb(color))))[seen], 1.0
         nearest[seen] = depth[seen]
-        axis.plot(*view[:2] @ (semi * _circle(view[2] / semi)).T, color=color, lw=0.8, alpha=0.6)
+        axis.plot(*view[:2] @ (semi * circle(view[2] / semi)).T, color=color, lw=0.8, alpha=0.6)
     axis.imshow(image, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), interpolation="bilinear", zorder=0)
 
 

@@ -68,3 +68,17 @@ def thin_path(path: np.ndarray, most: int) -> np.ndarray:
         return np.array([0, len(path) - 1])
     marks = np.searchsorted(way, np.linspace(0, way[-1], most))
     return np.unique(np.concatenate([marks.clip(0, len(path) - 1), [0, len(path) - 1]]))
+
+
+def camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """An orthographic view from the direction `eye`: rows to the right, upwards and towards the eye."""
+    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
+    """The circle on the unit sphere at this polar angle (degrees) from a direction."""
+    right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
+    turn, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
+    return np.sin(polar) * (np.cos(turn) * right + np.sin(turn) * up) + np.cos(polar) * toward
