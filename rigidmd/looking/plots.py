@@ -1,14 +1,12 @@
 """Plots of the columns of a run against its time, as small figures for a page, which a film can put a cursor on."""
 
-import html
-import io
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.looking.record import Record
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, thin_series
-from rigidmd.output.page import themed
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, thin_series
+from rigidmd.output.page import figure as figure_part
 
 #: Inches: narrow, so that its letters can be read on a phone.
 WIDTH, HEIGHT = 4.4, 2.3
@@ -83,25 +81,17 @@ def draw(record: Record) -> str:
 
 
 def _draw(record: Record, k: int, panel: Panel) -> str:
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axis = figure.subplots()
-    axis.patch.set_visible(False)
-    figure.patch.set_visible(False)
     draw_panel(axis, record, panel)
     axis.set_title(panel.title, loc="left", fontsize=9, color=INK)
     axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
-    stream = io.StringIO()
-    style = {"svg.fonttype": "none", "svg.hashsalt": f"panel{k}", "text.color": INK, "axes.labelcolor": INK,
-             "xtick.color": INK, "ytick.color": INK, "axes.edgecolor": INK}  # fmt: skip
-    with rc_context(style):
-        save_figure(figure, stream, format="svg", metadata={"Date": None, "Creator": None})
+    svg = figure_part(figure, f"panel{k}", panel.title)
     place = axis.get_position()
     left, right = axis.get_xlim()
     where = f'data-left="{place.x0:.5f}" data-right="{place.x1:.5f}" data-from="{left:.9g}" data-to="{right:.9g}"'
-    svg = themed(stream.getvalue()).replace("<svg", f'<svg role="img" aria-label="{html.escape(panel.title)}"', 1)
     return f"<figure {where}>{svg}</figure>"
 
 

@@ -82,3 +82,11 @@ def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
     right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
     turn, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
     return np.sin(polar) * (np.cos(turn) * right + np.sin(turn) * up) + np.cos(polar) * toward
+
+
+def few_decades(line) -> None:
+    """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer than two of them."""
+    from matplotlib.ticker import LogFormatterSciNotation
+
+    line.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.0, 0.5)))
+    line.set_tick_params(which="minor", labelsize=7)

@@ -1,10 +1,11 @@
 """The template of all pages: one self-contained HTML file, readable on a phone, in the dark and in print."""
 
 import html
+import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from rigidmd.output.figure import COOL, FAINT, INK, WARM
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
@@ -73,9 +74,25 @@ def code(text: str) -> str:
     return f"<pre>{html.escape(text)}</pre>"
 
 
-def themed(svg: str) -> str:
-    """A figure of Matplotlib (SVG) as part of a page: its ink follows the colours of the page."""
-    found = svg[svg.index("<svg") :]
+def figure(drawn, salt: str, about: str) -> str:
+    """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each figure of a page."""
+    from matplotlib import rc_context
+
+    stream = io.StringIO()
+    drawn.patch.set_visible(False)
+    for axis in drawn.axes:
+        axis.patch.set_visible(False)
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        save_figure(drawn, stream, format="svg", metadata={"Date": None, "Creator": None})
+    found = stream.getvalue()
+    found = found[found.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1)
     for color, name in ((INK, "ink"), (FAINT, "faint"), (COOL, "cool"), (WARM, "warm")):
         found = found.replace(color, f"var(--{name})")
     return found
+
+
+def wide(drawn, salt: str, about: str) -> str:
+    """A figure of several panels, which scrolls on a narrow screen."""
+    width = 120 * drawn.get_figwidth()  # pixels
+    style = f"max-width:{width:.0f}px;min-width:{min(620.0, 0.7 * width):.0f}px"
+    return f'<div class="scroll"><div class="wide" style="{style}">{figure(drawn, salt, about)}</div></div>'
