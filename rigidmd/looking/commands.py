@@ -25,6 +25,7 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     film = add("film", _film, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots")
     _run_arguments(film, ".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)")
     film.add_argument("--seconds", type=_seconds, default=10.0, metavar="S", help="length of the film (default: 10)")
+    film.add_argument("--height", type=_height, metavar="N", help="pixels (default: 640, of a .gif 448)")
     film.add_argument("--plots", action="store_true", help="put plots with a moving cursor beside it")
 
 
@@ -44,6 +45,13 @@ def _seconds(text: str) -> float:
     if not 0.1 <= value <= 3600:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds from 0.1 to 3600")
     return value
+
+
+def _height(text: str) -> int:
+    """A height of a film."""
+    if not text.isdigit() or not 100 <= int(text) <= 2160:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of pixels from 100 to 2160")
+    return int(text)
 
 
 def _target(options: argparse.Namespace, default: str, endings: tuple[str, ...]) -> Path:
@@ -88,7 +96,12 @@ def _film(options: argparse.Namespace) -> int:
     check_writer(path)
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         path, told = write_film(
-            Path(options.folder), path, options.seconds, options.plots, lambda share: bar.update(share - bar.n)
+            Path(options.folder),
+            path,
+            options.seconds,
+            options.plots,
+            options.height,
+            lambda share: bar.update(share - bar.n),
         )
     for sentence in told:
         print(sentence)

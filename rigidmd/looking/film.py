@@ -18,9 +18,9 @@ from rigidmd.looking.record import Record, read_record
 from rigidmd.output.figure import INK, WARM
 
 ENDINGS = (".mp4", ".gif")
-#: Frames a second, and seconds, of a film; inches and dots per inch of its picture.
-RATE, SECONDS = {".mp4": 25, ".gif": 15}, 10.0
-INCHES, DPI = 6.4, {".mp4": 100, ".gif": 70}
+#: Frames a second, seconds, and pixels of height of a film; inches of its picture.
+RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 15}, 10.0, {".mp4": 640, ".gif": 448}
+INCHES = 6.4
 #: Panels beside a film at most.
 PANELS = 3
 #: Frames of molecules that are read at most.
@@ -58,11 +58,12 @@ def write_film(
     path: Path,
     seconds: float = SECONDS,
     with_plots: bool = False,
+    height: int | None = None,
     progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[Path, list[str]]:
     """Write the film of the run in a folder. Returns its path and what is said of it. Raises OutputError.
 
-    seconds : its length; progress : called with the share that is done
+    seconds : its length; height : pixels, made even; progress : called with the share that is done
     """
     from matplotlib import animation
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -71,7 +72,9 @@ def write_film(
     check_writer(path)
     record = read_record(folder)
     film = _of_body(record) if record.is_body else _of_molecules(record)
-    figure = Figure(figsize=(INCHES * (1.75 if with_plots else 1.0), INCHES), dpi=DPI[path.suffix])
+    pixels = 2 * round((height or HEIGHT[path.suffix]) / 2)
+    across = 2 * round(pixels * (1.75 if with_plots else 1.0) / 2)
+    figure = Figure(figsize=(INCHES * across / pixels, INCHES), dpi=pixels / INCHES)
     FigureCanvasAgg(figure)
     width = 1 / 1.75 if with_plots else 1.0
     axes = figure.add_axes((0.0, 0.0, width, 1.0))

@@ -28,7 +28,7 @@ def library() -> str:
     try:
         found = files("chemiscope").joinpath(*SCRIPT).read_text(encoding="utf-8")
     except (ImportError, OSError):
-        raise OutputError("the film of molecules needs chemiscope: pip install 'rigidmd[view]'") from None
+        raise OutputError("the film of molecules needs the extra rigidmd[view]: pip install chemiscope") from None
     return found
 
 
