@@ -8,6 +8,7 @@ import subprocess
 import sys
 from itertools import pairwise
 
+import MDAnalysis
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -20,6 +21,7 @@ from rigidmd.looking import molecule_film
 from rigidmd.looking.mesh import UNITS, mesh_of
 from rigidmd.looking.record import read_record
 from rigidmd.mechanics.solids import SOLIDS, solid
+from rigidmd.output.connections import connections
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
@@ -272,8 +274,6 @@ def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, c
         case "other atoms":
             shutil.copyfile(top / "trajectory.xtc", path)
         case "other shapes":
-            import MDAnalysis
-
             u = MDAnalysis.Universe(folder / "topology.gro")
             u.atoms.positions = 2 * u.atoms.positions
             u.atoms.write(str(path))
@@ -365,3 +365,70 @@ def test_a_body_without_a_solid_is_drawn_as_the_cuboid_of_its_inertia():
     assert np.allclose(np.ptp(mesh.vertices, axis=0), lengths)
     assert volume(mesh) == pytest.approx(6.0)
     assert set(UNITS) < set(SOLIDS)
+
+
+@pytest.fixture(scope="module")
+def water_in_memory():
+    return Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT_WATER)).run()
+
+
+def test_a_universe_knows_bonds_charges_masses_and_velocities(water_in_memory):
+    u = water_in_memory.universe()
+    assert len(u.bonds) == 2 * 216
+    assert u.bonds.values() == pytest.approx(1.0, abs=1e-4)  # SPC/E: 1 Å
+    assert u.select_atoms("name OW").charges == pytest.approx(-0.8476)
+    assert u.residues[5].atoms.total_charge() == pytest.approx(0.0, abs=1e-12)
+    frame = u.trajectory[-1]
+    expected = water_in_memory.system.site_velocities(water_in_memory.state)
+    assert np.allclose(frame.velocities, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_rotations_are_output(water_in_memory):
+    rotation = water_in_memory.rotation
+    u = water_in_memory.universe()
+    assert rotation.shape == (len(u.trajectory), 216, 3, 3)
+    sites = water_in_memory.system.sites
+    arms = np.einsum("nij,nsj->nsi", rotation[2], sites.offset_body.reshape(216, 3, 3))
+    u.trajectory[2]
+    seen = u.atoms.positions.reshape(216, 3, 3).astype(float)
+    assert np.allclose(arms - arms[:, :1], seen - seen[:, :1], atol=1e-4)
+
+
+def test_the_files_of_a_run_tell_the_same(tmp_path):
+    scene = Scene.read(ROOT / "systems" / "water.toml", SHORT_WATER | {"output.topology": "topology.pdb"})
+    results = Simulation(scene, tmp_path / "run").run()
+    u = results.universe()
+    assert len(u.bonds) == 2 * 216
+    assert u.atoms[0].charge == pytest.approx(-0.8476)
+    assert u.atoms[0].mass == pytest.approx(15.9994)
+    assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 2 * 216  # CONECT
+    with pytest.raises(ValueError, match="run without a folder"):
+        results.rotation  # noqa: B018
+
+
+def test_a_body_has_its_edges_as_bonds(tmp_path):
+    more = {"run.duration_s": 0.01, "output.figures": False, "output.topology": "topology.pdb"}
+    results = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run").run()
+    joined = {tuple(pair) for pair in results.universe().bonds.indices.tolist()}
+    octahedron = {
+        (i, j) for i in range(2, 8) for j in range(i + 1, 8) if j - i != 3
+    }  # tips are opposite to the third next
+    assert joined == octahedron | {(0, 1)}  # and the pivot to the centre
+    assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 13
+    assert results.rotation.shape == (21, 1, 3, 3)
+    assert np.array_equal(results.rotation[-1, 0], results["Q"][-1])
+
+
+@pytest.mark.parametrize(
+    ("body", "edges"),
+    [
+        ({"mass_kg": 1.0, "solid": {"shape": "cuboid", "lengths_m": [1.0, 2.0, 3.0]}}, 12),
+        ({"mass_kg": 1.0, "solid": {"shape": "cylinder", "radius_m": 1.0, "height_m": 2.0}}, 36),
+        ({"mass_kg": 1.0, "solid": {"shape": "ring", "radius_m": 1.0}}, 24),
+        ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, 12),
+        ({"points": [{"mass_kg": 1.0, "position_m": [x, x * x, 0.0]} for x in (0.0, 1.0, 2.0, 3.0)]}, 3),
+    ],
+)
+def test_edges_of_solids(body, edges):
+    scene = Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})
+    assert len(connections(build_body(scene))) == edges

@@ -36,7 +36,7 @@ LIBRARIES = {
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
     "matplotlib": {
-        "output/figure.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
+        "output/figure.py", "output/page.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
         "looking/film.py", "looking/draw_body.py", "looking/draw_molecules.py",
     },

@@ -46,7 +46,7 @@ class BodyFilm(NamedTuple):
 
 def body_film(record: Record) -> BodyFilm:
     """The film of a run of a single body."""
-    system, seen = record.system, record.columns
+    system, seen = record.body, record.columns
     count = len(record.time)
     stride = -(-count // MOST)
     rows = np.arange(0, count, stride)
@@ -77,7 +77,7 @@ def body_film(record: Record) -> BodyFilm:
             if longest > 0:
                 scale = VECTOR[not flies] * (1.0 if flies else radius / unit) / longest
                 vectors[name], largest[name] = scale * found, f"{longest:.4g} {size}"
-    gravity = record.scene.gravity and np.array(record.scene.gravity.acceleration_m_s2, float)
+    gravity = system.scene.gravity and np.array(system.scene.gravity.acceleration_m_s2, float)
     down = None
     if gravity is not None and gravity.any():
         down = DOWN[not flies] * gravity / np.linalg.norm(gravity)
@@ -111,5 +111,5 @@ def _still(count: int) -> np.ndarray:
 
 def _axis(record: Record) -> np.ndarray:
     """The body axis whose path is drawn, in the lab (t, 3)."""
-    axis = drawn_axis(record.system)
+    axis = drawn_axis(record.body)
     return np.stack([sum(record.columns[f"q{i}{j + 1}"] * axis[j] for j in range(3)) for i in (1, 2, 3)], axis=-1)

@@ -27,7 +27,7 @@ class MoleculePicture:
     def __init__(self, record: Record, frames: Frames):
         from matplotlib.colors import to_rgb
 
-        sites = record.system.sites
+        sites = record.molecules.sites
         self._shown = np.flatnonzero(sites.mass > 0)
         elements = sites.element[self._shown]
         self._radius = np.array([LARGE * COVALENT[e] if e in COVALENT else OTHERS for e in elements])

@@ -136,7 +136,7 @@ def _panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
 def _of_body(record: Record) -> Film:
     found = body_film(record)
     end, told = _loop(record, found)
-    return Film(BodyPicture(found, not record.system.flies).draw, float(found.time[0]), end, [*found.told, *told])
+    return Film(BodyPicture(found, not record.body.flies).draw, float(found.time[0]), end, [*found.told, *told])
 
 
 def _loop(record: Record, film: BodyFilm) -> tuple[float, list[str]]:

@@ -10,7 +10,7 @@ from rigidmd.assemble.system import Sites
 from rigidmd.errors import OutputError
 from rigidmd.looking.record import Record
 from rigidmd.looking.view import data_part, own, packed, script, stage
-from rigidmd.output.molecule_report import bonds
+from rigidmd.output.connections import connections
 from rigidmd.output.trajectory import Frames, read_frames
 
 #: Coordinates in a page at most, of 2 bytes each: with base64 about 21 MB, beside 3 MB of chemiscope.
@@ -37,7 +37,7 @@ def frames_of(record: Record, most: int) -> Frames:
 
     Raises OutputError if the run has none.
     """
-    output, sites = record.scene.output, record.system.sites
+    output, sites = record.scene.output, record.molecules.sites
     if not output.trajectory:
         raise OutputError(f"{record.folder}: this run wrote no trajectory (output.trajectory = false)")
     path = record.folder / output.trajectory
@@ -66,15 +66,6 @@ def _centres(frame: np.ndarray, molecule: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(molecule, frame[:, k]) / count for k in range(3)], axis=-1)
 
 
-def all_bonds(record: Record) -> np.ndarray:
-    """Bonds (b, 2) between sites of all molecules, without those to massless sites."""
-    system = record.system
-    starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
-    links = [np.array([b for b in bonds(m) if m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species]
-    found = [start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)]
-    return np.concatenate(found) if found else np.zeros((0, 2), int)
-
-
 def thinned(frames: Frames) -> list[str]:
     """What of a trajectory is not in its film."""
     told = []
@@ -91,7 +82,7 @@ def thinned(frames: Frames) -> list[str]:
 def page_part(record: Record) -> tuple[list[str], list[str]]:
     """The film as HTML, and what was thinned out. Raises OutputError."""
     code = library()
-    sites = record.system.sites
+    sites = record.molecules.sites
     massive = np.flatnonzero(sites.mass > 0)
     frames = frames_of(record, max(2, MOST // (3 * len(massive))))
     told = thinned(frames)
@@ -109,12 +100,12 @@ def page_part(record: Record) -> tuple[list[str], list[str]]:
         "scale": scale,
         "steps": STEPS,
         "elements": [str(element) for element in sites.element[massive]],
-        "bonds": [[int(i), int(j), 1] for i, j in new[all_bonds(record)]],
+        "bonds": [[int(i), int(j), 1] for i, j in new[connections(record.molecules)]],
         "cells": None if frames.cells is None else packed(frames.cells.reshape(-1, 9), "<f4"),
         "name": record.scene.name,
     }
-    count = np.bincount(record.system.model.species, minlength=len(record.system.species))
-    legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, record.system.species, strict=True))
+    count = np.bincount(record.molecules.model.species, minlength=len(record.molecules.species))
+    legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, record.molecules.species, strict=True))
     how = (
         "Drag to turn, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels and axes. "
         "Space plays. A click on a plot jumps there. Drawn by chemiscope (chemiscope.org)."

@@ -30,7 +30,7 @@ def panels(record: Record) -> list[Panel]:
 
 
 def _of_molecules(record: Record) -> list[Panel]:
-    seen, n = record.columns, len(record.system.model.species)
+    seen, n = record.columns, len(record.molecules.model.species)
 
     def curves(*names: tuple[str, str], per: int = 1) -> list[tuple[str, np.ndarray]]:
         return [(label, seen[name] / per) for name, label in names if name in seen and np.isfinite(seen[name]).any()]
@@ -61,7 +61,7 @@ def _of_body(record: Record) -> list[Panel]:
         found.append(Panel(f"φ and ψ ({unit})", [(name, values / size) for name, values in angles]))
         omega = [("₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
         found.append(Panel("ω along the body's axes (rad/s)", [(f"ω{k}", values) for k, values in omega]))
-    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.system.flies:
+    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.body.flies:
         found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
     parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
     found.append(Panel("energies (J)", parts))

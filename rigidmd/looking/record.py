@@ -44,6 +44,20 @@ class Record:
         return isinstance(self.scene, BodyScene)
 
     @property
+    def body(self) -> BodySystem:
+        """The system of a single body. Raises TypeError for molecules."""
+        if not isinstance(self.system, BodySystem):
+            raise TypeError("this is a run of molecules")
+        return self.system
+
+    @property
+    def molecules(self) -> System:
+        """The system of molecules. Raises TypeError for a single body."""
+        if not isinstance(self.system, System):
+            raise TypeError("this is a run of a single body")
+        return self.system
+
+    @property
     def time(self) -> np.ndarray:
         """Times of the samples, ps for molecules, s for a body."""
         return self.columns["t" if self.is_body else "time"]

@@ -77,7 +77,7 @@ def _stages(record: Record) -> list[tuple[str, np.ndarray]]:
 
 def _means(record: Record) -> str:
     """Means of the log with their standard errors, which account for correlation."""
-    n, seen = len(record.system.model.species), record.columns
+    n, seen = len(record.molecules.model.species), record.columns
     shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
     rows = []
     for name, own in _stages(record):

@@ -87,7 +87,7 @@ def _body(record: Record, film: BodyFilm) -> list[str]:
         "sphere": film.sphere,
         "axis": film.axis.tolist(),
         "centre": film.centre.tolist(),
-        "pinned": not record.system.flies,
+        "pinned": not record.body.flies,
         "unit": film.unit,
         "azimuth": film.azimuth,
     }

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import MDAnalysis as mda
 import numpy as np
 from MDAnalysis.coordinates.base import ProtoReader
+from MDAnalysis.coordinates.core import reader as open_reader
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.coordinates.PDB import PDBReader
@@ -28,6 +29,7 @@ from rigidmd.assemble.system import System
 from rigidmd.core.files import AppendedFile, whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError, SimulationError
+from rigidmd.output.connections import charges, connections
 from rigidmd.output.frame import Frame
 
 #: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
@@ -52,8 +54,15 @@ def universe(system: System | BodySystem, state: State, velocities: bool = False
     u.add_TopologyAttr("masses", system.sites.mass)
     u.add_TopologyAttr("resnames", names)
     u.add_TopologyAttr("resids", np.arange(1, len(names) + 1))
+    _connect(u, system)
     set_frame(u, system, state, 0.0, 0, velocities, wrapped)
     return u
+
+
+def _connect(u: mda.Universe, system: System | BodySystem) -> None:
+    """Add charges and bonds."""
+    u.add_TopologyAttr("charges", charges(system))
+    u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system).tolist()])
 
 
 def set_frame(
@@ -85,13 +94,20 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
         if u.dimensions is None
         else np.array([dimensions(frame.cell) for frame in frames if frame.cell is not None])
     )
-    u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes)
+    velocities = np.array([frame.velocities for frame in frames])
+    u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
     return u
 
 
-def from_files(topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
-    """The Universe of a finished run's files, whose frames have these times (ps)."""
-    return mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
+def from_files(system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
+    """The Universe of a finished run's files, whose frames have these times (ps), with all that its system tells."""
+    u = mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
+    u.add_TopologyAttr("elements", system.sites.element)
+    u.add_TopologyAttr("masses", system.sites.mass)
+    if hasattr(u.atoms, "bonds"):  # a .pdb's
+        u.del_TopologyAttr("bonds")
+    _connect(u, system)
+    return u
 
 
 def _checked(times: list[float]) -> list[float]:
@@ -136,7 +152,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def _frames(path: Path, sites: int, most: int) -> Frames:
-    reader = mda.coordinates.core.reader(str(path), format="NCDF" if path.suffix == ".nc" else path.suffix[1:])
+    reader: Any = open_reader(str(path), format="NCDF" if path.suffix == ".nc" else path.suffix[1:])
     with contextlib.closing(reader):
         if reader.n_atoms != sites:
             raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
@@ -233,7 +249,7 @@ def write_topology(path: Path, system: System | BodySystem, state: State, wrappe
     with whole_file(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of missing attributes (occupancies, ...)
         sites = universe(system, state, wrapped=wrapped).select_atoms("all")
-        sites.write(str(temporary))
+        sites.write(str(temporary), **({"bonds": "all"} if path.suffix == ".pdb" else {}))
 
 
 def _check_fits(path: Path, positions: np.ndarray) -> None:
@@ -269,9 +285,12 @@ class TrajectoryFile:
         self._path, self._format, self._system = path, path.suffix, system
         self._velocities, self._wrapped = velocities, wrapped
         self._universe = universe(system, system.state, velocities)
-        self._options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}.get(
-            path.suffix, {}
-        )
+        forms = {
+            ".dcd": {"dt": interval},
+            ".nc": {"velocities": velocities},
+            ".pdb": {"multiframe": True, "bonds": None},  # those of the topology do
+        }
+        self._options = forms.get(path.suffix, {})
         size, self._frames = kept or (0, 0)
         self._file = AppendedFile(path, size if kept else None)
 
