@@ -25,8 +25,13 @@ def draw_motion(
     inertia: np.ndarray | None,
     invariants: list[str],
     gravity: np.ndarray | None,
+    flies: bool,
 ) -> list[Path]:
-    """Draw the figures that these columns allow, as PNG and SVG. Returns the paths. Raises OutputError."""
+    """Draw the figures that these columns allow, as PNG and SVG. Returns the paths. Raises OutputError.
+
+    inertia : of a body whose omega stays on the ellipsoids of energy and momentum; flies : of one that is pinned, the
+    path of the axis tells that of the centre of mass
+    """
     down = None if gravity is None or not np.any(gravity) else np.asarray(gravity) / np.linalg.norm(gravity)
     figures = {}
     if len(columns["t"]) > 1:
@@ -39,7 +44,7 @@ def draw_motion(
                 figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(inertia, float))
             else:
                 figures["omega"] = _omega_figure(columns)
-        if "x" in columns:
+        if flies:
             figures["path"] = _path_figure(columns, down)
         figures["invariants"] = _invariants_figure(columns, invariants)
     return [path for stem, figure in figures.items() if figure for path in _write(folder, stem, name, figure)]
@@ -97,7 +102,16 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     _triad(disc, view, "xy")
     zoom = f", enlarged {_times(1.12 / near)}" if enlarged else ""
     disc.set_title(f"from {word}{zoom}; dashed: its θ {_range(polar)}", **NOTE)
+    _tell_start(figure)
     return figure
+
+
+def _tell_start(figure) -> None:
+    """A legend outside of all panels: the dot is the start."""
+    from matplotlib.lines import Line2D
+
+    dot = Line2D([], [], color=WARM, marker="o", ms=5, ls="none", label="start")
+    figure.legend(handles=[dot], loc="outside upper right", frameon=False, fontsize=9, labelcolor=FAINT)
 
 
 def _angles_figure(columns: dict[str, np.ndarray]):
@@ -106,8 +120,11 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     phi, psi = _apart(columns)
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = _new_figure("Euler angles (3-1-3)", 8, 6.4)
-    labels, cells = ("φ (°)", "θ (°)", "ψ (°)"), figure.add_gridspec(3, 1)
-    panels = _draw_series(figure, cells, time, angles, labels, 1e-5, 1.0, (COOL, WARM, COOL))
+    turning = [np.ptp(angle) > 360 for angle in angles]
+    drawn = [angle / 360 if many else angle for angle, many in zip(angles, turning, strict=True)]
+    labels = [f"{name} ({'turns' if many else '°'})" for name, many in zip("φθψ", turning, strict=True)]
+    cells = figure.add_gridspec(3, 1)
+    panels = _draw_series(figure, cells, time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
     panels[1].set_title(_range(theta), **NOTE)
     for panel, angle in zip(panels[::2], angles[::2], strict=True):
         first, last = np.round(angle[[0, -1]], 6) + 0.0
@@ -150,7 +167,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     half = 1.06 * np.minimum(np.maximum(whole, np.abs(flat).max(0)), 2.5 * fastest)
     half = np.maximum(half, 0.8 * half[::-1])
     near, middle = 0.75 * np.ptp(flat, axis=0).max(), (flat.max(0) + flat.min(0)) / 2
-    boxes = [(half, np.zeros(2), f"ellipsoids of energy (blue) and momentum (red), t = {time[at]:g} s")]
+    boxes = [(half, np.zeros(2), f"from the side of ω; energy (blue), momentum (red), t = {time[at]:g} s")]
     if 1e-6 * half.max() < near < 0.2 * half.max():
         boxes.append((np.full(2, near), middle, f"the path, enlarged {_times(half.max() / near)}"))
     figure = _new_figure("ω in the body frame", 6.2 + 4 * len(boxes), 5)
@@ -163,6 +180,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
         axis.set_title(title, **NOTE)
     labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
     _draw_series(figure, cells[:, -1].subgridspec(3, 1), time, omega.T, labels, 1e-9 * fastest, 2 * fastest)
+    _tell_start(figure)
     return figure
 
 
@@ -200,6 +218,7 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     _draw_series(figure, stack, columns["t"], place.T, labels, least, span)
     for column, (title, right, upward) in enumerate(planes, start=1):
         _draw_plane(figure.add_subplot(cells[:, column]), title, place, right, upward, least)
+    _tell_start(figure)
     return figure
 
 
