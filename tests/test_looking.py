@@ -432,3 +432,18 @@ def test_a_body_has_its_edges_as_bonds(tmp_path):
 def test_edges_of_solids(body, edges):
     scene = Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})
     assert len(connections(build_body(scene))) == edges
+
+
+def test_a_gallery_leads_to_films(tmp_path, capsys):
+    folder = tmp_path / "gallery"
+    assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 0
+    index = (folder / "index.html").read_text("utf-8")
+    assert index.count("<img") == 1
+    assert 'href="heavy_top_3.html"' in index
+    assert is_alone(index)
+    assert len(numbers(data_of(folder / "heavy_top_3.html")["time"], "<f8")) == 3401
+    assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 2
+    assert "--force replaces it" in capsys.readouterr().err
+    assert cli.main(["gallery", "water", "-o", str(tmp_path / "other")]) == 2
+    assert "there is no shipped body 'water'" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

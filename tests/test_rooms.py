@@ -38,7 +38,7 @@ LIBRARIES = {
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
-        "looking/film.py", "looking/draw_body.py", "looking/draw_molecules.py",
+        "looking/film.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
     "numba": {

@@ -144,7 +144,8 @@
       pen.beginPath(); pen.moveTo(x, y); pen.lineTo(u - head * a, v - head * b); pen.stroke();
       pen.beginPath(); pen.moveTo(u, v); pen.lineTo(u - head * a + 4.5 * b, v - head * b - 4.5 * a); pen.lineTo(u - head * a - 4.5 * b, v - head * b + 4.5 * a); pen.fill();
       pen.font = "italic 600 15px system-ui,sans-serif";
-      pen.fillText(name, u + 10 * a - 5, v + 12 * b + 5);
+      const side = { L: -11, ω: 11 }[name] || 0; // of vectors that lie on one another
+      pen.fillText(name, u + 10 * a - 5 - side * b, v + 12 * b + 5 + side * a);
     }
     const shades = { L: "#7a5ca3", ω: "#b8862d" };
     const from = data.pinned ? origin : centre;

@@ -1,7 +1,8 @@
-"""The commands that look at a run: `report`, `view`, `film`. They print and never compute."""
+"""The commands that look at runs: `report`, `view`, `film`, `gallery`. They print and never compute."""
 
 import argparse
 import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,17 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     film.add_argument("--seconds", type=_seconds, default=10.0, metavar="S", help="length of the film (default: 10)")
     film.add_argument("--height", type=_height, metavar="N", help="pixels (default: 640, of a .gif 448)")
     film.add_argument("--plots", action="store_true", help="put plots with a moving cursor beside it")
+
+    gallery = add(
+        "gallery",
+        _gallery,
+        "run shipped bodies and write a page with a picture of each, which leads to its film",
+        "rigidmd gallery heavy_top_3 intermediate_axis",
+    )
+    gallery.add_argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)")
+    gallery.add_argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)")
+    gallery.add_argument("--force", action="store_true", help="replace an earlier gallery in that folder")
+    gallery.set_defaults(scene="the gallery")
 
 
 def _run_arguments(parser: argparse.ArgumentParser, about: str) -> None:
@@ -106,6 +118,21 @@ def _film(options: argparse.Namespace) -> int:
     for sentence in told:
         print(sentence)
     print(f"{path}: {path.stat().st_size / 1e6:.2g} MB")
+    return 0
+
+
+def _gallery(options: argparse.Namespace) -> int:
+    from rigidmd.looking.gallery import INDEX, chosen, write_gallery
+    from rigidmd.output.target import check_target
+
+    folder = Path(options.output)
+    bodies = chosen(options.names)
+    if folder.is_dir():
+        for name in (INDEX, *(f"{body.name}.html" for body in bodies)):
+            check_target(folder / name, (".html",), options.force)
+    command = shlex.join(["rigidmd", "gallery", *options.names])
+    say = lambda name: print(f"  {name} ...", file=sys.stderr, flush=True)  # noqa: E731
+    _written(write_gallery(folder, options.names, options.force, command, say), [])
     return 0
 
 

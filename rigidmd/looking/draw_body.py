@@ -10,6 +10,8 @@ from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle
 LIFT = 0.35
 SIDES = np.array([[0.31, 0.58, 0.77], [0.85, 0.41, 0.31]])
 VECTORS = {"L": "#7a5ca3", "ω": "#b8862d"}
+#: Labels of vectors that lie on one another stand beside them, to the left and to the right.
+SIDE = {"L": 0.05, "ω": -0.05}
 HEAD = "-|>,head_width=0.25,head_length=0.5"
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -116,7 +118,8 @@ class BodyPicture:
             "shrinkB": 0,
         }
         axes.annotate("", tip, xytext=tail, arrowprops=style, zorder=4)
-        label = tip + 0.06 * (tip - tail) / size
+        along = (tip - tail) / size
+        label = tip + 0.06 * along + SIDE.get(name, 0.0) * np.array([-along[1], along[0]])
         axes.text(
             *label, name, color=color, fontsize=13, style="italic", weight="bold", ha="center", va="center", zorder=4
         )
