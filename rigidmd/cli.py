@@ -39,14 +39,16 @@ def main(arguments: list[str] | None = None) -> int:
     Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a signal.
     """
     from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
+    from rigidmd.output.streams import checked_streams, open_streams
 
+    open_streams()
     options = _parser().parse_args(arguments)
 
     def show(message, category, *where, **more):
         _warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
 
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), checked_streams(lasting=options.writes):
             others, warnings.showwarning = warnings.showwarning, show
             return options.command(options)
     except SimulationError as error:
@@ -65,7 +67,6 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
-        sys.stderr.close()
         return 0
 
 
@@ -105,6 +106,18 @@ def _parser() -> argparse.ArgumentParser:
     resume.add_argument("folder", metavar="DIR", help="folder of the run")
     _going_on(resume)
     resume.set_defaults(overrides=[], force=False, resume=True)
+
+    compare = _command(
+        commands,
+        "compare",
+        _compare,
+        "tell where two runs part and what differs in what they were made from; exit code 0 if they are the same to "
+        "the last bit, else 1",
+        "rigidmd compare runs/water runs/water2",
+    )
+    compare.add_argument("first", metavar="RUN", help="folder of a run")
+    compare.add_argument("second", metavar="RUN", help="folder of another run")
+    compare.add_argument("--json", action="store_true", help="print JSON")
 
     energy = _command(
         commands,
@@ -222,7 +235,7 @@ def _command(commands, name: str, function, about: str, example: str) -> argpars
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(command=function)
+    parser.set_defaults(command=function, writes=function in (_run, _resume, _precision, _stability))
     return parser
 
 
@@ -349,6 +362,14 @@ def _resume(options: argparse.Namespace) -> int:
         raise OutputError(f"{folder} is not the folder of a run")
     options.scene, options.output = str(folder / SCENE), options.folder
     return _run(options)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from rigidmd.study.compare import compare, in_words
+
+    found = compare(Path(options.first), Path(options.second))
+    print(json.dumps(found.told(), indent=2) if options.json else in_words(found))
+    return 0 if found.same else FAILED
 
 
 def _say(sentence: str) -> None:

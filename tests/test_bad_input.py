@@ -428,6 +428,18 @@ def test_a_bad_structure_file(change, expected, capsys, tmp_path):
         assert part in message
 
 
+@pytest.mark.parametrize(("share", "code"), [(0.59, 2), (0.61, 0)])
+def test_sites_overlap_within_six_tenths_of_their_diameter(share, code, capsys, tmp_path):
+    sigma = load_model("argon").sigma[0]
+    (tmp_path / "two.xyz").write_text(f"2\n\nAr 5.0 5.0 5.0\nAr {5.0 + share * sigma:.9f} 5.0 5.0\n")
+    (tmp_path / "two.toml").write_text(
+        "box.lengths_A = 20.0\nforces.cutoff_A = 8.0\nstructure.file = 'two.xyz'\n"
+        "start.temperature_K = 90.0\n[[molecules]]\nmodel = 'argon'\n[[stages]]\nduration_ps = 0.01\n"
+    )
+    assert main(["check", str(tmp_path / "two.toml")]) == code
+    assert ("molecules 1 and 2 overlap" in capsys.readouterr().err) == (code == 2)
+
+
 def test_the_box_of_the_scene_counts_for_a_saved_state_too(tmp_path):
     Simulation(small_scene({"argon": 20}, 20.0), tmp_path / "out").run()
     for box, edge in (({}, 20.0), ({"lengths_A": 40.0}, 40.0), ({"periodic": False}, np.inf)):

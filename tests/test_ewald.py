@@ -21,9 +21,10 @@ from rigidmd.forces.laws.screened import screening
 from rigidmd.forces.pairs.space import Triclinic, cell_of
 from rigidmd.forces.waves.ewald import sum_of
 from rigidmd.forces.waves.vectors import waves
-from rigidmd.measure.accuracy import accuracy
+from rigidmd.measure.accuracy import accuracy, estimated_error
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
+from rigidmd.measure.summary import box_notes
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.output.report import summary_text
 from rigidmd.run import Every, Simulation
@@ -648,6 +649,18 @@ def test_forces_are_as_accurate_as_asked_for(method, asked):
     found = accuracy(system, state)
     assert 0.5 * asked < found.measured / COULOMB < 2 * asked
     assert found.estimated == pytest.approx(found.measured, rel=0.6)
+    grown = state._replace(cell=1.1 * state.cell, position=1.1 * state.position)
+    assert estimated_error(system, grown.cell) == pytest.approx(accuracy(system, grown).measured, rel=0.6)
+
+
+@pytest.mark.parametrize("method", ["ewald", "pme"])
+def test_a_box_that_has_outgrown_its_waves_is_noted(method):
+    forces = {"cutoff_A": 7.7, "electrostatics": method}
+    stages = [{"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "duration_ps": 0.01}]
+    system = build(small_scene({"spce": 125}, 15.52, forces=forces, stages=stages))
+    assert estimated_error(system, system.state.cell) == pytest.approx(system.force_error, rel=1e-12)
+    for factor, told in ((1.0, 0), (1.01, 0), (1.2, 1)):
+        assert len(box_notes(system, system.state._replace(cell=factor * system.state.cell))) == told
 
 
 @pytest.mark.parametrize("order", [7, *(pytest.param(order, marks=pytest.mark.slow) for order in (3, 4, 5, 6, 8))])

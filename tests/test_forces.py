@@ -16,6 +16,7 @@ from rigidmd.forces.pairs.space import cell_of
 from rigidmd.forces.terms import Loading
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector
+from rigidmd.units import BAR, BOLTZMANN
 
 ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 MIXTURES = [
@@ -291,6 +292,34 @@ def test_the_list_is_rebuilt_for_moves_and_for_turns():
         assert sum(energies(engine, state).values()) == pytest.approx(expected, rel=1e-10)
     builds = [own.pairs.counters[BUILDS] for own in engine.workspaces.values()]
     assert min(builds) > 3
+
+
+def test_a_list_lasts_until_sites_have_moved_by_half_its_skin():
+    """Two groups of four that come into each other's range from outside of the list, each by 0.7 of the skin."""
+    cutoff, skin = 8.0, 1.6
+    system, engine, state = built(
+        {"argon": 8}, 40.0, forces={"cutoff_A": cutoff, "skin_A": skin, "truncation": "plain"}
+    )
+    group = 4.0 * np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1.0]])
+    apart = np.array([cutoff + skin + 0.01, 0.0, 0.0])
+    state.position[:] = 10.0 + np.vstack([group, group + apart])
+    alone = sum(energies(engine, state).values())
+    state.position[:4, 0] += 0.7 * skin
+    state.position[4:, 0] -= 0.7 * skin
+    expected = sum(Oracle(system).energy(state.position, state.rotation))
+    assert sum(energies(engine, state).values()) == pytest.approx(expected, rel=1e-12)
+    assert abs(expected) > 1.001 * abs(alone)
+
+
+def test_the_pressure_of_an_ideal_gas():
+    """Molecules beyond each other's reach: P V = 2/3 of the energy of translation, whatever rotates."""
+    system, engine, state = built({"nitrogen": 12}, 200.0, forces={"cutoff_A": 8.0, "truncation": "shift"})
+    seen = observe(system, engine, state)
+    assert seen.potential == 0.0 and seen.kinetic_rotation > 0.0
+    mass = system.model.mass[system.model.species]
+    expected = float(mass @ (state.velocity**2).sum(axis=1)) / (3 * state.volume) / BAR
+    assert seen.pressure_bar == pytest.approx(expected, rel=1e-12)
+    assert expected * state.volume * BAR == pytest.approx(11 * BOLTZMANN * seen.temperature_translation, rel=1e-12)
 
 
 def test_the_self_energy_of_the_reaction_field():

@@ -1,12 +1,16 @@
 """Runs that are stopped and go on: to the same bits as one that never stopped."""
 
+import hashlib
+import json
 import os
+import platform
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +19,9 @@ from conftest import ROOT
 
 from rigidmd import cli
 from rigidmd.errors import CheckpointError
-from rigidmd.output.checkpoint import read_checkpoint
+from rigidmd.output.checkpoint import read_checkpoint, write_checkpoint
 from rigidmd.output.folder import CHECKPOINT, PREVIOUS, FolderLock
-from rigidmd.run import Simulation
+from rigidmd.run import Simulation, provenance
 from rigidmd.run.observers import Every
 from rigidmd.scene import Scene
 
@@ -99,7 +103,7 @@ def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
         (NPT | {"barostat": "monte_carlo"}, NVE | {"integrator": "position_verlet"}),
         (NPT | {"thermostat": "langevin", "pressure_coupling": "flexible"}, NVE | {"integrator": "chin_4a"}),
         (MINIMISE, NVT, MINIMISE, NVE),
-        (NVT, NVE | {"integrator": "auto", "timestep_fs": 2.0, "energy_error_kT": 0.01}),
+        (NVT, {"integrator": "auto", "energy_error_kT": 0.01, "duration_ps": 0.4}),
     ],
     ids=["langevin", "nose_hoover", "andersen", "monte_carlo", "flexible", "minimise", "auto"],
 )
@@ -197,6 +201,66 @@ def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
         Simulation(again, parts, resume=True, observers=stopped_at({step} if step else set())).run()
     assert contents(tmp_path / "whole") == contents(parts)
     assert [path.name for path in parts.iterdir() if path.name.startswith("input_")] == ["input_structure_final.npz"]
+
+
+def test_compare_tells_where_two_runs_part(again, stopped, tmp_path, capsys):
+    """A run beside itself, beside its continuation, and beside one of another scene whose log was changed in a bit."""
+    one, other = str(stopped / "run"), again / "run"
+    assert cli.main(["compare", one, str(other)]) == 0
+    assert "the runs are the same to the last bit\n" in capsys.readouterr().out
+    assert cli.main(["resume", str(other)]) == 0
+    capsys.readouterr()
+    assert cli.main(["compare", one, str(other)]) == 1
+    said = capsys.readouterr().out
+    assert "7 and 11 samples, 7 in common, the same to the last bit" in said
+    assert "position by up to" in said and "as far as both have samples" in said
+    log = other / "log.csv"
+    lines = [line.split(",") for line in log.read_text().splitlines()]
+    column = lines[0].index('"Kinetic Energy (kJ/mole)"')
+    lines[3][column] = repr(float(np.nextafter(float(lines[3][column]), np.inf)))
+    log.write_text("\n".join(",".join(line) for line in lines) + "\n")
+    scene = other / "scene.toml"
+    scene.write_text(scene.read_text().replace("seed = 1", "seed = 5"))
+    assert cli.main(["compare", one, str(other)]) == 1
+    said = capsys.readouterr().out
+    assert "seed: 1 against 5" in said
+    assert "the runs part at Step 20, sample 3 of 7" in said and "last 1 of 53 bits" in said
+    assert cli.main(["compare", one, str(other), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert [apart["column"] for apart in told["course"]["first"]] == ["Kinetic Energy (kJ/mole)"]
+    assert cli.main(["compare", one, str(tmp_path)]) == 2
+    assert "is not the folder of a run" in capsys.readouterr().err
+
+
+def test_the_summary_tells_what_a_run_was_made_with(stopped):
+    told = json.loads((stopped / "run" / "summary.json").read_text())
+    for package in ("numba", "llvmlite", "numpy"):
+        assert told[f"{package}_version"] == version(package)
+    assert (told["seed"], told["precision"], told["threads"], told["input_sha256"]) == (1, "double", 1, {})
+    assert "64bit" in told["processor_features"] or platform.machine() not in ("x86_64", "AMD64")
+    own = Scene.read(stopped / "run" / "scene.toml", {"threads": 2, "name": "other"})
+    assert provenance.scene_digest(own) == told["scene_sha256"]
+    assert provenance.scene_digest(own.model_copy(update={"seed": 2})) != told["scene_sha256"]
+
+
+def test_another_version_is_told(again, capsys):
+    kept = read_checkpoint(again / "run" / CHECKPOINT)
+    kept.told["with"]["numba_version"] = "0.1"
+    write_checkpoint(again / "run", kept)
+    assert cli.main(["resume", str(again / "run")]) == 0
+    assert "computed with numba 0.1 there, " in capsys.readouterr().err
+
+
+def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_path):
+    """Digests are those of the start, whatever happens to the files of a run that goes on."""
+    shutil.copy(stopped / "run" / "final.npz", tmp_path / "start.npz")
+    digest = hashlib.sha256((tmp_path / "start.npz").read_bytes()).hexdigest()
+    data = scene(NVT, structure={"file": "start.npz"}, box={})
+    data["molecules"] = [{"model": "spce"}]
+    away = Every(0.05, lambda moment: (tmp_path / "start.npz").unlink(missing_ok=True))
+    results = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "run", observers=away).run()
+    assert results.summary["input_sha256"] == {"structure.file": digest}
+    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).told["run"]["inputs"] == {"structure.file": digest}
 
 
 def test_another_scene_is_not_gone_on_with(again, capsys):
@@ -301,12 +365,13 @@ def killed(command: list[str], after: float | None) -> int:
 def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
     """kill -9 at random moments, with a checkpoint at every look."""
     scene = ["run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-9", "--threads", "1"]
-    scene += ["--set", f"stages.0.duration_ps={2.0 * times}", "--set", "output.log_interval_ps=0.004"]
-    assert cli.main([*scene, "-o", str(tmp_path / "whole")]) == 0
+    scene += ["--set", f"stages.0.duration_ps={max(4.0, 0.3 * times)}", "--set", "output.log_interval_ps=0.02"]
+    without = ["--set", "output.checkpoint_minutes=false"]
+    assert cli.main([*scene, "-o", str(tmp_path / "whole"), *without]) == 0
     command = [sys.executable, "-m", "rigidmd", *scene, "-o", str(tmp_path / "parts"), "--resume"]
     rng = np.random.default_rng(times)
     for _ in range(times):
-        assert killed(command, float(rng.uniform(0.01, 1.0))) == -signal.SIGKILL
+        assert killed(command, float(rng.uniform(0.0, 0.3))) == -signal.SIGKILL
     assert killed(command, None) == 0
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
@@ -328,16 +393,16 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     manual = (ROOT / "rigidmd" / "docs" / "manual.md").read_text()
     job = next(block for block in re.findall(r"```text\n(.*?)```", manual, re.DOTALL) if "#SBATCH" in block)
     (tmp_path / "job.sh").write_text(job.replace("3:55:00", "0:00:05"))
-    stub = tmp_path / "bin" / "sbatch"
-    stub.parent.mkdir()
-    stub.write_text('#!/bin/bash\necho job >> jobs\nexec bash "$1"\n')
-    stub.chmod(0o755)
+    (tmp_path / "bin").mkdir()
+    commands = {"sbatch": 'echo job >> jobs; exec bash "$1"', "rigidmd": f'exec {sys.executable} -m rigidmd "$@"'}
+    for name, line in commands.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/bash\n{line}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
     scene = (stopped / "water.toml").read_text().replace("duration_ps = 0.1", "duration_ps = 12.0")
     (tmp_path / "water.toml").write_text(scene)
-    path = os.pathsep.join([str(stub.parent), str(Path(sys.executable).parent), os.environ["PATH"]])
-    subprocess.run(
-        ["bash", "job.sh"], cwd=tmp_path, env=os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}, check=True
-    )
+    path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}
+    subprocess.run(["bash", "job.sh"], cwd=tmp_path, env=environment, check=True)
     assert len((tmp_path / "jobs").read_text().splitlines()) >= 2
     assert cli.main(["run", str(tmp_path / "water.toml"), "-o", str(tmp_path / "whole")]) == 0
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "runs" / "water")

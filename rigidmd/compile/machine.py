@@ -1,9 +1,13 @@
-"""Properties of this machine: the width of its vectors, and how finely work is divided."""
+"""Properties of this machine: its processor, the width of its vectors, and how finely work is divided."""
 
 import os
 
+from llvmlite.binding import get_host_cpu_name
 from numba.core.codegen import get_host_cpu_features
 
+#: As LLVM names them: the processor, and what it can do.
+PROCESSOR = get_host_cpu_name()
+PROCESSOR_FEATURES = tuple(sorted(name[1:] for name in get_host_cpu_features().split(",") if name.startswith("+")))
 BLOCKS = 16  # of work, which any thread may take: enough for 16 threads
 
 
@@ -11,8 +15,7 @@ def _simd_bits() -> int:
     """Bits of the vectors in pair loops: the widest that this machine supports."""
     if named := os.environ.get("RIGIDMD_SIMD_BITS"):
         return int(named)
-    features = get_host_cpu_features().split(",")
-    return 512 if "+avx512f" in features else 256 if "+avx2" in features else 128
+    return 512 if "avx512f" in PROCESSOR_FEATURES else 256 if "avx2" in PROCESSOR_FEATURES else 128
 
 
 SIMD_BITS = _simd_bits()

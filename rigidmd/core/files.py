@@ -3,10 +3,14 @@
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rigidmd.errors import OutputError
+
+#: Bytes that are read at a time.
+CHUNK = 1 << 20
 
 
 @contextlib.contextmanager
@@ -41,20 +45,30 @@ def sync_file(path: Path) -> None:
 class AppendedFile:
     """A file that grows by whole pieces. A piece that cannot be written is taken back. Methods raise OutputError.
 
-    size : bytes of an existing file to go on with, whose rest is cut off; None begins a new file
+    kept : `kept` of an earlier time, at which an existing file goes on, its rest cut off; None begins a new file
+    patched : offset and first value of bytes that `patch` replaces
     """
 
-    def __init__(self, path: Path, size: int | None = None):
+    def __init__(self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")):
         self._path = path
+        self._size, self._sum = kept or (0, 0)
         with self._told():
-            self._file = path.open("wb" if size is None else "r+b", buffering=0)
-            self.size = size or 0
-            if size is not None:
-                if self._file.seek(0, os.SEEK_END) < size:
+            self._file = path.open("wb" if kept is None else "r+b", buffering=0)
+            if kept is not None:
+                try:
+                    self._check(*patched)
+                except OutputError:
                     self._file.close()
-                    raise OutputError(f"{path} is shorter than it was: {size} bytes are needed to go on with it")
-                self._file.truncate(size)
-                self._file.seek(size)
+                    raise
+                self._file.truncate(self._size)
+                self._file.seek(self._size)
+
+    @property
+    def kept(self) -> tuple[int, int]:
+        """Bytes so far, all of them on the disk, and the CRC-32 of what was appended."""
+        with self._told():
+            os.fsync(self._file.fileno())
+        return self._size, self._sum
 
     def append(self, piece: bytes) -> None:
         """Add a piece at the end."""
@@ -63,26 +77,34 @@ class AppendedFile:
                 self._write(piece)
             except OSError:
                 with contextlib.suppress(OSError):
-                    self._file.truncate(self.size)
+                    self._file.truncate(self._size)
                 raise
-            self.size += len(piece)
+            self._size += len(piece)
+            self._sum = zlib.crc32(piece, self._sum)
 
     def patch(self, offset: int, piece: bytes) -> None:
         """Replace bytes at an offset."""
         with self._told():
             self._file.seek(offset)
             self._write(piece)
-            self._file.seek(self.size)
-
-    def sync(self) -> None:
-        """Return when all of it is on the disk."""
-        with self._told():
-            os.fsync(self._file.fileno())
+            self._file.seek(self._size)
 
     def close(self) -> None:
         """Close it."""
         with self._told():
             self._file.close()
+
+    def _check(self, offset: int, first: bytes) -> None:
+        """Hold the file against its size and checksum."""
+        found, left = 0, self._size
+        while left and (piece := bytearray(self._file.read(min(left, CHUNK)))):
+            if left == self._size:
+                piece[offset : offset + len(first)] = first
+            found, left = zlib.crc32(piece, found), left - len(piece)
+        if left:
+            raise OutputError(f"{self._path} is shorter than it was: {self._size} bytes are needed to go on with it")
+        if found != self._sum:
+            raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
 
     def _write(self, piece: bytes) -> None:
         rest = memoryview(piece)

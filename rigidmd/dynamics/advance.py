@@ -66,10 +66,12 @@ def row_of(scheme: Scheme) -> Row:
 def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, cursor):
     """Step until `until` steps of dt have been taken, counted in state.step.
 
-    code : see `code_of`. terms : of a body its workspaces, of molecules a `Loader`. probe : room for gradients; None
-    compiles none. heat, room : of a bath, of
-    a box (`baths.heat_room`, `boxes.box_room`). cursor (3,) : flows done in this step; whether `load` is that of the
-    present positions (1) or that with the gradient (2); whether a move of the box is made and not yet judged.
+    code : see `code_of`
+    terms : of a body its workspaces, of molecules a `Loader`
+    probe : room for gradients; None compiles none
+    heat, room : of a bath, of a box (`baths.heat_room`, `boxes.box_room`)
+    cursor (3,) : flows done in this step; whether `load` is that of the present positions (1) or that with the gradient
+        (2); whether a move of the box is made and not yet judged
 
     Forces are evaluated before a kick where positions have changed since, so the last evaluation of a step serves the
     next one. A status code: when it is not OK, state and cursor are such that calling again continues without a trace.

@@ -14,8 +14,9 @@ from rigidmd.errors import SceneError
 from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.pairs.loop import PairForces, PairWorkspace
 from rigidmd.forces.pairs.sites import place_sites
-from rigidmd.forces.waves.ewald import EwaldWorkspace
-from rigidmd.forces.waves.mesh import PmeWorkspace
+from rigidmd.forces.waves.errors import charges_of, mesh_error, radius_of, real_error, wave_error
+from rigidmd.forces.waves.ewald import EwaldSum, EwaldWorkspace
+from rigidmd.forces.waves.mesh import Pme, PmeWorkspace
 from rigidmd.units import COULOMB
 
 #: Accuracy of the reference sum, relative to the estimated error of the sum under test.
@@ -70,6 +71,24 @@ def accuracy(system: System, state: State) -> Accuracy:
         energy=energy - exact_energy,
         reference=next(note for note in reference.notes if note.startswith("ewald")),
     )
+
+
+def estimated_error(system: System, cell: np.ndarray) -> float:
+    """The estimated rms error of Coulomb forces on sites in another cell (3, 3), u Å/ps²: waves, grid and alpha stay
+    as they are. The system has Ewald sums.
+    """
+    over, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
+    counts = np.bincount(system.model.species, minlength=len(system.species))
+    charged = [m.charges != 0 for m in system.species]
+    charges = charges_of(
+        [(int(n), m.charges[c], m.positions_body[c]) for n, m, c in zip(counts, system.species, charged, strict=True)]
+    )
+    if isinstance(over, Pme):
+        wave = mesh_error(charges, over.alpha, cell, over.grid, over.order)
+    else:
+        over = cast(EwaldSum, over)
+        wave = wave_error(charges, over.alpha, radius_of(over.waves.total, volume), volume)
+    return float(np.hypot(real_error(charges, over.alpha, system.cutoff, volume), wave)) * COULOMB
 
 
 def rounding(system: System, state: State) -> tuple[float, float] | None:

@@ -1,9 +1,5 @@
 """The summary of a run of a single body: one dictionary with units in its keys."""
 
-import platform
-from importlib.metadata import version
-
-import numba
 import numpy as np
 
 from rigidmd.assemble.body import BodySystem
@@ -16,15 +12,13 @@ LARGE_ENERGY_ERROR = 1e-3
 def summarise_body(
     system: BodySystem, motion: Motion, planned: int, preparing: float, wall: float, computing: float, interrupted: bool
 ) -> dict:
-    """The summary of a run; times in s: preparing (compiling), wall (with output), computing (steps)."""
+    """The summary of a run but for what it was computed with; times in s: preparing (compiling), wall (with output),
+    computing (steps).
+    """
     run = system.scene.run
     end = float(motion["t"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
     return {
-        "scene": system.scene.name,
-        "rigidmd_version": version("rigidmd"),
-        "numba_version": numba.__version__,
-        "machine": platform.processor() or platform.machine(),
         "interrupted": interrupted,
         "kind": system.kind,
         "pinned": not system.flies,

@@ -1,12 +1,9 @@
 """The summary of a run: one dictionary with units in its keys."""
 
-import platform
 from collections import Counter
 from collections.abc import Sequence
-from importlib.metadata import version
 from math import isnan, sqrt
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -15,7 +12,7 @@ from rigidmd.core.state import TAKEN, State
 from rigidmd.measure.drift import inefficiency, slope
 from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
-from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
 #: Figures of a stage that a minimisation does not have.
 OF_MOTION = (
@@ -30,6 +27,8 @@ OF_MOTION = (
 DRIFTS, DIFFER, SURE, LEAST = 0.1, 0.02, 5.0, 20
 #: Largest share of the translational temperature in a common drift of all molecules without a note.
 SHOWS = 1e-4
+#: Growth of the estimated error of Coulomb forces that is told.
+COARSER = 1.5
 
 
 def summarise(
@@ -37,7 +36,6 @@ def summarise(
     samples: Samples,
     state: State,
     relief_steps: int,
-    threads: int,
     preparing: float,
     wall: float,
     computing: Sequence[float],
@@ -48,7 +46,8 @@ def summarise(
     minima: dict[int, Minimum],
     warnings: list[str],
 ) -> dict:
-    """The summary of a run; times in s: preparing (compiling, relief), wall (stages with output), computing (steps).
+    """The summary of a run but for what it was computed with; times in s: preparing (compiling, relief), wall (stages
+    with output), computing (steps).
 
     choices : choice and reason for stages that left their integrator open
     stable : the longest stable step (ps) of stages, as estimated at their start
@@ -68,12 +67,6 @@ def summarise(
         if any(sample.stage == k for sample in samples.rows)
     ]
     return {
-        "scene": scene.name,
-        "rigidmd_version": version("rigidmd"),
-        "numba_version": numba.__version__,
-        "machine": platform.processor() or platform.machine(),
-        "threads": threads,
-        "seed": scene.seed,
         "interrupted": interrupted,
         "molecules": len(system.model.species),
         "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),
@@ -97,6 +90,7 @@ def summarise(
         "notes": [
             *system.notes,
             *_drifting(system, state, samples.rows[-1]),
+            *box_notes(system, state),
             *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples.rows, k)),
             *warnings,
         ],
@@ -126,6 +120,22 @@ def _drifting(system: System, state: State, last: Sample) -> list[str]:
     return [
         f"the molecules drift together with |P| = {momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
         "run.remove_momentum_interval_ps removes the total momentum"
+    ]
+
+
+def box_notes(system: System, state: State) -> list[str]:
+    """A note if the box has grown or shrunk until waves or grid of the start no longer give the accuracy asked for."""
+    if system.force_error is None or not any(stage.changes_box for stage in system.scene.stages):
+        return []
+    from rigidmd.measure.accuracy import estimated_error  # SciPy is for such runs only
+
+    now = estimated_error(system, state.cell)
+    if now <= COARSER * system.force_error:
+        return []
+    before, after = (f"{error / COULOMB:.2g}" for error in (system.force_error, now))
+    return [
+        f"the box has changed, and with it the estimated error of Coulomb forces, from {before} to {after} e²/Å²: "
+        "alpha, waves and grid are those of the start. A run with structure.file = 'final.npz' chooses them anew"
     ]
 
 

@@ -5,6 +5,7 @@ The first columns are those of OpenMM's StateDataReporter.
 
 import csv
 import io
+from collections.abc import Sequence
 from math import isnan
 from pathlib import Path
 
@@ -25,20 +26,19 @@ def columns(tensor: bool = True) -> dict[str, str]:
 class Log:
     """Writes samples to a CSV file, numbers with all significant digits; missing values are empty. Raises OutputError.
 
-    kept : bytes of an existing file to go on with; the rest is cut off. None begins a new file
+    kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
     """
 
-    def __init__(self, path: Path, tensor: bool, kept: int | None = None):
+    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None):
         self._columns = columns(tensor)
         self._file = AppendedFile(path, kept)
         if kept is None:
             self._append(list(self._columns.values()))
 
     @property
-    def kept(self) -> int:
-        """Bytes so far, all of them on disk."""
-        self._file.sync()
-        return self._file.size
+    def kept(self) -> tuple[int, int]:
+        """Bytes so far, all of them on the disk, and their checksum."""
+        return self._file.kept
 
     def write(self, sample: Sample) -> None:
         """Add a line."""

@@ -6,7 +6,7 @@ import struct
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -269,7 +269,7 @@ class TrajectoryFile:
     write is checked, a file that ends early ends with a whole frame, and a run can go on with the file of another.
 
     interval : time between frames (ps); only .dcd uses it, which stores it once for all frames
-    kept : bytes and frames of an existing file to go on with; the rest is cut off. None begins a new file
+    kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
     Raises OutputError, here and in every method.
     """
 
@@ -280,7 +280,7 @@ class TrajectoryFile:
         interval: float,
         velocities: bool,
         wrapped: bool,
-        kept: tuple[int, int] | None = None,
+        kept: Sequence[int] | None = None,
     ):
         self._path, self._format, self._system = path, path.suffix, system
         self._velocities, self._wrapped = velocities, wrapped
@@ -291,14 +291,15 @@ class TrajectoryFile:
             ".pdb": {"multiframe": True, "bonds": None},  # those of the topology do
         }
         self._options = forms.get(path.suffix, {})
-        size, self._frames = kept or (0, 0)
-        self._file = AppendedFile(path, size if kept else None)
+        *before, self._frames = kept or (0, 0, 0)
+        offset, form = COUNTER.get(path.suffix, (0, ""))
+        patched = (offset, struct.pack(form, 1)) if form else (0, b"")
+        self._file = AppendedFile(path, before if kept else None, patched)
 
     @property
-    def kept(self) -> tuple[int, int]:
-        """Bytes and frames so far, all of them on disk."""
-        self._file.sync()
-        return self._file.size, self._frames
+    def kept(self) -> tuple[int, int, int]:
+        """Bytes so far, all of them on the disk, their checksum, and the number of frames."""
+        return *self._file.kept, self._frames
 
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""

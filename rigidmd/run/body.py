@@ -21,8 +21,10 @@ from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
 from rigidmd.run.loop import Costs, Options, Simulation, Stretch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.provenance import plain
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import check_same_scene, state_from
+from rigidmd.run.signals import interruptible
 from rigidmd.scene import BodyScene
 from rigidmd.validation import settled
 
@@ -91,7 +93,7 @@ class BodySimulation(Simulation):
 
     def _memory(self) -> dict[str, Any]:
         return {
-            "scene": self.scene.model_dump(mode="json", exclude_none=True),
+            "scene": plain(self.scene),
             "stable": self._stable,
             "notes": self.notes,
         }
@@ -175,7 +177,8 @@ class BodySimulation(Simulation):
 
     def start_energy(self) -> dict:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""
-        self._prepare()
+        with interruptible():
+            self._prepare()
         load, _ = self.engine.evaluate(self.state)
         seen = motion(self.system, [Snapshot(0.0, self.state)])
         torque = load.torque_body @ self.system.axes.T

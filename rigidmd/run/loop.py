@@ -3,13 +3,11 @@
 import contextlib
 import signal
 import sys
-import threading
 import time as clock
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack, cast, overload
 
@@ -37,8 +35,10 @@ from rigidmd.output.report import write_summary
 from rigidmd.run.keeper import PIECE, Keeper
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Every, Observer
+from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import fitting
+from rigidmd.run.resuming import changed_since, fitting
+from rigidmd.run.signals import handled, interruptible
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
@@ -201,26 +201,32 @@ class Simulation(Base):
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
         with contextlib.ExitStack() as stack:
-            kept, stays = None, False  # whether files of the folder stay
+            kept, stays = None, False
             if self.folder is not None:
                 stack.callback((lock := FolderLock(self.folder)).release)
                 lock.take()
-                kept = self._kept() if self._resume else None
-                stays = kept is not None or (self._resume and never_began(self.folder))
+                if self._resume:
+                    kept, stays = self._kept()
                 if not stays:
                     check_folder(self.folder, self._force, inputs)
             self._interrupted, self._signal, self._out_of_time = False, None, False
             scene = cast(MolecularScene | BodyScene, self.scene)
             self._keeper = Keeper(self.folder, scene.output.checkpoint_minutes, self._deadline)
-            stack.enter_context(self._asks_at_signals())
+            if hasattr(signal, "SIGUSR1"):
+                stack.enter_context(handled(self._ask_for_checkpoint, signal.SIGUSR1))
             self._warnings.clear()
+            self._inputs = input_digests(self.scene)
             self._reset()
             began = clock.perf_counter()
             if kept is None:
-                self._prepare()
+                with interruptible():
+                    self._prepare()
             else:
                 with fitting(self.folder):
                     self._recall(kept)
+                    changed = changed_since(kept.told["with"])
+                if changed is not None:
+                    self.note(changed)
                 self._say(f"going on from step {self.state.step[NOW]}")
             prepared = clock.perf_counter() - began
             observers = [*self._own_observers(), *self._observers]
@@ -231,7 +237,10 @@ class Simulation(Base):
                     make_folder(self.folder, self._force, names, inputs, lock)
                 else:
                     continue_folder(self.folder, names)
-            stack.enter_context(self._stops_at_signals())
+            ending = [signal.SIGINT]
+            if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:  # else the program has its own way to end
+                ending.append(signal.SIGTERM)
+            stack.enter_context(handled(self._stop_at_next_look, *ending))
             for k, observer in enumerate(observers):
                 stack.callback(observer.close)
                 if kept is None:
@@ -239,28 +248,32 @@ class Simulation(Base):
                 else:
                     with fitting(self.folder):
                         observer.resume(self, kept.of(_owner(k, observer)))
-            began = clock.perf_counter()
             try:
+                began = clock.perf_counter()
                 computing = self._run_stretches(observers, progress, kept)
+                return self._finished(observers, Costs(prepared, clock.perf_counter() - began, computing))
             except (SimulationError, OutputError) as error:
                 raise self._failed(error, observers) from None
-            costs = Costs(prepared, clock.perf_counter() - began, computing)
-            results = Results(self.system, self.state, self._samples())
-            results.interrupted, results.signal = self._interrupted, self._signal
-            results.out_of_time = self._out_of_time
-            results.summary = self._summary(results.samples, costs)
-            for observer in observers:
-                observer.end(self, results)
-            if self.folder is not None:
-                results.files.append(self.path(SUMMARY))
-                results.summary["files"] = [str(path) for path in results.files]
-                write_summary(self.path(SUMMARY), results.summary)
+
+    def _finished(self, observers: list[Observer], costs: Costs) -> Results:
+        """The results, with all files written. Raises OutputError."""
+        results = Results(self.system, self.state, self._samples())
+        results.interrupted, results.signal = self._interrupted, self._signal
+        results.out_of_time = self._out_of_time
+        results.summary = provenance(self.scene, self.threads, self._inputs) | self._summary(results.samples, costs)
+        for observer in observers:
+            observer.end(self, results)
+        if self.folder is not None:
+            results.files.append(self.path(SUMMARY))
+            results.summary["files"] = [str(path) for path in results.files]
+            write_summary(self.path(SUMMARY), results.summary)
         return results
 
     # Implemented for molecules and for bodies.
 
     system: "System | BodySystem"
     engine: Engine
+    threads: int
     stretch: Stretch  # the present one
     time_unit = ""
 
@@ -347,20 +360,19 @@ class Simulation(Base):
 
     def _last_chance(self) -> str:
         """What a run that could not write can be resumed from."""
-        if not self._keeper.keeps:
-            return ""
-        return f". Make room and go on from the last checkpoint: rigidmd resume {self.folder}"
+        kept = [name for name in (CHECKPOINT, PREVIOUS) if self.folder is not None and self.path(name).is_file()]
+        return f". Make room and go on from the last checkpoint: rigidmd resume {self.folder}" if kept else ""
 
-    def _kept(self) -> Checkpoint | None:
-        """The checkpoint to go on from; None if there is no run yet."""
+    def _kept(self) -> tuple[Checkpoint | None, bool]:
+        """The checkpoint to go on from, None if the run has to begin, and whether the files of the folder stay."""
         folder = cast(Path, self.folder)
         if is_empty(folder) or never_began(folder):
             self._say(f"{folder} holds no run yet: beginning it")
-            return None
+            return None, not is_empty(folder)
         kept, faults = latest(folder)
         for fault in faults:
             self._warn(f"{fault}. The checkpoint before it is used")
-        return kept
+        return kept, True
 
     def _checkpoint(self, observers: list[Observer], place: "Place") -> None:
         """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
@@ -373,7 +385,7 @@ class Simulation(Base):
             arrays |= {f"{owner}/{name}": array for name, array in own.items()}
         arrays |= {f"state/{name}": array for name, array in self.state._asdict().items()}
         arrays |= {f"engine/{name}": array for name, array in memory.items()}
-        told = {"rigidmd": version("rigidmd"), "place": place._asdict(), "run": self._memory(), "of": of}
+        told = {"with": computed_with(), "place": place._asdict(), "run": self._memory(), "of": of}
         self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW])))
 
     def _run_stretches(
@@ -461,46 +473,12 @@ class Simulation(Base):
             if now:
                 observer.see(moment)
 
-    @contextlib.contextmanager
-    def _asks_at_signals(self) -> Iterator[None]:
-        """SIGUSR1 asks for a checkpoint, where there is such a signal."""
-        number = getattr(signal, "SIGUSR1", None)
-        if number is None or threading.current_thread() is not threading.main_thread():
-            yield
-            return
+    def _ask_for_checkpoint(self, number: int) -> None:
+        self._keeper.asked = True
 
-        def ask(signum, frame):
-            self._keeper.asked = True
-
-        before = signal.signal(number, ask)
-        try:
-            yield
-        finally:
-            signal.signal(number, before)
-
-    @contextlib.contextmanager
-    def _stops_at_signals(self) -> Iterator[None]:
-        """Ctrl-C or SIGTERM ends the run at the next look with everything saved; a second Ctrl-C ends it at once.
-
-        If the program has its own handler for SIGTERM, that is kept.
-        """
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def stop(signum, frame):
-            if self._interrupted and signum == signal.SIGINT:
-                raise KeyboardInterrupt
-            self._signal = self._signal or int(signum)
-            self._interrupted = True
-
-        before = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
-        if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-            before[signal.SIGTERM] = signal.SIG_DFL
-        for number in before:
-            signal.signal(number, stop)
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    def _stop_at_next_look(self, number: int) -> None:
+        """End the run at the next look with everything saved; a second Ctrl-C ends it at once."""
+        if self._interrupted and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self._signal = self._signal or number
+        self._interrupted = True

@@ -34,9 +34,11 @@ from rigidmd.run.minimise import minimise
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, Sampler, StepWatch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.provenance import plain
 from rigidmd.run.relief import Relief, relieve
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import check_same_scene, digests, state_from
+from rigidmd.run.resuming import check_same_scene, state_from
+from rigidmd.run.signals import interruptible
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
@@ -70,7 +72,8 @@ class MolecularSimulation(Simulation):
     def start(self) -> Relief | None:
         """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
         self._reset()
-        self._prepare()
+        with interruptible():
+            self._prepare()
         return self._relief
 
     def _reset(self) -> None:
@@ -125,8 +128,8 @@ class MolecularSimulation(Simulation):
 
     def _memory(self) -> dict[str, Any]:
         return {
-            "scene": self._built.scene.model_dump(mode="json", exclude_none=True),
-            "inputs": digests(self._built.scene),
+            "scene": plain(self._built.scene),
+            "inputs": self._inputs,
             "stages": [stage.model_dump(mode="json", exclude_none=True) for stage in self.scene.stages],
             "relief": None if self._relief is None else self._relief._asdict(),
             "choices": list(self._choices.items()),
@@ -326,7 +329,7 @@ class MolecularSimulation(Simulation):
         relief_steps = self._relief.steps if self._relief else 0
         self._moves[self._stage] = self.engine.moves
         return summarise(
-            self.system, samples, self.state, relief_steps, self.threads, costs.preparing, costs.wall,
+            self.system, samples, self.state, relief_steps, costs.preparing, costs.wall,
             costs.computing, self._interrupted, self._choices, self._stable, self._moves, self._minima, self.notes,
         )  # fmt: skip
 

@@ -6,7 +6,7 @@ true, it also sees the last moment of every stretch. No observer depends on the 
 them need belong to the moment or the run.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -123,9 +123,9 @@ class Frames(Observer):
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         """Go on with the trajectory where the checkpoint left it."""
         self._run, self._frames = run, [Frame(time) for time in kept.arrays["time"].tolist()]
-        self._open(tuple(kept.told["kept"]))
+        self._open(kept.told["kept"])
 
-    def _open(self, kept: tuple[int, int] | None) -> None:
+    def _open(self, kept: Sequence[int] | None) -> None:
         from rigidmd.output.trajectory import TrajectoryFile
 
         run, path = self._run, self._run.path(self._names[1])

@@ -1,7 +1,6 @@
 """Whether a checkpoint is one of this scene, and the state that it holds."""
 
 import contextlib
-import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,8 @@ import numpy as np
 
 from rigidmd.core.state import NOW, State
 from rigidmd.errors import CheckpointError
+from rigidmd.run.provenance import APART, computed_with, differences, input_digests, keys_of, plain
 from rigidmd.scene import MolecularScene, Scene
-
-#: Keys that change no bit of a run, or are compared otherwise: input files by their contents.
-APART = ("name", "threads", "output.checkpoint_minutes", "output.figure", "output.figures", "watch")
-
-
-def digests(scene: Scene) -> dict[str, str]:
-    """SHA-256 of each input file of a scene, by its dotted key."""
-    return {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
 
 
 def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int) -> None:
@@ -26,20 +18,14 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
 
     The last stage of molecules may be longer or shorter than it was, but not shorter than it has been.
     """
-    now = _flat(scene.model_dump(mode="json", exclude_none=True))
-    then = _flat(before)
-    apart = {*scene.inputs, *APART}
+    apart = [*scene.inputs, *APART]
     if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
-        apart.add(f"stages.{len(scene.stages) - 1}.duration_ps")
+        apart.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
             raise CheckpointError(f"{scene.source}: the run in the folder is longer already, {steps} steps")
-    keys = [key for key in (now | then) if not any(f"{key}.".startswith(f"{other}.") for other in apart)]
-    faults = [
-        f"{key} is {now.get(key, 'left out')}, there {then.get(key, 'left out')}"
-        for key in keys
-        if now.get(key) != then.get(key)
-    ]
-    found = digests(scene)
+    apart_from = differences(keys_of(plain(scene), apart), keys_of(before, apart))
+    faults = [f"{key} is {now}, there {then}" for key, (now, then) in apart_from.items()]
+    found = input_digests(scene)
     faults += [f"the file of {key} has changed" for key in found if found[key] != inputs.get(key)]
     if faults:
         raise CheckpointError(
@@ -48,15 +34,19 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
         )
 
 
-def _flat(data: Any, name: str = "") -> dict[str, Any]:
-    """Dotted key -> value of nested tables, without those that are None."""
-    if isinstance(data, Mapping):
-        pairs = [(f"{name}.{key}" if name else str(key), value) for key, value in data.items()]
-    elif isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
-        pairs = [(f"{name}.{k}", value) for k, value in enumerate(data)]
-    else:
-        return {} if data is None else {name: data}
-    return {key: value for part, inner in pairs for key, value in _flat(inner, part).items()}
+def changed_since(told: Mapping[str, Any]) -> str | None:
+    """A sentence if the run so far was computed with other versions or on another processor, which may change bits."""
+    now = computed_with()
+    changed = [
+        f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"
+        for key, (then, here) in differences(told, now, None).items()
+        if key not in ("python_version", "processor_features")
+    ]
+    if not changed:
+        return None
+    return (
+        f"the run so far was computed with {'; '.join(changed)}: from here on bits may differ from a run without a stop"
+    )
 
 
 def state_from(arrays: Mapping[str, np.ndarray], like: State) -> State:

@@ -1,0 +1,74 @@
+"""Standard output and standard error, which may be closed, full, or without a reader."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO
+
+from rigidmd.errors import OutputError
+
+
+def open_streams() -> None:
+    """Open what was closed before the start, so that no file of a run gets the number of a standard stream."""
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  (until the process ends)
+
+
+@contextlib.contextmanager
+def checked_streams(lasting: bool) -> Iterator[None]:
+    """Within it a stream that cannot be written raises OutputError, or BrokenPipeError if its reader has gone.
+
+    lasting : raise neither; the stream goes silent
+    """
+    stdout: Any = _Checked(sys.stdout, lasting)
+    stderr: Any = _Checked(sys.stderr, lasting)
+    with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
+        yield
+        stdout.flush()
+
+
+class _Checked:
+    """A text stream that goes silent when it cannot be written, and raises an error unless it is a lasting one."""
+
+    def __init__(self, stream: TextIO, lasting: bool):
+        self._stream, self._lasting = stream, lasting
+
+    def write(self, text: str) -> int:
+        """Write; the number of letters."""
+        with self._told():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is held."""
+        with self._told():
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._silence()
+            if self._lasting:
+                return
+            if isinstance(error, BrokenPipeError):
+                raise
+            raise OutputError(f"standard output cannot be written: {error.strerror}") from None
+
+    def _silence(self) -> None:
+        """Let it go nowhere from now on, with what it still holds."""
+        with contextlib.suppress(OSError, ValueError):  # a stream in memory has no number, and does not fail
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)

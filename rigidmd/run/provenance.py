@@ -1,0 +1,85 @@
+"""What a run was computed with and from: versions, the processor, digests of the scene and of its input files."""
+
+import hashlib
+import json
+import platform
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from typing import Any
+
+from rigidmd.compile.machine import PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
+from rigidmd.errors import SceneError
+from rigidmd.scene import MolecularScene, Scene
+
+#: Packages that may change the last bits of a result.
+PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
+#: Keys that change no bit of a run, or are compared otherwise: input files by their contents.
+APART = ("name", "threads", "output.checkpoint_minutes", "output.figure", "output.figures", "watch")
+
+
+def computed_with() -> dict[str, Any]:
+    """All that besides the scene may change the bits of a result, as JSON has it."""
+    return {
+        **{f"{package}_version": version(package) for package in PACKAGES},
+        "python_version": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "processor": PROCESSOR,
+        "processor_features": list(PROCESSOR_FEATURES),
+        "vector_bits": SIMD_BITS,
+    }
+
+
+def provenance(scene: Scene, threads: int, inputs: Mapping[str, str]) -> dict[str, Any]:
+    """The first part of summary.json: `computed_with`, and what went in. inputs : `input_digests` at the start."""
+    molecular = isinstance(scene, MolecularScene)
+    return {
+        "scene": scene.name,
+        **computed_with(),
+        "threads": threads,
+        "seed": scene.seed if molecular else None,
+        "precision": scene.precision if molecular else "double",
+        "scene_sha256": scene_digest(scene),
+        "input_sha256": dict(inputs),
+    }
+
+
+def scene_digest(scene: Scene) -> str:
+    """SHA-256 of all keys of a resolved scene that decide the bits of its run."""
+    keys = keys_of(plain(scene), (*scene.inputs, *APART))
+    return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
+
+
+def input_digests(scene: Scene) -> dict[str, str]:
+    """SHA-256 of each input file of a scene, by its dotted key. Raises SceneError."""
+    try:
+        return {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
+    except OSError as error:
+        raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
+
+
+def plain(scene: Scene) -> dict[str, Any]:
+    """A scene as JSON has it."""
+    return scene.model_dump(mode="json", exclude_none=True)
+
+
+def keys_of(scene: Mapping[str, Any], apart: Iterable[str]) -> dict[str, Any]:
+    """Dotted key -> value of a `plain` scene, without the keys and tables named in `apart`."""
+    left_out = tuple(f"{key}." for key in apart)
+    return {key: value for key, value in _flat(scene).items() if not f"{key}.".startswith(left_out)}
+
+
+def differences(first: Mapping[str, Any], second: Mapping[str, Any], left_out: Any = "left out") -> dict[str, tuple]:
+    """Key -> both values, where two dictionaries differ."""
+    pairs = {key: (first.get(key, left_out), second.get(key, left_out)) for key in first | second}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def _flat(data: Any, name: str = "") -> dict[str, Any]:
+    """Dotted key -> value of nested tables, without those that are None."""
+    if isinstance(data, Mapping):
+        pairs = [(f"{name}.{key}" if name else str(key), value) for key, value in data.items()]
+    elif isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
+        pairs = [(f"{name}.{k}", value) for k, value in enumerate(data)]
+    else:
+        return {} if data is None else {name: data}
+    return {key: value for part, inner in pairs for key, value in _flat(inner, part).items()}

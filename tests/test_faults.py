@@ -1,0 +1,266 @@
+"""Faults from outside: disks that fill, folders that go, signals, streams that are closed, damaged files.
+
+Whatever happens, a run ends with one sentence, and what it has written before can be read and gone on with.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from rigidmd import cli
+from rigidmd.core.files import AppendedFile
+from rigidmd.core.state_file import read_state
+from rigidmd.errors import RigidMDError
+from rigidmd.output.checkpoint import latest, read_checkpoint
+from rigidmd.output.folder import CHECKPOINT, FINAL, LOG, PREVIOUS
+
+SCENE = """\
+box.density_g_cm3 = 0.9
+forces = { cutoff_A = 5.0, truncation = "smooth_switch" }
+start.temperature_K = 298.0
+output = { log_interval_ps = 0.002, trajectory_interval_ps = 0.02, checkpoint_minutes = 1e-9, figure = false }
+
+[[molecules]]
+model = "spce"
+count = 40
+
+[[stages]]
+ensemble = "nvt"
+temperature_K = 298.0
+duration_ps = 0.1
+"""
+TRAJECTORY = "trajectory.xtc"
+#: So long that a test ends it.
+LONG = ("--set", "stages.0.duration_ps=1000")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """A scene; a run of it, in `whole` beside it."""
+    path = tmp_path_factory.mktemp("scene") / "water.toml"
+    path.write_text(SCENE)
+    assert cli.main(["run", str(path), "-o", str(path.parent / "whole"), "--threads", "1"]) == 0
+    return path
+
+
+def command(scene: Path, folder: Path, *more: str) -> list[str]:
+    return [sys.executable, "-m", "rigidmd", "run", str(scene), "-o", str(folder), "--threads", "1", *more]
+
+
+def ran(arguments: list[str], **options) -> subprocess.CompletedProcess:
+    """A finished process, with what it wrote."""
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+    return subprocess.run(arguments, timeout=300, env=environment() | options.pop("env", {}), **options)
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def started(arguments: list[str], log: Path) -> subprocess.Popen:
+    """A process that has begun to write its log."""
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment())
+    while process.poll() is None and not (log.exists() and log.stat().st_size > 2000):
+        time.sleep(0.005)
+    return process
+
+
+def same(scene: Path, folder: Path) -> bool:
+    """Whether a run ended like the one that nothing happened to."""
+    return cli.main(["compare", str(scene.parent / "whole"), str(folder)]) == 0
+
+
+@pytest.fixture
+def disk(tmp_path) -> Iterator:
+    """A function that makes a small file system of so many kB; its folder."""
+    place = tmp_path / "disk"
+    place.mkdir()
+
+    def make(size: int) -> Path:
+        made = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", place], capture_output=True)
+        if made.returncode:
+            pytest.skip(f"no small file system can be made here: {made.stderr.decode().strip()}")
+        return place
+
+    yield make
+    subprocess.run(["umount", place], capture_output=True)
+
+
+# What is written when the disk is full: the scene, the log, the first checkpoint, frames or a later checkpoint.
+@pytest.mark.parametrize(
+    "size", [96, *(pytest.param(size, marks=pytest.mark.slow) for size in (4, 8, 16, 24, 32, 48, 64, 128, 192, 256))]
+)
+def test_a_disk_that_fills(size, scene, disk, tmp_path):
+    """The run ends with a sentence; with room again it goes on to the same bits."""
+    place = disk(size)
+    done = ran(command(scene, place / "run", *LONG))
+    said = done.stderr.decode()
+    assert done.returncode == 2 and "No space left on device" in said and "Traceback" not in said
+    assert not [path for path in (place / "run").iterdir() if path.name.startswith(".") and path.suffix]
+    shutil.copytree(place / "run", tmp_path / "run")
+    if "rigidmd resume" in said:
+        until = "0.1ps" if size < 150 else "0.5ps"
+        shutil.copytree(scene.parent / "whole", tmp_path / "whole")
+        for name in ("run", "whole"):
+            assert cli.main(["resume", str(tmp_path / name), "--until", until]) == 0
+        assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "run")]) == 0
+    else:
+        assert not (tmp_path / "run" / CHECKPOINT).exists()
+
+
+def test_a_folder_that_is_removed_meanwhile(scene, tmp_path):
+    run = started(command(scene, tmp_path / "run", *LONG), tmp_path / "run" / LOG)
+    shutil.rmtree(tmp_path / "run")
+    said = run.communicate(timeout=60)[1].decode()
+    assert run.returncode == 2
+    assert "cannot be written: No such file or directory" in said
+    assert "Traceback" not in said and "rigidmd resume" not in said
+
+
+def test_a_folder_that_cannot_be_written(scene, disk, tmp_path):
+    place = disk(64)
+    subprocess.run(["mount", "-o", "remount,ro", place], check=True)
+    done = ran(command(scene, place / "run"))
+    assert done.returncode == 2
+    assert "cannot be written: no permission" in done.stderr.decode()
+
+
+@pytest.mark.parametrize(
+    "stream", ["full", pytest.param("closed", marks=pytest.mark.slow), pytest.param("gone", marks=pytest.mark.slow)]
+)
+def test_a_standard_output_that_takes_nothing(stream, scene, tmp_path):
+    """The run is not lost for it."""
+    line = " ".join(f"'{part}'" for part in command(scene, tmp_path / "run"))
+    into = {"full": "> /dev/full", "closed": ">&- 2>&-", "gone": "| true; exit ${PIPESTATUS[0]}"}[stream]
+    done = ran(["bash", "-c", f"{line} {into}"])
+    assert "Traceback" not in done.stderr.decode()
+    assert same(scene, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "changed", [{"LC_ALL": "C"}, pytest.param({"PYTHONIOENCODING": "latin-1"}, marks=pytest.mark.slow)]
+)
+def test_a_poor_environment(changed, scene, tmp_path):
+    """No home, no UTF-8, a path with spaces and letters of other scripts."""
+    folder = tmp_path / "ein Häuschen 水"
+    kept = {name: os.environ[name] for name in ("PATH", "RIGIDMD_CACHE") if name in os.environ}
+    done = subprocess.run(
+        command(scene, folder), capture_output=True, env=kept | changed | {"PYTHONPATH": str(ROOT)}, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert b"orthogonality" in done.stdout
+    assert same(scene, folder)
+
+
+SIGNALS = [signal.SIGTERM, signal.SIGINT]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", SIGNALS, ids=lambda sent: sent.name)
+def test_a_run_that_is_stopped_by_signals_goes_on(sent, scene, tmp_path):
+    """At 25 random moments each, preparing included."""
+    rng = np.random.default_rng(int(sent))
+    for _ in range(25):
+        run = subprocess.Popen(
+            command(scene, tmp_path / "run", "--resume", "--set", "stages.0.duration_ps=0.5"),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment(),
+        )  # fmt: skip
+        time.sleep(float(rng.uniform(1.0, 8.0)))  # not while Python itself starts
+        run.send_signal(sent)
+        said = run.communicate(timeout=120)[1].decode()
+        assert run.returncode in (0, 128 + sent, -sent), said
+        assert "Traceback" not in said
+    assert cli.main(["resume", str(tmp_path / "run")]) == 0
+    assert cli.main(["resume", str(scene.parent / "whole"), "--until", "0.5ps"]) == 0
+    assert same(scene, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_a_command_that_is_interrupted_while_it_compiles(scene, tmp_path):
+    """Ctrl-C ends it with 130, wherever it comes, and the code that it leaves behind can be used."""
+    rng = np.random.default_rng(4)
+    for k in range(9):
+        cache = {"RIGIDMD_CACHE": str(tmp_path / "cache")}
+        run = subprocess.Popen(
+            command(scene, tmp_path / f"run{k}"), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            env=environment() | cache,
+        )  # fmt: skip
+        time.sleep(float(rng.uniform(1.0, 20.0)))
+        run.send_signal(signal.SIGINT)
+        said = run.communicate(timeout=300)[1].decode()
+        assert run.returncode == 130, said
+        assert "Traceback" not in said and "no compiled object" not in said
+    assert ran(command(scene, tmp_path / "last"), env=cache).returncode == 0
+    assert same(scene, tmp_path / "last")
+
+
+@pytest.mark.slow
+def test_two_first_compilations_at_once(scene, tmp_path):
+    environ = environment() | {"RIGIDMD_CACHE": str(tmp_path / "cache")}
+    both = [
+        subprocess.Popen(
+            command(scene, tmp_path / f"run{k}"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environ
+        )
+        for k in range(2)
+    ]
+    for k, run in enumerate(both):
+        assert b"Traceback" not in run.communicate(timeout=900)[1] and run.returncode == 0
+        assert same(scene, tmp_path / f"run{k}")
+
+
+def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
+    """What a command would go on with after reading a file of a run. Raises RigidMDError."""
+    if name == FINAL:
+        found = read_state(folder / name)
+        arrays = {"species": found.species, "residue_number": found.residue_number, "models": found.models}
+        arrays |= found.state._asdict()
+        return {name: array.tobytes() for name, array in arrays.items() if array is not None}
+    kept, faults = latest(folder)
+    if name in (CHECKPOINT, PREVIOUS):
+        assert all(CHECKPOINT in fault for fault in faults)
+        return {name: array.tobytes() for name, array in kept.arrays.items()}
+    owner = {LOG: "LogFile", TRAJECTORY: "Frames"}[name]
+    size, checksum = next(part["kept"] for who, part in kept.told["of"].items() if who.endswith(owner))[:2]
+    AppendedFile(folder / name, (size, checksum)).close()
+    return (folder / name).read_bytes()
+
+
+@pytest.mark.parametrize("times", [25, pytest.param(1000, marks=pytest.mark.slow)])
+def test_damaged_files_of_a_run(times, scene, tmp_path):
+    """Flipped and cut files are refused by name or give way to the checkpoint before; or the damage changes nothing."""
+    names = [CHECKPOINT, PREVIOUS, FINAL, LOG, TRAJECTORY]
+    whole = {name: read_back(scene.parent / "whole", name) for name in names}
+    before = {
+        name: array.tobytes() for name, array in read_checkpoint(scene.parent / "whole" / PREVIOUS).arrays.items()
+    }
+    rng = np.random.default_rng(times)
+    refused = dict.fromkeys(names, 0)
+    for k in range(times):
+        name = names[k % len(names)]
+        shutil.copytree(scene.parent / "whole", tmp_path / "run")
+        path = tmp_path / "run" / name
+        data = bytearray(path.read_bytes())
+        if rng.random() < 0.5:
+            del data[int(rng.integers(len(data))) :]
+        else:
+            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(data))
+        try:
+            found = read_back(tmp_path / "run", name)
+            assert found == whole[name] or (name == CHECKPOINT and found == before)
+        except RigidMDError as error:
+            assert name in str(error)
+            refused[name] += 1
+        shutil.rmtree(tmp_path / "run")
+    assert refused[CHECKPOINT] == refused[PREVIOUS] == 0
+    assert refused[FINAL] > times / 20
+    assert refused[LOG] == refused[TRAJECTORY] == times // 5
