@@ -347,6 +347,8 @@ def _run(options: argparse.Namespace) -> int:
     print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
     if results.interrupted:
         print(f"  `rigidmd resume {shlex.quote(str(folder))}` goes on with it")
+    else:
+        print(f"  `rigidmd view {shlex.quote(str(folder))}` shows its film on a page, `rigidmd report` the page alone")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0

@@ -70,7 +70,7 @@ def _of_body(record: Record) -> list[Panel]:
         for name, values in seen.items()
         if name.endswith("_error") and np.isfinite(values).any()
     ]
-    found.append(Panel("relative errors of what is conserved", errors, log=True))
+    found.append(Panel(f"relative errors of what is conserved (0 is drawn at {FLOOR:.0e})", errors, log=True))
     return found
 
 

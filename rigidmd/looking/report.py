@@ -26,6 +26,13 @@ MEANS = (
     ("pressure_bar", "P (bar)", False),
     ("density", "density (g/cm³)", False),
 )
+#: What a summary tells of the machine and the programs, and what went in.
+KNOWN = (
+    ("rigidmd_version", "rigidmd"), ("numba_version", "Numba"), ("llvmlite_version", "llvmlite"),
+    ("numpy_version", "NumPy"), ("python_version", "Python"), ("machine", "machine"), ("processor", "processor"),
+    ("vector_bits", "bits of a vector"), ("threads", "threads"), ("precision", "precision"), ("seed", "seed"),
+    ("scene_sha256", "SHA-256 of the scene"), ("input_sha256", "SHA-256 of the files that it read"),
+)  # fmt: skip
 #: Files of a run: ending or name -> what is in it.
 ABOUT = {
     "scene.toml": "the scene with all defaults: it repeats the run to the bit",
@@ -191,15 +198,20 @@ def _size(size: float) -> str:
     return f"{size:.3g} GB"
 
 
+def _told_value(value: object) -> str:
+    """A value of the summary; digests of several files as words."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {digest}" for key, digest in value.items())
+    return str(value)
+
+
 def _repeat(record: Record) -> Iterator[str]:
     summary, folder = record.summary or {}, shlex.quote(str(record.folder))
     yield code(
-        f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run, to the same bits\n"
-        f"rigidmd check {folder}/{SCENE}                  # describe it without running it"
+        f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run\n"
+        f"rigidmd compare {folder} {folder}-again    # to the same bits"
     )
-    known = [("rigidmd", "rigidmd_version"), ("Numba", "numba_version"), ("machine", "machine"), ("threads", "threads"),
-             ("seed", "seed")]  # fmt: skip
-    yield table([], [[name, summary[key]] for name, key in known if key in summary], words=True)
+    yield table([], [[name, _told_value(summary[key])] for key, name in KNOWN if summary.get(key)], words=True)
     seconds = [f"{summary[key]:.1f} s {word}" for key, word in (("preparing_s", "to compile and prepare"),
                ("computing_s", "of steps"), ("wall_s", "in all, output included")) if summary.get(key)]  # fmt: skip
     yield f"<p>{html.escape('; '.join(seconds))}.</p>" if seconds else ""
