@@ -132,6 +132,15 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
     assert centre.max() < frames.cells.max() + 0.01
 
 
+@pytest.mark.parametrize("ending", [".trr", ".dcd", ".nc", ".xyz", ".pdb"])
+def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
+    more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.1.duration_ps": 0.01}
+    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
+    frames = molecule_film.frames_of(read_record(tmp_path / "run"), 100)
+    assert frames.time == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-6)
+    assert frames.cells[-1] == pytest.approx(results.state.cell, abs=1e-3)
+
+
 def test_without_chemiscope_a_sentence_says_what_to_install(water, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
     assert cli.main(["view", str(water)]) == 2

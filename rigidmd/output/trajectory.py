@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import struct
 import sys
 import tempfile
@@ -34,6 +35,11 @@ from rigidmd.output.frame import Frame
 
 #: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
+#: Lines that tell the cell and the time of a frame in formats of text.
+BETWEEN_FRAMES = {
+    ".xyz": rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)',
+    ".pdb": rb"^REMARK +()TIME +(\S+) PS",
+}
 #: Frames are evenly spaced if intervals differ by less than this fraction of the longest.
 EVEN = 1e-6
 
@@ -170,8 +176,28 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
             boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
     if not times:
         raise OutputError(f"{path} holds no whole frame")
-    boxed = all(box is not None for box in boxes)
-    return Frames(np.array(times), np.array(positions), np.array(boxes) if boxed else None, count, stride, is_cut)
+    told_times, told_cells = _told_in_text(path)
+    if told_times:
+        times = told_times[::stride][: len(times)]
+    cells = np.array(boxes) if all(box is not None for box in boxes) else None
+    if told_cells:
+        cells = np.array(told_cells[::stride][: len(times)])
+    return Frames(np.array(times), np.array(positions), cells, count, stride, is_cut)
+
+
+def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
+    """Times (ps) and cells (3, 3) that lines between frames of .xyz and .pdb tell, which MDAnalysis passes by."""
+    pattern = BETWEEN_FRAMES.get(path.suffix)
+    if pattern is None:
+        return [], []
+    times, cells = [], []
+    with path.open("rb") as file:
+        for line in file:
+            if (b"Time=" in line or line.startswith(b"REMARK")) and (found := re.search(pattern, line)):
+                times.append(float(found[2]))
+                if found[1]:
+                    cells.append(np.array(found[1].split(), float).reshape(3, 3))
+    return times, cells
 
 
 @contextlib.contextmanager
