@@ -61,10 +61,10 @@ def main(arguments: list[str] | None = None) -> int:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
     except MemoryError:
-        print(
-            f"rigidmd: {options.scene}: not enough memory; take fewer molecules or samples",
-            file=sys.stderr,
-        )
+        from rigidmd.core.memory import free_memory, in_words
+
+        what, free = getattr(options, "scene", "this"), in_words(free_memory())
+        print(f"rigidmd: {what}: not enough memory ({free} free); take fewer molecules or samples", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
@@ -269,8 +269,8 @@ def _walltime(text: str) -> float:
     found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
-    days, hours, minutes, seconds = (int(part or 0) for part in found.groups())
-    return 86400.0 * days + 3600.0 * hours + 60.0 * minutes + seconds
+    days, hours, minutes, seconds = (float(part or 0) for part in found.groups())
+    return 86400 * days + 3600 * hours + 60 * minutes + seconds
 
 
 def _until(text: str) -> float:
@@ -380,7 +380,9 @@ def _say(sentence: str) -> None:
 
 
 def _warn(sentence: str) -> None:
-    print(f"rigidmd: warning: {sentence}", file=sys.stderr)
+    from rigidmd.errors import visible
+
+    print(f"rigidmd: warning: {visible(sentence)}", file=sys.stderr)
 
 
 def _energy(options: argparse.Namespace) -> int:

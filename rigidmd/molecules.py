@@ -1,20 +1,36 @@
 """Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds published models."""
 
-import tomllib
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
+from scipy.spatial import KDTree
 
+from rigidmd.core.toml_text import impossible_values, read_toml
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import Kind, principal_frame, rotational_freedom
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
-from rigidmd.validation import NonNegative, Number, Positive, Section, Vector, faults_of, meant, toml_fault
+from rigidmd.validation import (
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    Vector,
+    faults_of,
+    meant,
+    numbers_beyond,
+    place,
+)
 
 MODELS = Path(__file__).parent / "models"
+#: Absolute values of the numbers of molecules, in Å, u, e, kJ/mol, ps, unless they are 0: products of a few are finite.
+SIZES = (1e-30, 1e30)
 
+#: Of one rigid molecule.
+MOST_SITES = 5000
 #: Two sites closer than this fraction of the molecule's size count as coinciding.
 SAME_PLACE = 1e-6
 #: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
@@ -210,6 +226,8 @@ def molecule(
     faults = [
         f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
     ]
+    if len(sites) > MOST_SITES:
+        faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
     masses = np.array([s.mass_u for s in sites])
@@ -219,10 +237,8 @@ def molecule(
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
     frame = principal_frame(masses, positions, size)
     body = (positions - frame.centre) @ frame.axes
-    for i in range(len(sites)):
-        for j in range(i):
-            if np.linalg.norm(body[i] - body[j]) <= SAME_PLACE * size:
-                faults.append(f"sites {sites[j].name} and {sites[i].name} coincide")  # noqa: PERF401
+    near = KDTree(body).query_pairs(SAME_PLACE * size, output_type="ndarray")
+    faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
     if frame.kind == "point" and not faults:
         off = np.linalg.norm(body, axis=1)
         faults += [
@@ -304,9 +320,15 @@ def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
 
 def available_models() -> list[str]:
     """Names of the shipped models."""
-    return sorted(path.stem for path in MODELS.glob("*.toml"))
+    return list(_shipped())
 
 
+@cache
+def _shipped() -> tuple[str, ...]:
+    return tuple(sorted(path.stem for path in MODELS.glob("*.toml")))
+
+
+@cache
 def model_fault(name: str) -> str:
     """Message that there is no model of this name; empty if there is one."""
     known = available_models()
@@ -345,14 +367,13 @@ Table = TypeVar("Table", bound=Section)
 
 def _read(path: Path, kind: type[Table]) -> Table:
     """A file read as this kind of table. Raises MoleculeError."""
+    data, text = read_toml(path, MoleculeError)
+    wrong = impossible_values(data)
+    if not wrong:
+        wrong = numbers_beyond(data, *SIZES)
+    if wrong:
+        raise MoleculeError(str(path), [f"{place(keys, text)}: {fault}" for keys, fault in wrong])
     try:
-        text = path.read_text(encoding="utf-8")
-        return kind.model_validate(tomllib.loads(text))
-    except OSError as error:
-        raise MoleculeError(str(path), [f"cannot be read: {error.strerror}"]) from None
-    except UnicodeDecodeError as error:
-        raise MoleculeError(str(path), [f"is not TOML: {error}"]) from None
-    except tomllib.TOMLDecodeError as error:
-        raise MoleculeError(str(path), [toml_fault(error, text)]) from None
+        return kind.model_validate(data)
     except ValidationError as error:
         raise MoleculeError(str(path), faults_of(error, kind, text)) from None

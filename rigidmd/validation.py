@@ -2,12 +2,15 @@
 
 import difflib
 import re
-import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from math import isfinite
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic_core import ErrorDetails
+
+from rigidmd.core.toml_text import cut, line_of, shortened
+from rigidmd.errors import MOST_SHOWN
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
@@ -18,8 +21,13 @@ Vector = tuple[Number, Number, Number]
 
 T = TypeVar("T")
 
+#: Tables in a list of tables. Scenes have a handful.
+MOST_TABLES = 1000
+
 #: With more similar names than this, no suggestion is made from a common beginning or end.
 MOST_MEANT = 8
+#: Names longer than this, and more of them, are compared with no others: that would take long and say nothing.
+LONGEST_NAME, MOST_NAMES = 60, 1000
 
 
 class Section(BaseModel):
@@ -41,20 +49,42 @@ def faults_of(
 
     overridden : dotted keys whose values come from the command line, so that they have no line
     """
-    faults = {}
-    for detail in error.errors():
-        keys = [key for key in detail["loc"] if not _is_union_branch(key)]
+    faults: dict[tuple, list[str]] = {}
+    for detail in error.errors(include_url=False):
+        unknown = detail["type"] == "extra_forbidden"  # the last key is what a stranger wrote
+        names = detail["loc"][:-1] if unknown else detail["loc"]
+        keys = [*(key for key in names if not _is_union_branch(key)), *(detail["loc"][-1:] if unknown else ())]
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
             keys = keys[:-1]  # a list lacks an entry: the fault is the list's
-        path = ".".join(str(key) for key in keys)
-        faults.setdefault((place(keys, text, overridden), path), []).append(_sentence(detail, keys, model))
+        # Faults beyond those that are shown only count.
+        sentence = _sentence(detail, keys, model) if len(faults) <= MOST_SHOWN else detail["msg"]
+        faults.setdefault(tuple(keys), []).append(sentence)
     # pydantic reports one error for each type that a value may have: join them. An error inside a value is more
     # specific than one about the whole value.
+    around = {keys[:depth] for keys in faults for depth in range(1, len(keys))}
     return [
-        f"{where}: {_either(list(dict.fromkeys(sentences)))}"
-        for (where, path), sentences in faults.items()
-        if not any(other.startswith(path + ".") for _, other in faults)
+        f"{place(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
+        for keys, sentences in faults.items()
+        if keys not in around
     ]
+
+
+def numbers_beyond(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
+    """Numbers of nested tables and lists that are too small or too large, each with its path of keys and what is wrong.
+
+    Infinities and NaN, which some keys allow, are left to the types of those keys.
+    """
+    found: list[tuple[list, str]] = []
+    rest: list[tuple[list, Any]] = [([], data)]
+    while rest:
+        keys, value = rest.pop()
+        if isinstance(value, dict | list | tuple):
+            inner = value.items() if isinstance(value, dict) else enumerate(value)
+            rest += [([*keys, key], part) for key, part in inner]
+        elif isinstance(value, float) and value != 0 and not least <= abs(value) <= largest and isfinite(value):
+            bounds = f"{least:g} and {largest:g}".replace("e+", "e")
+            found.append((keys, f"is {value:g}, must be 0 or between {bounds}"))
+    return found[::-1]
 
 
 def _either(sentences: list[str]) -> str:
@@ -65,7 +95,7 @@ def _either(sentences: list[str]) -> str:
 
 def place(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
     """Where a key of a scene was given: its line, or the command line."""
-    path = ".".join(map(str, keys))
+    path = ".".join(cut(str(key)) for key in keys)
     if any(f"{path}.".startswith(f"{key}.") for key in overridden):
         return f"--set {path}"
     line = line_of(keys, text)
@@ -79,7 +109,7 @@ def _is_union_branch(key: Any) -> bool:
 
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
-    shown = repr(value) if not isinstance(value, dict | list) else f"a {'table' if isinstance(value, dict) else 'list'}"
+    shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shortened(value)
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
@@ -143,6 +173,9 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
     These are the names that differ only in case and punctuation; else those that begin with it, as when a unit is
     forgotten, or end with it; else the one with the most similar spelling.
     """
+    known = list(known)
+    if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
+        return []
     plain = {key: _plain(key) for key in known}
     asked = _plain(name)
     near = [key for key, letters in plain.items() if letters == asked]
@@ -156,25 +189,6 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
 
 def _plain(name: str) -> str:
     return re.sub(r"[\W_]", "", name).lower()
-
-
-def toml_fault(error: tomllib.TOMLDecodeError, text: str) -> str:
-    """What is wrong with a text that is not TOML. For a value without quotes the line and key are named."""
-    place = re.search(r"at line (\d+), column (\d+)", str(error))
-    number, column = map(int, place.groups()) if place else (0, 0)
-    line = text.splitlines()[number - 1] if place else ""
-    # tomllib stops at the word, or within it: after the inf of "infinite"
-    bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
-    if not bare or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after a list that is not closed
-        return f"is not TOML: {error}"
-    keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1]
-    where = f"line {number}: {'.'.join(map(str, keys))}: "
-    match bare:
-        case "True" | "False":
-            return f"{where}is {bare}, must be written {bare.lower()}"
-        case "None" | "null":
-            return f"{where}is {bare}, which TOML does not have: omit the key"
-    return f'{where}is {bare} without quotes; a text needs them: "{bare}"'
 
 
 def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
@@ -193,40 +207,3 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [m for part in getattr(annotation, "__args__", ()) for m in _models_in(part)]
-
-
-def line_of(keys: list, text: str) -> int | None:
-    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; else None."""
-    found = None
-    for number, table, entry in _lines(text):
-        if entry:
-            if keys[: len(table) + len(entry)] == [*table, *entry]:
-                return number
-        elif keys[: len(table)] == table:
-            found = number
-    return found
-
-
-def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
-    """Lines (from 1) of a TOML text that open a table or set a key: the table's path, and the key's in it or []."""
-    table: list = []
-    counts: dict[str, int] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*\[\[\s*([\w.\"-]+)\s*\]\]", line):
-            name = header[1]
-            counts[name] = counts.get(name, -1) + 1
-            for inner in [key for key in counts if key.startswith(name + ".")]:
-                del counts[inner]
-        elif header := re.match(r"\s*\[\s*([\w.\"-]+)\s*\]", line):
-            name = header[1]
-        else:
-            if entry := re.match(r"\s*([\w.\"-]+)\s*=", line):
-                yield number, table, entry[1].split(".")
-            continue
-        table = []
-        parts = name.split(".")
-        for depth, part in enumerate(parts, 1):
-            table.append(part)
-            if (index := counts.get(".".join(parts[:depth]))) is not None:
-                table.append(index)
-        yield number, table, []

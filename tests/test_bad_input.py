@@ -229,7 +229,7 @@ def test_all_faults_at_once(capsys, tmp_path):
 
 def test_a_missing_scene(capsys):
     assert main(["run", "nowhere.toml"]) == 2
-    assert "nowhere.toml: cannot be read: No such file" in capsys.readouterr().err
+    assert "nowhere.toml: there is no such file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

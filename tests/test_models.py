@@ -518,7 +518,7 @@ def test_one_model_in_full(capsys):
         (["--draw"], "need the NAME of a model"),
         (["spce", "-o", "spce.gif"], "ends in one of .png .svg .pdf"),
         (["spce", "-o", "no/spce.png"], "there is no folder no"),
-        (["mine.toml"], "cannot be read"),
+        (["mine.toml"], "there is no such file"),
     ],
 )
 def test_models_that_cannot_be_shown(arguments, expected, capsys, tmp_path, monkeypatch):

@@ -1083,7 +1083,7 @@ DAMAGED = {
         "alternate locations A, B",
     ),
     "empty.pdb": ("END\n", "holds no atoms"),
-    "cut.xyz": (cut(xyz(WATERS.atoms(), WATERS.cell), 9), "ASE cannot read it"),
+    "cut.xyz": (cut(xyz(WATERS.atoms(), WATERS.cell), 9), "line 1 promises 12 atoms, 7 are there"),
     "words.xyz": ("3\n\nO a b c\nH 0 0 0\nH 0 0 0\n", "ASE cannot read it"),
     "cut.arc": (cut(arc(WATERS.atoms(), None), 9), r"promises 12 atoms, 8 are there"),
     "words.arc": (cut(arc(WATERS.atoms(), None), 12) + "x y\n", "line 13: expected an atom of Tinker's format"),

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
+from rigidmd.assemble.own_formats import promised_atoms
+from rigidmd.core.toml_text import whole_number
 from rigidmd.errors import StructureError
 
 if TYPE_CHECKING:
@@ -43,8 +45,12 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
     """Atoms from ASE's, in our units. Names and elements that are not given are ASE's symbols."""
     symbols = atoms.get_chemical_symbols()
     notes = list(notes)
-    if any(share < 1 for site in atoms.info.get("occupancy", {}).values() for share in site.values()):
-        shares = sorted({f"{e} {s:g}" for site in atoms.info["occupancy"].values() for e, s in site.items() if s < 1})
+    if names is not None and len(names) != len(atoms):
+        raise StructureError(str(path), [f"has {len(names)} atoms, of which ASE reads {len(atoms)}"])
+    shares = {(e, s) for site in (atoms.info.get("occupancy") or {}).values() for e, s in site.items()}
+    if untold := sorted({str(s) for _, s in shares if not (isinstance(s, int | float) and s >= 0)}):
+        raise StructureError(str(path), [f"says of some of its sites that they are occupied by {', '.join(untold)}"])
+    if shares := sorted(f"{e} {s:g}" for e, s in shares if s < 1):
         raise StructureError(
             str(path),
             [
@@ -112,9 +118,11 @@ def _pdb_model(path: Path, head: list[str], body: list[str], notes: list[str]) -
         if (here := line[17:27]) != last:  # name, chain, number and insertion code: numbers alone wrap or run out
             count, last = count + 1, here
         number = line[22:26].strip()
-        residue.append((int(number) if number.isdecimal() else None, line[17:21].strip(), count))
+        residue.append((whole_number(number), line[17:21].strip(), count))
         lines.append(f"{line[:22]:22}{count % 10000:4d}{line[26:76]:50} X")
     found = read_by_ase(path, io.StringIO("\n".join([*head, *lines]) + "\n"), format="proteindatabank")
+    if not found:
+        raise StructureError(str(path), ["holds no atoms that ASE can read"])
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
     return from_ase(path, found[0], names, elements, residue, notes=notes)
@@ -124,12 +132,10 @@ def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The frames of a plain or extended .xyz through ASE, which needs elements where many files have names."""
     labels, at = [], 0
     while at < len(lines) and lines[at].strip():
-        count = lines[at].strip()
-        if not count.isdigit() or at + 2 + int(count) > len(lines):
-            break  # ASE raises the error
+        count = promised_atoms(path, at + 1, lines[at].strip(), len(lines) - at - 2)
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
         column = _species_column(properties.group(1)) if properties else 0
-        for k in range(at + 2, at + 2 + int(count)):
+        for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
             if column is None or len(words) <= column:
                 labels.append(None)
@@ -139,7 +145,7 @@ def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
             labels.append((name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""))
             words[column] = symbol if is_element(symbol) else "H" if symbol in HEAVY_HYDROGEN else "X"
             lines[k] = " ".join(words)
-        at += 2 + int(count)
+        at += 2 + count
     frames, first = [], 0
     for atoms in read_by_ase(path, io.StringIO("\n".join(lines) + "\n"), format="extxyz"):
         own = labels[first : first + len(atoms)]
@@ -156,13 +162,15 @@ def _species_column(properties: str) -> int | None:
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         if name.lower() in ("species", "symbols"):
             return column
-        column += int(width) if width.isdigit() else 1
+        column += 1 if (columns := whole_number(width)) is None else columns
     return None
 
 
 def read_lammps(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
     """LAMMPS data through ASE. The first line may name the units; real and metal differ only in velocities."""
     text = "\n".join(lines) + "\n"
+    if promised := re.search(r"^[ \t]*(\d+)[ \t]+atoms\b", text, re.MULTILINE):
+        promised_atoms(path, text.count("\n", 0, promised.start()) + 1, promised[1], len(lines))
     listed, labels = _lammps_types(lines)
     if not listed and not labels and atom_types is None and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
         fault = "has no section Masses, from which its atom types could be told: name them by structure.atom_types"

@@ -17,6 +17,7 @@ from rigidmd.assemble.body_parts import (
     terms_of,
 )
 from rigidmd.assemble.resolve import FORMULATION, resolve_body
+from rigidmd.assemble.room import check_samples
 from rigidmd.assemble.system import Sites
 from rigidmd.core.schemes import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State, state_of
@@ -252,6 +253,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         raise SceneError(scene.source, faults)
 
     scene = resolve_body(scene, turning, float(np.linalg.norm(points, axis=1).max()))
+    check_samples(scene)
     rotor = rotor_of(scene, moments, added_inertia, axes) if turning else NoRotor()
     frame = frame_of(scene)
     if scene.body.pinned:

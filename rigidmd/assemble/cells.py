@@ -14,6 +14,21 @@ ORIENTED = 1e-6
 HALF_AS_PRINTED = 1e-4
 #: Factor by which another choice of edges must raise the longest possible cut-off before the cell is rotated for it.
 ROOMIER = 1.1
+#: Edges and thicknesses of cells that hold atoms, Å: from half an atom to a tenth of a metre.
+THINNEST, LONGEST = 0.5, 1e9
+
+
+def cell_fault(cell: np.ndarray) -> str:
+    """Why a cell (3, 3) of finite numbers holds no molecules; empty if it may hold some."""
+    if np.abs(cell).max() > LONGEST:
+        return f"it must not be longer than {LONGEST:g} Å"
+    edges = np.linalg.norm(cell, axis=1)
+    told = f"its edges of {', '.join(f'{edge:.4g}' for edge in edges)} Å"
+    areas = np.linalg.norm(np.cross(np.roll(cell, -1, axis=0), np.roll(cell, 1, axis=0)), axis=1)
+    thickness = np.abs(np.linalg.det(cell)) / areas.max() if areas.max() > 0 else 0.0
+    if thickness < THINNEST:
+        return f"with {told} it is {thickness:.3g} Å thin, must be {THINNEST:g} Å at least"
+    return ""
 
 
 def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

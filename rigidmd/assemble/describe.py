@@ -1,6 +1,5 @@
 """A system in words: how it would run, and what was left out."""
 
-from collections.abc import Iterator
 from math import inf
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import numpy as np
 from rigidmd.assemble.body import BodySystem, build_body
 from rigidmd.assemble.cells import angles_deg, right_angled
 from rigidmd.assemble.fields import fields_in_words
+from rigidmd.assemble.room import bytes_of
 from rigidmd.assemble.stage_words import stage_in_words
 from rigidmd.assemble.system import System, build
 from rigidmd.core.schemes import Scheme, Solver
@@ -114,7 +114,7 @@ def _molecules(system: System) -> str:
     for k, stage in enumerate(scene.stages):
         how, law = stage_in_words(stage)
         lines += [f"  {k}: {how}", f"     {law}"]
-    lines.append(f"\nmemory: about {array_bytes(system) / 1e6:.1f} MB for state, forces and neighbour lists")
+    lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces and neighbour lists")
     return "\n".join(lines)
 
 
@@ -125,21 +125,3 @@ def _term(system: System, name: str, term: NamedTuple) -> str:
     if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
         reach += f", {system.scene.forces.truncation}"
     return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
-
-
-def array_bytes(value) -> int:
-    """Bytes of all arrays in nested tuples; each array counts once."""
-    if isinstance(value, System):
-        # The state four times: the start, the one that moves, the last good one, forces and torques.
-        fixed = (value.engine().room(value.state), value.model, value.sites)
-        return 4 * array_bytes(value.state) + array_bytes(fixed)
-    return sum({id(array): array.nbytes for array in _arrays(value)}.values())
-
-
-def _arrays(value) -> Iterator[np.ndarray]:
-    """All arrays in nested tuples."""
-    if isinstance(value, np.ndarray):
-        yield value
-    elif isinstance(value, tuple):
-        for part in value:
-            yield from _arrays(part)

@@ -145,6 +145,7 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+    from scipy.spatial.distance import cdist
 
     numbers = {kind: k for k, kind in enumerate({*kinds}.union(*map(_labels, species)))}
     reach = np.zeros((len(numbers), len(numbers)))
@@ -152,7 +153,7 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
         sites = massive(molecule)
         points = molecule.positions_body[sites]
         number = [numbers[_labels(molecule)[s]] for s in sites]
-        tree = minimum_spanning_tree(np.linalg.norm(points[:, None] - points, axis=2)).tocoo()
+        tree = minimum_spanning_tree(cdist(points, points)).tocoo()
         for i, j, length in zip(tree.row, tree.col, tree.data, strict=True):
             one, other = number[i], number[j]
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)

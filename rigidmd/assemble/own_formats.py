@@ -4,6 +4,7 @@ These are .gro (ASE supports neither more digits, nor several frames, nor veloci
 and .txyz (ASE has no reader, MDAnalysis reads in single precision) and .cssr (neither has a reader).
 """
 
+import contextlib
 import re
 from collections.abc import Callable
 from functools import partial
@@ -13,7 +14,18 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.assemble.atoms import Atoms
+from rigidmd.core.toml_text import whole_number
 from rigidmd.errors import StructureError
+
+
+def promised_atoms(path: Path, line: int, text: str, there: int) -> int:
+    """The number of atoms that a line promises, at most as many as there are. Raises StructureError."""
+    count = whole_number(text)
+    if count is None:
+        raise StructureError(str(path), [f"line {line}: expected the number of atoms, found {text[:60]!r}"])
+    if count > there:
+        raise StructureError(str(path), [f"line {line} promises {count} atoms, {max(0, there)} are there: truncated?"])
+    return count
 
 
 def _numbers(path: Path, number: int, words: list[str], what: str) -> list[float]:
@@ -31,15 +43,16 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     frames, first = [], 0
     while first < len(lines):
         promised = lines[first + 1].strip() if first + 1 < len(lines) else ""
-        if not promised.isdigit():
+        count = whole_number(promised)
+        if count is None:
             raise StructureError(
                 str(path), [f"line {first + 2}: expected the number of atoms, found {promised[:60]!r}"]
             )
-        box = first + 2 + int(promised)
+        box = first + 2 + count
         if box >= len(lines):
             there = max(0, len(lines) - first - 3)
             raise StructureError(
-                str(path), [f"line {first + 2} promises {promised} atoms and a box, {there} are there: truncated?"]
+                str(path), [f"line {first + 2} promises {count} atoms and a box, {there} are there: truncated?"]
             )
         what = "the box, 3 or 9 numbers (is the number of atoms right?)"
         edges = _numbers(path, box + 1, lines[box].split(), what)
@@ -71,8 +84,7 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
                 )
             velocity[k - first - 2] = found
         names.append(line[10:15].strip())
-        number = line[:5].strip()
-        residue.append((int(number) if number.isdecimal() else None, line[5:10].strip()))
+        residue.append((whole_number(line[:5].strip()), line[5:10].strip()))
     xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
     cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     return Atoms(
@@ -92,16 +104,10 @@ def read_arc(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     lines = [line for line in lines if line.strip()]
     frames, first = [], 0
     while first < len(lines):
-        count = lines[first].split()[0]
-        if not count.isdigit():
-            raise StructureError(str(path), [f"frame {len(frames) + 1}: expected the number of atoms, found {count!r}"])
+        words = lines[first].split()
         periodic = first + 1 < len(lines) and len(lines[first + 1].split()) == 6 and "." in lines[first + 1].split()[0]
         start = first + 1 + periodic
-        end = start + int(count)
-        if end > len(lines):
-            raise StructureError(
-                str(path), [f"promises {count} atoms, {max(0, len(lines) - start)} are there: truncated?"]
-            )
+        end = start + promised_atoms(path, first + 1, words[0], len(lines) - start)
         frames.append(partial(_arc_frame, path, lines[first + 1] if periodic else "", lines[start:end], start + 1))
         first = end
     return frames
@@ -109,7 +115,7 @@ def read_arc(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 def _arc_frame(path: Path, box: str, lines: list[str], first: int) -> Atoms:
     """The atoms from line `first` on."""
-    cell = _cell(_numbers(path, first - 1, box.split(), "three edges and three angles")) if box else None
+    cell = _cell(path, _numbers(path, first - 1, box.split(), "three edges and three angles")) if box else None
     names, position = _columns(path, lines, first, "an atom of Tinker's format: number, name, x, y, z, type, bonds")
     return Atoms(names, [""] * len(names), [()] * len(names), position, None, cell, None, [])
 
@@ -135,19 +141,21 @@ def _cssr_atoms(path: Path, lines: list[str]) -> Atoms:
         raise StructureError(str(path), [f"expected {what}"])
     if re.search(r"SPGR\s*=\s*(?!1?\s*P\s*1\s*$)\S", lines[1]):
         raise StructureError(str(path), [f"has the space group {lines[1].split('=')[-1].strip()}; only P1 is read"])
-    cell = _cell(_numbers(path, 1, [*edges, *angles], what))
-    head = [word for word in lines[2].split() if word.isdigit()]
-    if not head or len(lines) < 4 + int(head[0]):
-        raise StructureError(
-            str(path), [f"line 3 promises {head[0] if head else 'no'} atoms, {len(lines) - 4} are there: truncated?"]
-        )
-    names, position = _columns(path, lines[4 : 4 + int(head[0])], 5, "an atom of a .cssr: number, name, x, y, z")
+    cell = _cell(path, _numbers(path, 1, [*edges, *angles], what))
+    head = [word for word in lines[2].split() if whole_number(word) is not None]
+    count = promised_atoms(path, 3, head[0] if head else lines[2].strip(), len(lines) - 4)
+    names, position = _columns(path, lines[4 : 4 + count], 5, "an atom of a .cssr: number, name, x, y, z")
     if head[1:2] != ["1"]:
         position = position @ cell
     return Atoms(names, [""] * len(names), [()] * len(names), position, None, cell, None, [])
 
 
-def _cell(edges_and_angles: list[float]) -> np.ndarray:
+def _cell(path: Path, edges_and_angles: list[float]) -> np.ndarray:
     from ase.geometry import cellpar_to_cell
 
-    return cellpar_to_cell(edges_and_angles)
+    edges, angles = np.array(edges_and_angles).reshape(2, 3)
+    if (edges > 0).all() and (angles > 0).all() and (angles < 180).all():
+        with contextlib.suppress(AssertionError):  # of ASE, where three edges cannot form the angles
+            return cellpar_to_cell([*edges, *angles])
+    told = " ".join(f"{x:g}" for x in edges_and_angles)
+    raise StructureError(str(path), [f"no cell has its edges and angles, {told}"])

@@ -5,15 +5,25 @@ is "auto", which a pilot run chooses; the number of threads, on which results do
 the cell of the scene leans so much that another cell of the same lattice stands for it (see `Resolved.pme_grid`).
 """
 
-from math import inf, pi, sqrt
+from math import inf, pi, prod, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from rigidmd.assemble.cells import basis_in_words, edges_in_words
 from rigidmd.core.schemes import RK4, SOLVERS
 from rigidmd.forces.pairs.space import Space, Triclinic, cell_of
-from rigidmd.forces.waves.errors import FAREST, Charges, alpha_for, charges_of, mesh_for, wave_radius_for
+from rigidmd.forces.waves.errors import (
+    FAREST,
+    MOST_POINTS,
+    SPACINGS,
+    Charges,
+    alpha_for,
+    charges_of,
+    mesh_for,
+    wave_radius_for,
+)
 from rigidmd.forces.waves.vectors import AS_GIVEN
 from rigidmd.molecules import Molecule
 from rigidmd.scene import BodyScene, MolecularScene
@@ -27,6 +37,7 @@ ACCURACY = 1e-5  # of Ewald sums
 REMOVE_MOMENTUM_INTERVAL = 1.0
 #: Along an edge, as forces.ewald_k_max has it: more would take all memory.
 MOST_WAVES = 1000
+MOST_WAVES_IN_ALL = 2e7  # of which a step with 1000 sites takes half a minute
 
 SAMPLES = 2000  # of the motion of a body
 TOLERANCE = 1e-10  # of DOP853 and RADAU
@@ -128,7 +139,7 @@ def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list
             f"{half:.3f} Å: a site would meet two images of another. Take a larger box or a shorter cut-off"
         )
     for m in facts.species:
-        extent = np.linalg.norm(m.positions_body[:, None] - m.positions_body, axis=2).max()
+        extent = pdist(m.positions_body).max(initial=0.0)
         if extent > half:
             faults.append(
                 f"a molecule of {m.name} is {extent:.2f} Å long, more than half {least} of the box, {half:.3f} Å"
@@ -197,6 +208,12 @@ def _ewald(
                 f"{MOST_WAVES} waves along an edge of the box"
             )
             return numbers, [fault], None
+        if (count := _waves_at_most(forces, radius, facts.space.volume)) > MOST_WAVES_IN_ALL:
+            fault = (
+                f"forces.electrostatics = 'ewald' needs about {count:.2g} waves, more than {MOST_WAVES_IN_ALL:.2g}: "
+                "use pme, or ask for less accuracy, fewer waves or a smaller box"
+            )
+            return numbers, [fault], None
         return numbers | {"ewald_k_radius_per_A": radius}, [], None
     grid, order, cell = forces.pme_grid, forces.pme_order, cell_of(facts.space)
     if grid is not None and len(set(grid)) > 1 and not facts.is_as_described:
@@ -204,6 +221,11 @@ def _ewald(
             f"forces.pme_grid = {list(grid)} counts points along edges of a cell that leans too much; the box is that "
             f"with {edges_in_words(cell)}, {basis_in_words(facts.basis)}, and has its own edges. Describe the box by "
             "that cell, or give three equal numbers, or leave pme_grid out"
+        )
+        return numbers, [fault], None
+    if grid is None and (longest := np.linalg.norm(cell, axis=1).max()) > MOST_POINTS * SPACINGS[0]:
+        fault = (
+            f"forces.electrostatics = 'pme': an edge of {longest:.4g} Å is too long for a grid of {MOST_POINTS} points"
         )
         return numbers, [fault], None
     if grid is None or order is None:
@@ -219,6 +241,13 @@ def _ewald(
     else:
         numbers["ewald_accuracy"] = accuracy
     return numbers, [], grid
+
+
+def _waves_at_most(forces: Forces, radius: float | None, volume: float) -> float:
+    """About how many waves the radius (1/Å) and the limits of [forces] leave."""
+    most = forces.ewald_k_max
+    boxed = inf if most is None else prod(2.0 * n + 1 for n in (most if isinstance(most, tuple) else (most,) * 3))
+    return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
 
 
 def resolve_body(scene: BodyScene, turns: bool, radius: float) -> BodyScene:

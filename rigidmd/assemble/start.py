@@ -2,13 +2,15 @@
 
 import numpy as np
 
+from rigidmd.assemble.cells import cell_fault
 from rigidmd.assemble.fields import start_lattice
 from rigidmd.assemble.momenta import draw_momenta, mobile, remove_momentum
+from rigidmd.assemble.room import check_molecules
 from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
 from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
-from rigidmd.errors import StructureError
+from rigidmd.errors import SceneError, StructureError
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
@@ -21,6 +23,8 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     if scene.structure is not None:
         path = scene.path(scene.structure.file)
         start = scene.structure
+        if scene.box.cell is not None and (fault := cell_fault(scene.box.cell)):
+            raise SceneError(scene.source, [f"box: {fault}"])
         found = read_structure(
             path,
             species,
@@ -43,10 +47,14 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
             raise StructureError(str(path), faults)
         return found
     counts = [settled(entry.count) for entry in scene.molecules]
+    of_sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
+    check_molecules(scene.source, sum(counts), of_sites)
     mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
     cell = scene.box.cell
     if cell is None:
         cell = np.eye(3) * np.cbrt(mass / (settled(scene.box.density_g_cm3) * GRAM_PER_CM3))
+    if fault := cell_fault(cell):
+        raise SceneError(scene.source, [f"box: {fault}"])
     rng = np.random.default_rng([scene.seed, LATTICE])
     n = sum(counts)
     found = Arrangement(

@@ -1,5 +1,6 @@
 """A start from a structure file: atoms become the scene's molecules, in the scene's box."""
 
+from math import prod
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from rigidmd.assemble.cells import (
     angles_deg,
     basis_in_words,
     basis_of,
+    cell_fault,
     edges_in_words,
     reduced,
     right_angled,
@@ -18,6 +20,7 @@ from rigidmd.assemble.cells import (
     standard_rotation,
 )
 from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
+from rigidmd.assemble.room import check_molecules
 from rigidmd.assemble.structure_files import read_atoms
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
@@ -83,8 +86,13 @@ def read_structure(
             notes.append("the scene's box counts, not that of the file")
     else:
         cell = found.cell
+    if cell is not None and (fault := cell_fault(cell)):
+        raise StructureError(str(path), [f"its box: {fault}"])
     found = found._replace(cell=cell, notes=tuple(notes))
     if repeat != (1, 1, 1):
+        count = prod(repeat) * np.bincount(found.species, minlength=len(species)).astype(object)
+        of_sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
+        check_molecules(str(path), sum(count), of_sites)
         found = _repeated(found, repeat)
     return leaning_less(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
 
@@ -160,12 +168,16 @@ def _read_molecules(
         atoms = atoms._replace(cell=cell)
     if periodic and wanted is None:
         _check_box(path, atoms.cell, notes)
+    if atoms.cell is not None and periodic and (fault := cell_fault(atoms.cell)):
+        raise StructureError(str(path), [f"its box: {fault}"])
     across = atoms.cell if atoms.cell is not None or not periodic else wanted
     matched = match(atoms, species, across, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
         raise StructureError(str(path), faults)
+    if len(matched.species) == 0:
+        raise StructureError(str(path), ["holds no atoms with mass, so no molecules"])
     notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]

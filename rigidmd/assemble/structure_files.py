@@ -9,9 +9,14 @@ import numpy as np
 from rigidmd.assemble.ase_formats import from_ase, read_by_ase, read_lammps, read_pdb, read_xyz
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of
 from rigidmd.assemble.own_formats import read_arc, read_cssr, read_gro
-from rigidmd.errors import StructureError
+from rigidmd.core.files import file_fault
+from rigidmd.core.memory import in_words, memory_fault
+from rigidmd.errors import UNSEEN, StructureError
 from rigidmd.scene.place import LAMMPS_DATA
 
+FARTHEST = 1e9  # Å, of an atom from the origin
+HEAVIEST = 1e30  # u
+FOR_BYTE = 20  # bytes of memory for each of a file: lines and words as text, numbers
 NO_VOLUME = 1e-9  # of a cell, relative to the cube of its longest edge
 READERS = {
     ".gro": read_gro,
@@ -31,8 +36,11 @@ def read_atoms(path: Path, frame: int | None = None, atom_types: dict[str, str] 
     frame: 1 for the first, -1 for the last; None where there must be only one. atom_types: names of the types in a
     LAMMPS data file.
     """
-    if not path.is_file():
-        raise StructureError(str(path), ["there is no such file"])
+    if fault := file_fault(path):
+        raise StructureError(str(path), [fault])
+    size = path.stat().st_size
+    if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
+        raise StructureError(str(path), [f"not enough memory: {fault}"])
     atoms = _choose(path, _frames(path, atom_types), frame)()
     if len(atoms.position) == 0:
         raise StructureError(str(path), ["holds no atoms"])
@@ -41,6 +49,13 @@ def read_atoms(path: Path, frame: int | None = None, atom_types: dict[str, str] 
             bad = int(np.argmin(np.isfinite(values).all(axis=1)))
             owner = "its box has an edge" if what == "cell" else f"atom {bad + 1} has a position"
             raise StructureError(str(path), [f"{owner} that is not a finite number"])
+    if (far := np.abs(atoms.position).max()) > FARTHEST:
+        raise StructureError(str(path), [f"an atom is at {far:.3g} Å, farther than {FARTHEST:g} Å: is this the unit?"])
+    if atoms.masses is not None and not ((atoms.masses >= 0) & (atoms.masses < HEAVIEST)).all():
+        raise StructureError(str(path), ["an atom has a mass that is negative, too large or no number"])
+    for k, texts in enumerate(zip(atoms.names, atoms.elements, atoms.residue, strict=True), 1):
+        if any(UNSEEN.search(str(text)) for text in (*texts[:2], *texts[2])):
+            raise StructureError(str(path), [f"atom {k} has a name with control characters: {texts[0]!r}"])
     return _without_placeholder(atoms)
 
 

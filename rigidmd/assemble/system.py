@@ -11,6 +11,7 @@ from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_ter
 from rigidmd.assemble.momenta import Freedom, freedom_of, kept_momentum, mobile
 from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.resolve import Facts, resolve, resolve_momentum
+from rigidmd.assemble.room import check_room
 from rigidmd.assemble.species import frozen_apart, species_of
 from rigidmd.assemble.stage_words import stage_notes
 from rigidmd.assemble.start import arrange, residue_numbers, set_momenta
@@ -187,6 +188,7 @@ def build(scene: MolecularScene) -> System:
         ]
         if faults:
             raise SceneError(scene.source, faults)
+    check_room(system)
     system.notes.extend(set_momenta(scene, model, state, arrangement))
     system.notes.extend(
         f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"

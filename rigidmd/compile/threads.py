@@ -1,6 +1,23 @@
-"""How OpenMP threads wait for work. Imported before Numba, because OpenMP reads these settings when it is loaded."""
+"""Settings of threads. Imported before Numba, because Numba and OpenMP read them when they are loaded."""
 
 import os
+
+from rigidmd.errors import SettingError
+
+MOST_THREADS = 4096
+LAYERS = ("default", "safe", "threadsafe", "forksafe", "tbb", "omp", "workqueue")
+
+
+def _check(settings: "os._Environ[str]") -> None:
+    """Raise SettingError for settings on which Numba stops with an error of its own, or hangs."""
+    threads, layer = settings.get("NUMBA_NUM_THREADS"), settings.get("NUMBA_THREADING_LAYER")
+    if threads and not (threads.isascii() and threads.isdigit() and 0 < int(threads[:9]) <= MOST_THREADS):
+        raise SettingError(f"NUMBA_NUM_THREADS is {threads[:40]!r}, must be a whole number from 1 to {MOST_THREADS}")
+    if layer and layer not in LAYERS:
+        raise SettingError(f"NUMBA_THREADING_LAYER is {layer[:40]!r}, must be one of {', '.join(LAYERS)}")
+
+
+_check(os.environ)
 
 # A thread that waits for work polls 1000 times, for 50 to 100 µs, and then sleeps. A thread that polls for longer keeps
 # a core busy that another program may need; a thread that sleeps at once must be woken for every parallel loop, and

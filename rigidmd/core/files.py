@@ -1,16 +1,39 @@
-"""Files that are written completely or not at all, and files that grow by whole pieces."""
+"""Files that are written completely or not at all, files that grow by whole pieces, and which files can be read."""
 
 import contextlib
+import errno
 import os
+import stat
 import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
+from math import inf
 from pathlib import Path
 
 from rigidmd.errors import OutputError
 
 #: Bytes that are read at a time.
 CHUNK = 1 << 20
+
+
+def file_fault(path: Path, largest: float = inf) -> str:
+    """Why a file cannot be read; empty if it can be. Pipes and devices, which may never end, cannot.
+
+    largest : bytes that it may have
+    """
+    try:
+        found = path.stat()
+    except OSError as error:
+        return "there is no such file" if error.errno == errno.ENOENT else f"cannot be read: {error.strerror}"
+    except ValueError:
+        return "there is no such file: its name holds a zero byte"
+    if stat.S_ISDIR(found.st_mode):
+        return "is a folder"
+    if not stat.S_ISREG(found.st_mode):
+        return "is no file but a pipe, a socket or a device"
+    if found.st_size > largest:
+        return f"has {found.st_size / 1e6:.4g} MB; files of up to {largest / 1e6:.4g} MB are read"
+    return ""
 
 
 @contextlib.contextmanager

@@ -1,16 +1,19 @@
 """A state on disk, every bit of it: `final.npz`. The one function that writes it, and the one that reads it."""
 
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import file_fault, whole_file
+from rigidmd.core.memory import in_words, memory_fault
 from rigidmd.core.state import State, state_of
 from rigidmd.errors import StructureError
 
 #: Of the files. Version 1 (rigidmd 0.1) did not say its version and held no step, books and bath.
 SCHEMA = 2
+LARGEST = 1e30  # of any number in a state
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 
 
@@ -43,14 +46,18 @@ def write_state(path: Path, saved: Saved) -> None:
 
 def read_state(path: Path) -> Saved:
     """Read a state back, to the bit. Raises StructureError with all that is wrong with the file."""
+    if fault := file_fault(path):
+        raise StructureError(str(path), [fault])
     try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if fault := memory_fault(2 * size, f"reading its {in_words(size)}"):
+            raise ValueError(f"not enough memory: {fault}")
         with np.load(path, allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
         schema = int(arrays.pop("schema", 1))
         names = [str(name) for name in arrays.pop("species_names")]
         species = arrays["species"]
-    except FileNotFoundError:
-        raise StructureError(str(path), ["there is no such file"]) from None
     except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: {error}"]) from None
     if schema > SCHEMA:
@@ -76,11 +83,14 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     m = n if len(np.atleast_1d(arrays["rotation"])) else 0
     shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3), "rotation": (m, 3, 3)}
     shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (3,)}
+    shapes |= {"bath": (arrays["bath"].size,)}
     shapes |= {"residue_number": (n,)} if "residue_number" in arrays else {}
     shapes |= {"models": (len(names), 5)} if "models" in arrays else {}
     bad = {key for key, shape in shapes.items() if arrays[key].shape != shape or arrays[key].dtype.kind not in "fi"}
-    finite = [key for key in (*shapes, "bath") if key not in (*bad, "cell")]
-    bad |= {key for key in finite if not np.isfinite(arrays[key]).all()}
+    sound = [key for key in shapes if key not in (*bad, "cell")]
+    bad |= {key for key in sound if not (np.abs(arrays[key]) <= LARGEST).all()}  # NaN is not
+    if "cell" not in bad and not _is_cell(arrays["cell"]):
+        bad.add("cell")
     bad |= {key for key in ("species", "residue_number") if key in arrays and arrays[key].dtype.kind != "i"}
     if "species" not in bad and not np.isin(arrays["species"], np.arange(len(names))).all():
         bad.add("species")
@@ -89,3 +99,10 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
         if np.abs(gap).max() > NOT_A_ROTATION or (np.linalg.det(arrays["rotation"]) < 0).any():
             bad.add("rotation")
     return bad
+
+
+def _is_cell(cell: np.ndarray) -> bool:
+    """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or infinite edges, which are none."""
+    if not np.isfinite(cell).all():
+        return not np.isfinite(cell.diagonal()).any()
+    return bool((cell.diagonal() > 0).all() and not np.triu(cell, 1).any() and np.abs(cell).max() <= LARGEST)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from rigidmd.core.toml_text import cut
 from rigidmd.errors import OutputError
 
 #: Files of a run; the scene names trajectory and topology.
@@ -19,7 +20,11 @@ LOCK = ".rigidmd-lock"
 
 def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None:
     """Raise OutputError if a run could not be written there, or would remove one of its inputs; changes nothing."""
-    if folder.exists():
+    try:
+        exists = folder.exists()
+    except OSError as error:  # a name that is too long
+        raise OutputError(f"{cut(str(folder))} cannot be written: {error.strerror}") from None
+    if exists:
         if not folder.is_dir():
             raise OutputError(f"{folder} is a file; name another folder with -o")
         if not is_empty(folder):

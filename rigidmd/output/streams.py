@@ -1,6 +1,7 @@
 """Standard output and standard error, which may be closed, full, or without a reader."""
 
 import contextlib
+import io
 import os
 import sys
 from collections.abc import Iterator
@@ -10,7 +11,10 @@ from rigidmd.errors import OutputError
 
 
 def open_streams() -> None:
-    """Open what was closed before the start, so that no file of a run gets the number of a standard stream."""
+    """Open what was closed before the start, so that no file of a run gets the number of a standard stream.
+
+    What the encoding of a terminal lacks is written as an escape, and ends no run.
+    """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
@@ -19,6 +23,8 @@ def open_streams() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  (until the process ends)
+        if isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextlib.contextmanager

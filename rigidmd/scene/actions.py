@@ -50,6 +50,9 @@ class Timed(Section):
         for key, value in values.items():
             if value is None:
                 continue
+            if value == ():
+                faults.append(f"{key} is an empty list")
+                continue
             many = isinstance(value, tuple) and (entry is float or isinstance(value[0], tuple))
             if times is None and many:
                 faults.append(f"{key} is a list of values: times_s is missing")
@@ -139,7 +142,7 @@ class Frame(Timed):
             faults.append("from_s and to_s are not supported here; use times_s")
         if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
             faults.append("angular_acceleration_rad_s2 and times_s contradict each other")
-        if not any(timed.values()) and self.angular_acceleration_rad_s2 is None:
+        if all(value is None for value in timed.values()) and self.angular_acceleration_rad_s2 is None:
             faults.append("needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2")
         if faults:
             raise ValueError("; ".join(faults))

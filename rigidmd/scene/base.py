@@ -2,20 +2,31 @@
 
 import os
 import re
-import tomllib
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, PrivateAttr, ValidationError
 
+from rigidmd.core.files import file_fault
+from rigidmd.core.toml_text import (
+    DEEPEST,
+    TOMLDecodeError,
+    impossible_values,
+    parse_toml,
+    read_toml,
+    shortened,
+    whole_number,
+)
 from rigidmd.errors import SceneError
-from rigidmd.validation import Section, faults_of, meant, nearest, perhaps, place, toml_fault
+from rigidmd.validation import Section, faults_of, meant, nearest, numbers_beyond, perhaps, place
 
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene
     from rigidmd.scene.molecules import MolecularScene
+
+LONGEST_NAME = 100
 
 
 class Scene(Section):
@@ -24,8 +35,11 @@ class Scene(Section):
     A scene with a table [body] is a `BodyScene`, any other a `MolecularScene`.
     """
 
-    name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=100)] = "scene"
+    name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run; default: that of the file"""
+
+    SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
+    """What numbers may have as absolute values, unless they are 0: squares and products then stay finite"""
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
@@ -77,16 +91,8 @@ class Scene(Section):
         `overrides` may be anywhere, and are taken relative to the working directory.
         """
         path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-            data = tomllib.loads(text)
-        except OSError as error:
-            raise SceneError(str(path), [f"cannot be read: {error.strerror}"]) from None
-        except UnicodeDecodeError as error:
-            raise SceneError(str(path), [f"is not TOML: {error}"]) from None
-        except tomllib.TOMLDecodeError as error:
-            raise SceneError(str(path), [toml_fault(error, text)]) from None
-        data.setdefault("name", re.sub(r"[^\w.\-]", "_", path.stem))
+        data, text = read_toml(path, SceneError)
+        data.setdefault("name", re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene")
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
 
     @classmethod
@@ -109,10 +115,13 @@ class Scene(Section):
         overridden = []
         for key, value in (overrides or {}).items():
             faults += _override(data, key, value)
-            if value is None and key.rpartition(".")[2].isdigit():
+            if value is None and whole_number(key.rpartition(".")[2]) is not None:
                 text = ""  # entries after a removed one have other numbers than in the text
             else:
                 overridden.append(key)
+        if wrong := impossible_values(data):
+            raise SceneError(source, [f"{place(keys, text, overridden)}: {fault}" for keys, fault in wrong])
+        faults += [f"{place(keys, text, overridden)}: {fault}" for keys, fault in numbers_beyond(data, *kind.SIZES)]
         faults += kind.contradictions(data, text)
         try:
             scene = kind.model_validate(data)
@@ -130,14 +139,22 @@ class Scene(Section):
         """Faults: missing files, by line and key."""
         faults = []
         for key, path in self.inputs.items():
-            if path.is_file():
+            if not (fault := file_fault(path)):
                 continue
-            where = place([int(part) if part.isdigit() else part for part in key.split(".")], text, overridden)
-            what = "is a folder" if path.is_dir() else "there is no such file"
-            there = sorted(path.parent.iterdir()) if path.parent.is_dir() else []
-            stems = nearest(path.stem, {other.stem for other in there})
-            faults.append(f"{where}: {what}: {path}{perhaps([other.name for other in there if other.stem in stems])}")
+            keys = [part if (number := whole_number(part)) is None else number for part in key.split(".")]
+            there = _beside(path)
+            stems = nearest(path.stem, {other.stem for other in there if other.name != path.name})
+            alike = perhaps([other.name for other in there if other.stem in stems])
+            faults.append(f"{place(keys, text, overridden)}: {fault}: {shortened(str(path))}{alike}")
         return faults
+
+
+def _beside(path: Path) -> list[Path]:
+    """What lies in the folder of a path; nothing if there is no such folder."""
+    try:
+        return sorted(path.parent.iterdir())
+    except (OSError, ValueError):
+        return []
 
 
 def file_name(name: str, endings: tuple[str, ...]) -> str:
@@ -165,13 +182,16 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
     """Set one dotted key in nested tables and lists in place; None removes it. Returns faults."""
     if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
-    *parents, last = key.split(".")
+    *parents, last = key.split(".", DEEPEST + 1)
+    if len(parents) > DEEPEST:
+        return [f"--set {shortened(key)}: is a key of more than {DEEPEST} parts"]
     target: Any = data
     for depth, part in enumerate([*parents, last]):
         here = ".".join(key.split(".")[:depth])
         listed, table = isinstance(target, list), isinstance(target, dict)
         if listed:
-            if not part.isdigit() or int(part) >= len(target):
+            number = whole_number(part)
+            if number is None or number >= len(target):
                 return [f"--set {key}: {here} has entries 0 to {len(target) - 1}, not {part!r}"]
         elif not table:
             return [f"--set {key}: {here} is not a table"]
@@ -201,6 +221,6 @@ def parse_override(text: str) -> tuple[str, Any]:
     if not value.strip():
         return key.strip(), None
     try:
-        return key.strip(), tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        return key.strip(), parse_toml(f"value = {value}")["value"]
+    except TOMLDecodeError:
         return key.strip(), value.strip()

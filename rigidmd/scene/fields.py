@@ -3,10 +3,10 @@
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Strict, field_validator, model_validator
+from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.scene.species import ResidueNumber, checked_numbers, spans
-from rigidmd.validation import NonNegative, Number, Positive, Section, Vector
+from rigidmd.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
 
 if TYPE_CHECKING:
     from rigidmd.scene.molecules import MolecularScene
@@ -118,9 +118,9 @@ class Fields(Section):
     """Its phase"""
     gravity_m_s2: Vector | None = None
     """Uniform gravity"""
-    walls: tuple[Walls, ...] = ()
+    walls: tuple[Walls, ...] = Field(default=(), max_length=MOST_TABLES)
     """Flat walls that molecules stay between"""
-    restraints: tuple[Restraint, ...] = ()
+    restraints: tuple[Restraint, ...] = Field(default=(), max_length=MOST_TABLES)
     """Springs on centres of mass"""
 
     @model_validator(mode="after")

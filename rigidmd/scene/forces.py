@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, Strict, model_validator
 
 from rigidmd.molecules import Mixing
-from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
+from rigidmd.validation import MOST_TABLES, Count, Flag, NonNegative, Positive, Section
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
@@ -53,7 +53,7 @@ class Forces(Section):
     smooth_switch begins; default: at 0.6 of the cut-off"""
     mixing: Mixing = "lorentz-berthelot"
     """Lennard-Jones parameters between unlike sites"""
-    pairs: tuple[UnlikePair, ...] = ()
+    pairs: tuple[UnlikePair, ...] = Field(default=(), max_length=MOST_TABLES)
     """Parameters of particular pairs, in place of the mixing rule"""
     tail_correction: Flag = False
     """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` includes it, `virial` does not"""

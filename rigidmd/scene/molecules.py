@@ -1,19 +1,21 @@
 """The scene of molecules: species, box, forces, stages, output."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, Strict, field_validator, model_validator
 
+from rigidmd.core.toml_text import shortened
 from rigidmd.errors import SceneError
+from rigidmd.molecules import SIZES
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.place import Box, Start, Structure
 from rigidmd.scene.species import SPECIES_FILES, Molecules
-from rigidmd.scene.stage import Stage
+from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.watch import Watch
-from rigidmd.validation import Count, Flag, Section
+from rigidmd.validation import MOST_TABLES, Count, Flag, Section
 
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc")
@@ -79,6 +81,8 @@ class Output(Section):
 class MolecularScene(Scene):
     """A scene of moving molecules."""
 
+    SIZES: ClassVar[tuple[float, float]] = SIZES
+
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Seed of all random numbers"""
     precision: Literal["double", "mixed"] = "double"
@@ -87,11 +91,11 @@ class MolecularScene(Scene):
     """Number of threads; default: all cores. Results do not depend on it"""
     structure: Structure | None = None
     box: Box = Box()
-    molecules: tuple[Molecules, ...] = Field(min_length=1)
+    molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)
     forces: Forces = Forces()
     fields: Fields = Fields()
     start: Start = Start()
-    stages: tuple[Stage, ...] = Field(min_length=1)
+    stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
     run: Throughout = Throughout()
     output: Output = Output()
     watch: Watch = Watch()
@@ -105,6 +109,8 @@ class MolecularScene(Scene):
             raise SceneError(self.source, [f"the last stage {what}: --until cannot set its end"])
         if not until > before:
             raise SceneError(self.source, [f"--until {until:g} ps: the last stage begins at {before:g} ps"])
+        if not (until - before) * 1000 / last.timestep_fs < MOST_STEPS:
+            raise SceneError(self.source, [f"--until {until:g} ps is more than {MOST_STEPS:g} steps away"])
         stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": until - before}))
         return self.model_copy(update={"stages": stages})
 
@@ -240,7 +246,15 @@ class MolecularScene(Scene):
                 for key in SPECIES_FILES
             ]
         return [
-            f"{key}: {file!r} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
+            f"{key}: {shortened(file)} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
             for key, file in named
-            if isinstance(file, str) and not (folder / file).resolve().is_relative_to(folder.resolve())
+            if isinstance(file, str) and not _lies_in(folder / file, folder)
         ]
+
+
+def _lies_in(path: Path, folder: Path) -> bool:
+    """Whether a path leads to a place in a folder. True for what leads nowhere, which is found missing later."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a name that is too long, a loop of links, a zero byte
+        return True

@@ -24,7 +24,7 @@ from peer_engines import environment
 from peers import WORKLOADS, numbers, write_start
 
 from rigidmd import Scene, Simulation
-from rigidmd.assemble.describe import array_bytes
+from rigidmd.assemble.room import array_bytes
 from rigidmd.core.schemes import SCHEMES
 
 WORK = WORKLOADS["W1"]

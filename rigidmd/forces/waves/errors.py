@@ -17,6 +17,12 @@ FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
 PROXY = 32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
 ORDERS = (4, 5, 6, 7, 8)
 SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
+#: Along an edge: an edge of 0.1 mm has not more.
+MOST_POINTS = 2**16
+
+
+#: Distances inside molecules that agree to so many digits (Å) count as the same; with many charges all in a bin do.
+FINE, COARSE, MANY_CHARGES = 6, 0.1, 200
 
 
 class Charges(NamedTuple):
@@ -36,15 +42,28 @@ class Charges(NamedTuple):
 
 def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
     """The `Charges` of species, each given as (number of molecules, charges (s,) in e, positions (s, 3) in Å)."""
-    square, count, pairs = 0.0, 0, {}
+    square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
     for n, charge, position in molecules:
         count += n * len(charge)
         square += n * float(charge @ charge)
-        for i in range(len(charge)):
-            for j in range(i):
-                r = round(float(np.linalg.norm(position[i] - position[j])), 6)
-                pairs[r] = pairs.get(r, 0.0) + 2 * n * float(charge[i] * charge[j])
-    return Charges(count, square, np.array([(product, r) for r, product in pairs.items()]).reshape(-1, 2))
+        i, j = np.tril_indices(len(charge), -1)
+        product, distance = 2 * n * (charge[i] * charge[j]), np.linalg.norm(position[i] - position[j], axis=1)
+        if len(charge) > MANY_CHARGES:
+            bins = np.rint(distance / COARSE).astype(int)
+            product, distance = np.bincount(bins, product), COARSE * np.arange(bins.max() + 1)
+        products.append(product)
+        distances.append(np.round(distance, FINE))
+    return Charges(count, square, _by_distance(np.concatenate(products), np.concatenate(distances)))
+
+
+def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Sums of products (p,) over pairs of one distance, and these distances (d, 2), in the order in which they come."""
+    _, first, which = np.unique(distances, return_index=True, return_inverse=True)
+    sums = np.zeros(len(first))
+    np.add.at(sums, which, products)
+    order = np.argsort(first)
+    told = [round(distance, FINE) for distance in distances[first[order]].tolist()]
+    return np.array([sums[order], told]).T.copy()
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
@@ -158,7 +177,8 @@ def mesh_for(
     order, grid : fixed, if given
     """
     edges = np.linalg.norm(cell, axis=1)
-    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in SPACINGS] if grid is None else [grid]
+    sensible = SPACINGS[edges.max() / SPACINGS <= MOST_POINTS]
+    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
     best = None
     for p in ORDERS if order is None else (order,):
         low, high = 0, len(grids)

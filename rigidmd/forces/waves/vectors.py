@@ -66,20 +66,22 @@ def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
 def _waves(most, inside) -> Waves:
     mx, my, mz = (int(m) for m in most)
     z = np.arange(-mz, mz + 1)
-    columns, counts, start = [], [], 0
+    columns, counts = [], []
     for x in range(mx + 1):
-        for y in range(-my if x else 0, my + 1):
-            n = np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=-1)
-            found = z[inside(n) & ((x > 0) | (y > 0) | (z > 0))]
-            if len(found):
-                columns.append((x, y, found[0], start))
-                counts.append(len(found))
-                start += len(found)
-    blocks = max(1, min(BLOCKS, len(columns)))
-    shares = np.searchsorted(np.cumsum(counts), np.linspace(0, start, blocks + 1)[1:-1]) if columns else []
+        y = np.arange(-my if x else 0, my + 1)
+        n = np.stack(np.broadcast_arrays(x, y[:, None], z), axis=-1)
+        found = inside(n) & ((x > 0) | (y[:, None] > 0) | (z > 0))
+        here = np.flatnonzero(found.any(axis=1))
+        columns.append(np.stack([np.full(len(here), x), y[here], z[found[here].argmax(axis=1)]], axis=1))
+        counts.append(np.count_nonzero(found[here], axis=1))
+    count = np.concatenate(counts).astype(np.int64)
+    ends = np.cumsum(count)
+    total = int(count.sum())
+    blocks = max(1, min(BLOCKS, len(count)))
+    shares = np.searchsorted(ends, np.linspace(0, total, blocks + 1)[1:-1])
     return Waves(
-        np.array(columns, np.int64).reshape(-1, 4),
-        np.array(counts, np.int64),
+        np.column_stack([np.concatenate(columns), ends - count]).astype(np.int64),
+        count,
         np.array([mx, my, mz]),
-        np.array([0, *shares, len(columns)], np.int64),
+        np.array([0, *shares, len(count)], np.int64),
     )

@@ -1,0 +1,174 @@
+"""TOML from strangers: files are read within bounds, and what no table may hold is found before anything else is."""
+
+import re
+import tomllib
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from tomllib import TOMLDecodeError
+from typing import Any, NamedTuple
+
+from rigidmd.core.files import file_fault
+from rigidmd.errors import UNSEEN, Faults
+
+#: Bytes of a file of TOML. Reading takes a second per megabyte; a molecule of 10,000 sites has one.
+LARGEST = 4_000_000
+#: Tables and lists inside one another; scenes need six.
+DEEPEST = 32
+#: TOML's whole numbers have 64 bits.
+LEAST_WHOLE, LARGEST_WHOLE = -(2**63), 2**63 - 1
+
+_LONG_KEY = re.compile(rf"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST}}}")
+
+
+def read_toml(path: Path, refusal: type[Faults]) -> tuple[dict[str, Any], str]:
+    """The tables of a file, and its text. Raises `refusal`."""
+    try:
+        if fault := file_fault(path, LARGEST):
+            raise refusal(str(path), [fault])
+        text = path.read_text(encoding="utf-8-sig")  # Windows begins files with a mark of the encoding
+        return parse_toml(text), text
+    except OSError as error:
+        raise refusal(str(path), [f"cannot be read: {error.strerror}"]) from None
+    except UnicodeDecodeError as error:
+        raise refusal(str(path), [f"is not TOML: {error}"]) from None
+    except TOMLDecodeError as error:
+        raise refusal(str(path), [toml_fault(error, text)]) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a text. Raises TOMLDecodeError, also for what the library cannot take: depth, digits."""
+    if long := _LONG_KEY.search(text):
+        line = text.count("\n", 0, long.start()) + 1
+        raise TOMLDecodeError(f"a key of more than {DEEPEST} parts (at line {line}, column 1)")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise TOMLDecodeError(f"lists or tables more than {DEEPEST} deep") from None
+    except TOMLDecodeError:
+        raise
+    except ValueError as error:  # of int(), which takes 4300 digits
+        number = re.search(r"\d{4301}", text)
+        line = text.count("\n", 0, number.start()) + 1 if number else 1
+        why = "a whole number of more than 64 bits" if number else str(error)
+        raise TOMLDecodeError(f"{why} (at line {line}, column 1)") from None
+
+
+def impossible_values(data: Any) -> list[tuple[list, str]]:
+    """Values that no table may hold, each with its path of keys and what is wrong with it.
+
+    These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts that a terminal would not show
+    as they are.
+    """
+    found: list[tuple[list, str]] = []
+    rest: list[tuple[list, Any]] = [([], data)]
+    while rest:
+        keys, value = rest.pop()
+        match value:
+            case dict() | list() | tuple() if len(keys) > DEEPEST:
+                return [(keys[:DEEPEST], f"has lists or tables more than {DEEPEST} deep")]
+            case dict():
+                rest += [([*keys, key], inner) for key, inner in value.items()]
+                found += [([*keys, key], "has a control character in its name") for key in value if _hides(key)]
+            case list() | tuple():
+                rest += [([*keys, k], inner) for k, inner in enumerate(value)]
+            case int() if not LEAST_WHOLE <= value <= LARGEST_WHOLE:
+                found.append((keys, "is a whole number of more than 64 bits"))
+            case str() if _hides(value):
+                found.append((keys, f"is {shortened(value)}: control characters are not allowed"))
+    return found
+
+
+def _hides(text: Any) -> bool:
+    return isinstance(text, str) and UNSEEN.search(text) is not None
+
+
+def cut(text: str, most: int = 80) -> str:
+    """A text without its middle where it is long."""
+    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
+
+
+def shortened(value: Any) -> str:
+    """repr of a value, cut where it is long."""
+    try:
+        return cut(repr(value))
+    except (ValueError, RecursionError):  # a whole number of thousands of digits; lists in lists
+        return "too large to show"
+
+
+def whole_number(text: str) -> int | None:
+    """The number that a text of up to 18 ASCII digits says; None for any other text."""
+    return int(text) if re.fullmatch(r"[0-9]{1,18}", text) else None
+
+
+def toml_fault(error: TOMLDecodeError, text: str) -> str:
+    """What is wrong with a text that is not TOML. For a value without quotes the line and key are named."""
+    place = re.search(r"at line (\d+), column (\d+)", str(error))
+    number, column = map(int, place.groups()) if place else (0, 0)
+    lines = text.split("\n")
+    line = lines[number - 1] if 0 < number <= len(lines) else ""
+    # tomllib stops at the word, or within it: after the inf of "infinite"
+    bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
+    keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1:] if bare else []
+    if not keys or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after a list that is not closed
+        return f"is not TOML: {error}"
+    where = f"line {number}: {'.'.join(map(str, keys[0]))}: "
+    match bare:
+        case "True" | "False":
+            return f"{where}is {bare}, must be written {bare.lower()}"
+        case "None" | "null":
+            return f"{where}is {bare}, which TOML does not have: omit the key"
+    return f'{where}is {bare} without quotes; a text needs them: "{bare}"'
+
+
+def line_of(keys: list, text: str) -> int | None:
+    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; else None."""
+    index, parts = _index(text), tuple(keys)
+    heads = [parts[:n] for n in range(1, len(parts) + 1)]
+    entries = [index.entries[head] for head in heads if head in index.entries]
+    if entries:
+        return min(entries)
+    return max((index.tables[head] for head in heads if head in index.tables), default=None)
+
+
+class _Index(NamedTuple):
+    """Lines (from 1) of a TOML text."""
+
+    entries: dict[tuple, int]  # the first that sets a path of keys
+    tables: dict[tuple, int]  # the last that opens a table
+
+
+@lru_cache(maxsize=2)
+def _index(text: str) -> _Index:
+    found = _Index({}, {})
+    for number, table, entry in _lines(text):
+        if entry:
+            found.entries.setdefault((*table, *entry), number)
+        else:
+            found.tables[tuple(table)] = number
+    return found
+
+
+def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
+    """Lines (from 1) of a TOML text that open a table or set a key: the table's path, and the key's in it or []."""
+    table: list = []
+    counts: dict[tuple, int] = {}  # of tables in lists, by their path with the numbers of lists around them
+    for number, line in enumerate(text.split("\n"), 1):
+        if header := re.match(r"\s*(\[\[?)\s*([\w.\"'-]+)\s*\]", line):
+            table = []
+            parts = _parts(header[2])
+            for depth, part in enumerate(parts, 1):
+                table.append(part)
+                here = tuple(table)
+                if depth == len(parts) and header[1] == "[[":
+                    counts[here] = counts.get(here, -1) + 1
+                if here in counts:
+                    table.append(counts[here])
+            yield number, table, []
+        elif entry := re.match(r"\s*([\w.\"'-]+)\s*=", line):
+            yield number, table, _parts(entry[1])
+
+
+def _parts(key: str) -> list[str]:
+    """The parts of a dotted key without quotes. A dot in quotes divides too: what it names has no line then."""
+    return [part.strip("\"'") for part in key.split(".")]

@@ -1,0 +1,583 @@
+"""Input from strangers: whatever a file or an option holds, it is taken or refused with one of our errors.
+
+Valid input is changed at random: keys dropped, doubled and renamed, extreme numbers, wrong types, strange text, bytes
+cut off and flipped; besides input that is arbitrary. Nothing here compiles kernels: `check` describes a run.
+"""
+
+import contextlib
+import io
+import os
+import resource
+import sys
+import time
+import tomllib
+import warnings
+from copy import deepcopy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rigidmd.cli import main
+from rigidmd.core.state import state_of
+from rigidmd.core.state_file import Saved, write_state
+from rigidmd.errors import UNSEEN, CheckpointError
+from rigidmd.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+
+SECONDS, BYTES = 5.0, 2e9  # that an input may take
+FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the slow tier
+
+WATER = """
+seed = 3
+[box]
+lengths_A = 20.0
+[[molecules]]
+model = "spce"
+count = 5
+[[molecules]]
+model = "argon"
+count = 2
+frozen = [1]
+[forces]
+cutoff_A = 8.0
+truncation = "shift"
+[[forces.pairs]]
+sites = ["O", "Ar"]
+sigma_A = 3.3
+epsilon_kJ_mol = 0.5
+[start]
+temperature_K = 300.0
+[[stages]]
+ensemble = "nvt"
+temperature_K = [300.0, 280.0]
+duration_ps = 0.01
+timestep_fs = 1
+[fields]
+electric_V_per_nm = [0.0, 0.0, 0.5]
+restraints = [{ species = "argon", molecules = "2", stiffness_kJ_mol_A2 = 10.0 }]
+walls = [{ axis = "z", kind = "harmonic", positions_A = [3.0, 9.0], stiffness_kJ_mol_A2 = 5.0 }]
+[output]
+trajectory = "t.trr"
+log_interval_ps = 0.002
+"""
+PRESSED = """
+precision = "mixed"
+[box]
+lengths_A = [20.0, 21.0, 22.0]
+angles_deg = [80.0, 85.0, 90.0]
+[[molecules]]
+name = "own"
+count = 4
+sites = [
+  { name = "A", element = "O", mass_u = 16.0, position_A = [0.0, 0.0, 0.0], charge_e = -0.5, sigma_A = 3.0, epsilon_K = 50.0 },
+  { name = "B", element = "H", mass_u = 1.0, position_A = [0.0, 0.0, 1.0], charge_e = 0.5 },
+]
+masses_u = { B = 2.0 }
+[forces]
+cutoff_A = 8.0
+electrostatics = "pme"
+ewald_accuracy = 1e-3
+tail_correction = true
+[[stages]]
+ensemble = "minimise"
+most_iterations = 5
+[[stages]]
+ensemble = "npt"
+temperature_K = 300.0
+pressure_bar = 1.0
+duration_ps = 0.01
+integrator = "baoab"
+barostat = "cell_rescaling"
+"""
+SUMMED = PRESSED.replace('"pme"', '"ewald"').replace("angles_deg = [80.0, 85.0, 90.0]\n", "")
+FROM_FILE = """
+[[molecules]]
+model = "spce"
+[structure]
+file = "FILE"
+[box]
+lengths_A = 18.0
+[forces]
+cutoff_A = 5.0
+[start]
+temperature_K = 300
+[[stages]]
+duration_ps = 0.01
+"""
+TOP = """
+[body]
+mass_kg = 2.0
+pinned = true
+solid = { shape = "cylinder", radius_m = 0.1, height_m = 0.3 }
+centre_of_mass_m = [0.0, 0.0, 0.2]
+[start]
+euler_angles_deg = [0.0, 30.0, 0.0]
+euler_rates_rad_s = [0.0, 0.0, 50.0]
+[gravity]
+acceleration_m_s2 = [0.0, 0.0, -9.81]
+[friction]
+viscous_N_m_s = [0.0, 0.0, 0.001]
+[[applied]]
+axes = "body"
+torque_N_m = [[0.0, 0.0, 0.1], [0.0, 0.0, 0.0]]
+times_s = [0.0, 0.5]
+[run]
+duration_s = 1.0
+timestep_s = 0.001
+"""
+SATELLITE = """
+[body]
+mass_kg = 10.0
+inertia_kg_m2 = [1.0, 2.0, 2.5]
+[start]
+quaternion_wxyz = [1.0, 0.0, 0.0, 0.1]
+angular_velocity_body_rad_s = [0.1, 1.0, 0.0]
+[[wheels]]
+axis = [0.0, 0.0, 1.0]
+motor_torque_N_m = [0.0, 0.01]
+times_s = [0.0, 1.0]
+[frame]
+angular_velocity_rad_s = [0.0, 0.001, 0.0]
+[run]
+duration_s = 1.0
+timestep_s = 0.01
+integrator = "dop853"
+relative_tolerance = 1e-9
+[output]
+interval_s = 0.1
+"""
+SUNK = """
+[body]
+points = [{ mass_kg = 1.0, position_m = [0.1, 0.0, 0.0] }, { mass_kg = 1.0, position_m = [-0.1, 0.0, 0.0] }, { mass_kg = 1.5, position_m = [0.0, 0.2, 0.0] }, { mass_kg = 1.5, position_m = [0.0, -0.2, 0.0] }]
+[start]
+velocity_m_s = [1.0, 0.0, 0.0]
+rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+[gravity]
+[fluid]
+linear_resistance_kg_s = [0.1, 0.1, 0.1]
+added_mass_kg = [0.1, 0.2, 0.3]
+displaced_mass_kg = 1.0
+[run]
+duration_s = 0.5
+timestep_s = 0.001
+[output]
+trajectory = false
+"""
+CHANGING = SATELLITE.replace("inertia_kg_m2 = [1.0, 2.0, 2.5]\n", "").replace(
+    "[frame]\nangular_velocity_rad_s = [0.0, 0.001, 0.0]",
+    "[changing_inertia]\ntimes_s = [0.0, 1.0]\ninertia_kg_m2 = [[1.0, 2.0, 2.5], [2.0, 2.0, 2.5]]",
+)
+SCENES = [tomllib.loads(text) for text in (WATER, PRESSED, SUMMED, TOP, SATELLITE, SUNK, CHANGING)]
+
+MODEL = """
+name = "mine"
+title = "A molecule"
+residue_names = ["MIN"]
+mixing = "geometric"
+[[sites]]
+name = "A"
+element = "O"
+mass_u = 16.0
+charge_e = -0.8
+sigma_A = 3.1
+epsilon_kJ_mol = 0.6
+position_A = [0.0, 0.0, 0.0]
+[[sites]]
+name = "B"
+element = "H"
+mass_u = 1.0
+charge_e = 0.4
+position_A = [0.8, 0.6, 0.0]
+[[sites]]
+name = "C"
+element = "H"
+mass_u = 1.0
+charge_e = 0.4
+position_A = [-0.8, 0.6, 0.0]
+"""
+TABLE = """
+title = "Shared"
+[[sites]]
+name = "O"
+mass_u = 16.0
+charge_e = -0.8
+sigma_A = 3.1
+epsilon_kcal_mol = 0.15
+[[sites]]
+name = "H"
+charge_e = 0.4
+"""
+ONE_WATER = "3\nwater\nO 0.0 0.0 0.0\nH 0.8164904 0.5773590 0.0\nH -0.8164904 0.5773590 0.0\n"
+
+
+def structures() -> dict[str, str]:
+    """Two waters in each format that is read."""
+    names, one = ("O", "H", "H"), np.array([[0, 0, 0], [0.8164904, 0.577359, 0], [-0.8164904, 0.577359, 0]])
+    atoms = [(m, name, *(at + 2 + 6 * m)) for m in range(2) for name, at in zip(names, one, strict=True)]
+    rows = list(enumerate(atoms, 1))
+    gro = "".join(f"{m + 1:5}SOL  {n:>5}{k:5}{x / 10:8.3f}{y / 10:8.3f}{z / 10:8.3f}\n" for k, (m, n, x, y, z) in rows)
+    xyz = "".join(f"{n} {x} {y} {z}\n" for _, (_, n, x, y, z) in rows)
+    lattice = 'Lattice="18.0 0.0 0.0 0.0 18.0 0.0 0.0 0.0 18.0" Properties=species:S:1:pos:R:3'
+    pdb = "".join(
+        f"ATOM  {k:5} {n:4} SOL A{m + 1:4}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {n}\n"
+        for k, (m, n, x, y, z) in rows
+    )
+    arc = "".join(f"{k} {n} {x} {y} {z} 1\n" for k, (_, n, x, y, z) in rows)
+    cif = "".join(f"{n}{k} {n} {x / 18} {y / 18} {z / 18} 1.0\n" for k, (_, n, x, y, z) in rows)
+    data = "".join(f"{k} {m + 1} {1 if n == 'O' else 2} 0.0 {x} {y} {z}\n" for k, (m, n, x, y, z) in rows)
+    columns = "".join(
+        f"_atom_site_{key}\n" for key in ("label", "type_symbol", "fract_x", "fract_y", "fract_z", "occupancy")
+    )
+    edges = "".join(f"_cell_length_{axis} 18\n" for axis in "abc")
+    angles = "".join(f"_cell_angle_{angle} 90\n" for angle in ("alpha", "beta", "gamma"))
+    return {
+        "x.gro": f"water\n{len(rows)}\n{gro}   1.8 1.8 1.8\n",
+        "x.xyz": f"{len(rows)}\nwater\n{xyz}",
+        "y.xyz": f"{len(rows)}\n{lattice}\n{xyz}",
+        "x.pdb": f"CRYST1   18.000   18.000   18.000  90.00  90.00  90.00 P 1           1\n{pdb}END\n",
+        "x.arc": f"{len(rows)} water\n18.0 18.0 18.0 90.0 90.0 90.0\n{arc}",
+        "x.cif": f"data_x\n{edges}{angles}loop_\n{columns}{cif}",
+        "x.cssr": f" 18.0 18.0 18.0\n 90.0 90.0 90.0 SPGR = 1 P 1\n {len(rows)} 1\n water\n{arc}",
+        "x.data": f"units = real\n\n{len(rows)} atoms\n2 atom types\n0 18 xlo xhi\n0 18 ylo yhi\n0 18 zlo zhi\n\nMasses\n\n1 15.999\n2 1.008\n\nAtoms # full\n\n{data}",
+    }
+
+
+STRUCTURES = structures()
+
+NUMBERS = [
+    0, 1, -1, 2, 3, 7, 2**31, 2**53, 10**12, 2**63 - 1, 2**63, 10**30, 10**400,
+    0.0, -0.0, 0.5, 1.0, -1.0, 3.0, 90.0, 1e3, 1e-3, 1e6, 1e-6, 1e10, 1e-10, 1e30, 1e-30, 1e31, 1e-31, 1e100, 1e-100,
+    1e200, -1e200, 1e300, 1e-300, 5e-324, float("inf"), float("-inf"), float("nan"),
+]  # fmt: skip
+FACTORS = [0.0, -1.0, 0.5, 0.8, 0.9, 0.99, 1.01, 1.1, 1.3, 2.0, 5.0, 0.1, 30.0, 1e-3, 1e3, 1e-6, 1e6, 1e-12, 1e12]
+TEXTS = [
+    "", " ", "x", "nan", "1", "spce", "argon", "\x1b[31mred\x07", "a\x00b", "\u202eleft", "ä", "²", "٣", "1-10", "1-99999999999999999999",
+    "../x", "/", ".", "~", "/dev/zero", "/dev/tty", "x.gro", "x.xyz", "x.toml", "a" * 300, "a" * 300 + ".toml", "[a(b", "int", "float",
+    "1.2.3", "O", "H", "nve", "npt", "pme", "ewald", "none", "true", "z", "%s", "{}", "\n", "\t", "Å" * 70,
+]  # fmt: skip
+STRANGE = st.one_of(
+    st.sampled_from(NUMBERS),
+    st.sampled_from(TEXTS),
+    st.booleans(),
+    st.floats(),
+    st.integers(-(2**70), 2**70).filter(lambda n: not 10**4 < n < 2**31),  # such counts are many molecules
+    st.text(max_size=20),
+    st.sampled_from(
+        [[], {}, [[]], [{}], {"a": 1}, [1.0, 2.0, 3.0], [0.0, 0.0, 0.0], ["A", "B"], [[1.0, 2.0, 3.0]] * 2]
+    ),
+    st.recursive(st.just([]), lambda inner: st.lists(inner, min_size=1, max_size=2), max_leaves=3),
+).map(deepcopy)  # or a later change would change what is drawn from
+BYTE_CHANGES = st.lists(
+    st.tuples(
+        st.sampled_from(["digit", "digit", "digit", "cut", "flip", "drop line", "double line", "word", "insert"]),
+        st.floats(0, 1, exclude_max=True),
+        st.one_of(
+            st.binary(min_size=1, max_size=4),
+            st.sampled_from([str(number).encode() for number in NUMBERS]),
+            st.sampled_from([text.encode() for text in (*TEXTS, "?", "-", "\ufeff", '"', "'''", "[[", "]", "=", "#")]),
+        ),
+    ),
+    min_size=1,
+    max_size=3,
+)
+
+
+def paths(data, before=()):
+    """The paths of all keys and entries of nested tables and lists, and what is there."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        yield (*before, key), value
+        if isinstance(value, dict | list):
+            yield from paths(value, (*before, key))
+
+
+@st.composite
+def changed(draw, tables):
+    """One of these tables with some of its keys and values changed."""
+    data = deepcopy(draw(st.sampled_from(tables)))
+    for _ in range(draw(st.sampled_from([1, 1, 1, 2, 3]))):
+        if not (places := [path for path, _ in paths(data)]):
+            break
+        *parents, last = draw(st.sampled_from(places))
+        holder = data
+        for key in parents:
+            holder = holder[key]
+        what = draw(st.sampled_from(["drop", "replace", "scale", "scale", "scale", "double", "rename", "add"]))
+        if what == "drop":
+            del holder[last]
+        elif what == "scale" and type(holder[last]) in (int, float):
+            holder[last] *= draw(st.sampled_from(FACTORS if isinstance(holder[last], float) else [0, 1, 2, 3, 10]))
+        elif what in ("replace", "scale"):
+            holder[last] = draw(STRANGE)
+        elif what == "double" and isinstance(holder, list):
+            holder.insert(last, deepcopy(holder[last]))
+        elif isinstance(holder, list):
+            holder.append(draw(STRANGE))
+        elif what == "rename":
+            holder[draw(st.one_of(st.sampled_from(TEXTS), st.text(max_size=9)))] = holder.pop(last)
+        else:
+            holder[draw(st.sampled_from(TEXTS))] = draw(STRANGE)
+    return data
+
+
+def with_bytes_changed(content: bytes, changes) -> bytes:
+    """A file with bytes cut off, flipped or replaced."""
+    for what, where, piece in changes:
+        at = int(where * len(content))
+        lines = content.split(b"\n")
+        line = int(where * len(lines))
+        if what == "digit" and (digits := [k for k, byte in enumerate(content) if 48 <= byte <= 57]):
+            at = digits[int(where * len(digits))]
+            content = content[:at] + bytes([48 + piece[0] % 10 if piece else 48]) + content[at + 1 :]
+        elif what == "cut":
+            content = content[:at]
+        elif what == "flip" and content:
+            content = (
+                content[:at] + bytes([content[at] ^ (1 << piece[0] % 8)]) + content[at + 1 :] if piece else content
+            )
+        elif what == "drop line":
+            content = b"\n".join(lines[:line] + lines[line + 1 :])
+        elif what == "double line":
+            content = b"\n".join([*lines[: line + 1], *lines[line:]])
+        elif what == "word" and (words := lines[line].split(b" ")):
+            words[int(where * 997) % len(words)] = piece
+            lines[line] = b" ".join(words)
+            content = b"\n".join(lines)
+        elif what == "insert":
+            content = content[:at] + piece + content[at:]
+    return content
+
+
+class Trial:
+    """Runs commands on strange input, and keeps what they took."""
+
+    def __init__(self):
+        self.inputs = self.refused = 0
+        self.slowest, self.slowest_of = 0.0, ""
+        self.before = self.peak
+
+    @property
+    def peak(self) -> float:
+        """Largest memory of this process so far, bytes."""
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+    def __call__(self, *arguments: str) -> int:
+        """The exit code of a command, which must be 0 or 2 with a message that is safe to print."""
+        out, err = io.StringIO(), io.StringIO()
+        begin = time.perf_counter()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # of NumPy: numbers that overflow or mean nothing
+            code = main(list(arguments))
+        self.note(time.perf_counter() - begin, code == 2, arguments)
+        said = out.getvalue() + err.getvalue()
+        assert code in (0, 2), said
+        assert not UNSEEN.search(said), said
+        if code == 2:
+            assert err.getvalue().startswith("rigidmd: "), said
+            assert len(err.getvalue().splitlines()[0].split(": ")) >= 3 or "faults" in said, said
+            assert len(said) < 100_000
+        return code
+
+    def note(self, seconds: float, refused: bool, what: object) -> None:
+        """Count an input."""
+        self.inputs += 1
+        self.refused += refused
+        if seconds > self.slowest:
+            self.slowest, self.slowest_of = seconds, str(what)[:200]
+        assert seconds < SECONDS, what
+        assert self.peak - self.before < BYTES, what
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """One for all inputs; tells what they took."""
+    main(["check", "nowhere.toml"])  # what is imported at the first command is none of the input's
+    found = Trial()
+    yield found
+    print(
+        f"\n{found.inputs} inputs, {found.refused} refused, the slowest {found.slowest:.2f} s {found.slowest_of}, "
+        f"{(found.peak - found.before) / 1e6:.0f} MB more at most"
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where all scenes lie; their files are written anew for each input."""
+    place = tmp_path_factory.mktemp("strange")
+    before = Path.cwd()
+    os.chdir(place)
+    yield place
+    os.chdir(before)
+
+
+def fuzz(*strategies):
+    """A test that takes a few inputs, and one in the slow tier that takes many."""
+
+    def tests(function):
+        def limited(count):
+            told = settings(
+                max_examples=count, deadline=None, derandomize=True, database=None,
+                suppress_health_check=list(HealthCheck),
+            )  # fmt: skip
+            return told(given(*strategies)(function))
+
+        return limited(FEW), pytest.mark.slow(limited(MANY))
+
+    return tests
+
+
+def written(data: dict) -> bytes:
+    """A table as TOML."""
+    return tomli_w.dumps(data).encode("utf-8", "surrogatepass")
+
+
+@pytest.fixture(scope="module")
+def attack(trial, folder):
+    """Check a scene, with other files beside it."""
+
+    def check(scene: bytes, *arguments: str, **files: bytes) -> int:
+        (folder / "scene.toml").write_bytes(scene)
+        for name, content in files.items():
+            (folder / name.replace("_", ".", 1)).write_bytes(content)
+        return trial("check", "scene.toml", *arguments)
+
+    return check
+
+
+def test_all_that_is_changed_is_valid(attack, folder, trial):
+    assert [attack(written(scene)) for scene in SCENES] == [0] * len(SCENES)
+    for name, text in STRUCTURES.items():
+        assert attack(FROM_FILE.replace("FILE", name).encode(), **{name.replace(".", "_"): text.encode()}) == 0, name
+    _models(trial, attack, folder, (tomllib.loads(MODEL), []))
+    _tables(attack, (tomllib.loads(TABLE), False, []))
+    _states(attack, folder, ({}, []))
+    assert trial.refused == 0
+
+
+def _scenes(attack, data):
+    attack(written(data))
+
+
+def _texts(attack, told):
+    text, changes = told
+    attack(with_bytes_changed(text, changes))
+
+
+def _overrides(attack, told):
+    scene, key, value = told
+    attack(written(scene), f"--set={key}={value}")
+
+
+def _structures(attack, told):
+    name, changes, frame = told
+    scene = FROM_FILE.replace("FILE", name).replace("[box]", f"{frame}[box]")
+    attack(scene.encode(), **{name.replace(".", "_"): with_bytes_changed(STRUCTURES[name].encode(), changes)})
+
+
+def _models(trial, attack, folder, told):
+    model, changes = told
+    (folder / "m.toml").write_bytes(with_bytes_changed(written(model), changes))
+    trial("models", "m.toml")
+    attack(WATER.replace('model = "spce"', 'file = "m.toml"').encode())
+
+
+def _tables(attack, told):
+    table, geometry, changes = told
+    own = 'file = "x.xyz"\nparameters = "t.toml"'
+    scene = WATER.replace('model = "spce"', own)
+    attack(
+        scene.encode(), t_toml=written(table), x_xyz=with_bytes_changed(ONE_WATER.encode(), changes if geometry else [])
+    )
+
+
+def _states(attack, folder, told):
+    arrays, changes = told
+    turn = np.tile(np.eye(3), (2, 1, 1))
+    state = state_of(np.array([[0.0, 0, 0], [5, 5, 5]]), None, turn, None, 18.0 * np.eye(3))
+    write_state(folder / "good.npz", Saved(state, ["spce"], np.zeros(2, int), np.array([1, 2])))
+    with np.load(folder / "good.npz") as good:
+        found = {name: good[name] for name in good.files}
+    for name, array in arrays.items():
+        if array is None:
+            found.pop(name, None)
+        else:
+            found[name] = array
+    np.savez(folder / "final.npz", **found)
+    content = with_bytes_changed((folder / "final.npz").read_bytes(), changes)
+    attack(FROM_FILE.replace("FILE", "final.npz").encode(), final_npz=content)
+
+
+def _checkpoints(trial, folder, changes):
+    write_checkpoint(folder, Checkpoint({"of": {"x": {"a": 1}}, "run": {}}, {"x/y": np.arange(50.0)}))
+    path = folder / "checkpoint.npz"
+    kept = path.read_bytes()
+    path.write_bytes(with_bytes_changed(kept, changes))
+    begin = time.perf_counter()
+    try:
+        found = read_checkpoint(path)
+    except CheckpointError as error:
+        assert str(path) in str(error)
+        trial.note(time.perf_counter() - begin, True, changes)
+    else:
+        assert np.array_equal(found.of("x").arrays["y"], np.arange(50.0))  # nothing wrong is ever taken
+        trial.note(time.perf_counter() - begin, False, changes)
+
+
+@st.composite
+def overrides(draw):
+    """A scene, a dotted key and a value: one of its own keys with a number near its own, or anything."""
+    scene = draw(st.sampled_from(SCENES))
+    own = {".".join(map(str, path)): value for path, value in paths(scene)}
+    if draw(st.booleans()):
+        key = draw(st.sampled_from([key for key, value in own.items() if type(value) in (int, float)]))
+        return scene, key, own[key] * draw(st.sampled_from([1, 2, 0] if isinstance(own[key], int) else FACTORS))
+    key = draw(
+        st.one_of(st.sampled_from(KEYS), st.sampled_from(KEYS).map(lambda key: f"{key}.0"), st.text(max_size=20))
+    )
+    strange = st.sampled_from([*NUMBERS, *TEXTS, "[[", "{a=1}", "[1,2", "=", "a=b"])
+    return scene, key, draw(st.one_of(strange, st.text(max_size=20)))
+
+
+KEYS = sorted({".".join(map(str, path)) for scene in SCENES for path, _ in paths(scene)})
+ARRAYS = st.one_of(
+    st.none(),
+    st.sampled_from([
+        np.zeros(0), np.zeros((2, 3)), np.full((2, 3), np.nan), np.full((2, 3), 1e300), np.zeros((3, 3)), np.eye(3),
+        -np.eye(3), np.full((3, 3), np.inf), np.diag([18.0, np.inf, 18.0]), np.array([[18.0, 0, 0], [18, 0, 0], [0, 0, 18]]),
+        1e-300 * np.eye(3), np.zeros(2, int), np.full(2, 7), np.array(["spce"]), np.array(["\x1b[31m"]), np.array(3.0),
+        np.array(2), np.zeros((2, 3, 3)), np.zeros(2, complex), np.zeros((2, 3), bool), np.array(10**9), np.array([]),
+    ]),
+)  # fmt: skip
+NAMES = ["schema", "species_names", "species", "residue_number", "models", *state_of()._fields, "other"]
+
+test_scenes, test_many_scenes = fuzz(changed(SCENES))(_scenes)
+test_texts, test_many_texts = fuzz(
+    st.one_of(
+        st.tuples(st.sampled_from(SCENES).map(written), BYTE_CHANGES),
+        st.tuples(st.one_of(st.binary(max_size=200), st.text(max_size=200).map(str.encode)), st.just([])),
+    )
+)(_texts)
+test_overrides, test_many_overrides = fuzz(overrides())(_overrides)
+test_structures, test_many_structures = fuzz(
+    st.tuples(
+        st.sampled_from(sorted(STRUCTURES)),
+        BYTE_CHANGES,
+        st.sampled_from(["", "", "frame = 2\n", "frame = -1\n", "tolerance = 1e-30\n"]),
+    )
+)(_structures)
+test_models, test_many_models = fuzz(
+    st.one_of(
+        st.tuples(changed([tomllib.loads(MODEL)]), st.just([])),
+        st.tuples(st.just(tomllib.loads(MODEL)), BYTE_CHANGES),
+    )
+)(_models)
+test_tables, test_many_tables = fuzz(st.tuples(changed([tomllib.loads(TABLE)]), st.booleans(), BYTE_CHANGES))(_tables)
+test_states, test_many_states = fuzz(
+    st.tuples(
+        st.dictionaries(st.sampled_from(NAMES), ARRAYS, max_size=2),
+        st.one_of(st.just([]), st.just([]), BYTE_CHANGES),
+    )
+)(_states)
+test_checkpoints, test_many_checkpoints = fuzz(BYTE_CHANGES)(_checkpoints)

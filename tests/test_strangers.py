@@ -1,0 +1,315 @@
+"""Input that was made to break: each is refused at once, with what is wrong, where and what was expected."""
+
+import io
+import os
+import subprocess
+import sys
+import time
+import zipfile
+
+import numpy as np
+import pytest
+from test_bad_input import GOOD
+from test_fuzz import FROM_FILE, SATELLITE, STRUCTURES
+
+from rigidmd.assemble import room
+from rigidmd.assemble.system import build
+from rigidmd.cli import main
+from rigidmd.core import memory
+from rigidmd.core.state import state_of
+from rigidmd.core.state_file import Saved, write_state
+from rigidmd.core.toml_text import line_of
+from rigidmd.errors import MoleculeError, SceneError, StructureError
+from rigidmd.forces.waves import vectors
+from rigidmd.molecules import read_molecule
+from rigidmd.scene import Scene
+from rigidmd.scene.molecules import MolecularScene
+
+DEEP = "[" * 1000 + "]" * 1000
+AT_ONCE = 5.0  # s
+
+
+def refusal(capsys, tmp_path, text, *arguments, commands=("check",)):
+    """The message for a scene, the same of each command."""
+    (tmp_path / "scene.toml").write_text(text)
+    messages = set()
+    for command in commands:
+        begin = time.perf_counter()
+        assert main([command, str(tmp_path / "scene.toml"), *arguments]) == 2
+        assert time.perf_counter() - begin < AT_ONCE
+        messages.add(capsys.readouterr().err)
+    assert len(messages) == 1
+    return messages.pop()
+
+
+def own_molecule(position="[0.0, 0.0, 1.0]", more=""):
+    site = f'{{name = "A", mass_u = 1.0, position_A = {position}{more}}}, {{name = "B", mass_u = 1.0, position_A = [0, 0, 0]}}'
+    return f'[[molecules]]\nname = "x"\ncount = 2\nsites = [{site}]\n[[stages]]'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("count = 20", f"count = {2**63}", "line 6: molecules.0.count: is a whole number of more than 64 bits"),
+        ("count = 20", "count = 1e30", "line 6: molecules.0.count: is 1e+30, must be a whole number"),
+        ("count = 20", f"count = {'9' * 5000}", "a whole number of more than 64 bits (at line 6, column 1)"),
+        ("lengths_A = 20.0", f"lengths_A = 1{'0' * 400}", "line 2: box.lengths_A: is a whole number of more than 64 bits"),
+        ("lengths_A = 20.0", "lengths_A = 1e-300", "line 2: box.lengths_A: is 1e-300, must be 0 or between 1e-30"),
+        ("lengths_A = 20.0", "lengths_A = 1e-20", "must be 0.5 Å at least"),
+        ("lengths_A = 20.0", "lengths_A = 1e10", "must not be longer than 1e+09 Å"),
+        ("count = 20", f"count = 20\nx = {DEEP}", "more than 32 deep"),
+        ("count = 20", f"count = 20\nx = {'{a=' * 1000}1{'}' * 1000}", "more than 32 deep"),
+        ("count = 20", f"count = 20\nx = {'[' * 50}1{']' * 50}", "line 7: molecules.0.x.0.0"),
+        ("[start]", f"[{'.'.join('a' * 100_000)}]", "a key of more than 32 parts (at line 12, column 1)"),
+        ("[[stages]]", own_molecule("[0.0, 0.0, 1e200]"), "line 11: molecules.1.sites.0.position_A.2: is 1e+200, must be"),
+        ("[[stages]]", own_molecule(more=", charge_e = 1e300"), "charge_e: is 1e+300, must be 0 or between"),
+        ('model = "spce"', 'file = "a\\u0000.toml"', "line 5: molecules.0.file: is 'a\\x00.toml': control characters"),
+        ('model = "spce"', f'file = "{"a" * 300}.toml"', "line 5: molecules.0.file: cannot be read: File name too long"),
+        ('model = "spce"', 'file = "loop.toml"', "cannot be read: Too many levels of symbolic links: "),
+        ('model = "spce"', 'file = "pipe.toml"', "line 5: molecules.0.file: is no file but a pipe"),
+        ('model = "spce"', 'model = "spce"\nname = "\\u001b[31mred"', "line 6: molecules.0.name: is '\\x1b[31mred'"),
+        ("[start]", '"\\u001b[31mx" = 1\n[start]', "\\x1b[31mx: has a control character in its name"),
+        ("count = 20", 'count = 20\n"int" = 1', "line 7: molecules.0.int: unknown key"),
+        ("count = 20", "count = 20\n'a' = True", "line 7: molecules.0.a: is True, must be written true"),
+        ("count = 20", "count = 20\n() = True", "is not TOML"),
+        ("[start]", '[forces]\nelectrostatics = "ewald"\newald_k_max = 1000\n[start]', "8e+09 waves, more than 2e+07"),
+        ("20.0", '[20.0, 20.0, 1e6]\n[forces]\nelectrostatics = "pme"', "an edge of 1e+06 Å is too long for a grid"),
+    ],
+)  # fmt: skip
+def test_a_scene_that_was_made_to_break(old, new, expected, capsys, tmp_path):
+    os.symlink("loop.toml", tmp_path / "loop.toml")
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert old in GOOD
+    message = refusal(capsys, tmp_path, GOOD.replace(old, new, 1))
+    assert expected in message
+    assert "\x1b" not in message
+    assert len(message) < 1000
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("[0.0, 0.001, 0.0]", "[]", "frame: angular_velocity_rad_s is an empty list"),
+        ("[0.0, 0.001, 0.0]", "[]\ntimes_s = [0.0, 1.0]", "frame: angular_velocity_rad_s is an empty list"),
+        ("[frame]\nangular_velocity_rad_s = [0.0, 0.001, 0.0]", "[changing_inertia]\ninertia_kg_m2 = []\ntimes_s = [0.0, 1.0]",
+         "changing_inertia: inertia_kg_m2 is an empty list"),
+    ],
+)  # fmt: skip
+def test_an_empty_list_of_a_body(old, new, expected, capsys, tmp_path):
+    text = SATELLITE.replace("inertia_kg_m2 = [1.0, 2.0, 2.5]\n", "") if "changing" in new else SATELLITE
+    assert expected in refusal(capsys, tmp_path, text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        (f"forces.cutoff_A={DEEP}", "--set forces.cutoff_A: is "),
+        (f"{'.'.join('a' * 50_000)}=1", "is a key of more than 32 parts"),
+        (f"box.lengths_A={'9' * 4500}", "--set box.lengths_A: is "),
+        ("molecules.²=1", "molecules has entries 0 to 0"),
+        ("molecules.0.count=9223372036854775808", "--set molecules.0.count: is a whole number of more than 64 bits"),
+        ('structure.file="a\\u0000"', "--set structure.file: is "),
+    ],
+)
+def test_an_option_that_was_made_to_break(override, expected, capsys, tmp_path):
+    assert expected in refusal(capsys, tmp_path, GOOD, f"--set={override}")
+
+
+@pytest.mark.parametrize("what", ["keys", "tables", "molecules"])
+def test_twenty_thousand_faults_are_told_at_once(what, capsys, tmp_path):
+    some = {
+        "keys": "".join(f"k{n} = 1\n" for n in range(20_000)) + GOOD,
+        "tables": GOOD + "".join(f"[k{n}]\n" for n in range(20_000)),
+        "molecules": GOOD + "".join(f'[[molecules]]\nmodel = "spce{n}"\n' for n in range(5000)),
+    }[what]
+    message = refusal(capsys, tmp_path, some)
+    assert f"{5000 if what == 'molecules' else 20_000} faults" in message
+    assert "\n  and " in message
+    assert len(message) < 20_000
+
+
+def test_lines_are_found_among_lists_within_lists():
+    text = "a.b = 1\n[[x]]\nk = 1\n[[x.y]]\n[[x.y]]\nk = 2\n[[x]]\n[[x.y]]\nk = 3\n[x.z]\nk = 4\n"
+    found = [["a", "b"], ["x", 0, "k"], ["x", 0, "y", 1, "k"], ["x", 1, "y", 0, "k"], ["x", 1, "z", "k"], ["x", 1, "q"]]
+    assert [line_of(keys, text) for keys in found] == [1, 3, 6, 9, 11, 7]
+    assert line_of(["none"], text) is None
+
+
+def test_a_file_may_begin_with_the_mark_of_its_encoding(capsys, tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD, encoding="utf-8-sig")
+    assert Scene.read(tmp_path / "scene.toml").molecules[0].count == 20
+
+
+def test_a_scene_that_is_a_pipe_or_too_large(tmp_path):
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(SceneError, match="is no file but a pipe"):
+        Scene.read(tmp_path / "pipe.toml")
+    (tmp_path / "large.toml").write_bytes(b"#" * 5_000_000)
+    with pytest.raises(SceneError, match=r"has 5 MB; files of up to 4 MB are read"):
+        Scene.read(tmp_path / "large.toml")
+
+
+def test_control_characters_of_a_model_are_not_printed(capsys, tmp_path):
+    sites = '[[sites]]\nname = "A"\nmass_u = 1.0\nposition_A = [0.0, 0.0, 0.0]\n'
+    (tmp_path / "m.toml").write_text(f'name = "\\u001b[31mevil\\u202e"\n{sites}')
+    assert main(["models", str(tmp_path / "m.toml")]) == 2
+    message = capsys.readouterr().err
+    assert "\x1b" not in message and "line 1: name: is '\\x1b[31mevil\\u202e'" in message
+    (tmp_path / "m.toml").write_text(f"x = {DEEP}\n")
+    with pytest.raises(MoleculeError, match="more than 32 deep"):
+        read_molecule(tmp_path / "m.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "expected"),
+    [
+        ("x.xyz", "6\n", "100000000000\n", "x.xyz: line 1 promises 100000000000 atoms, 6 are there: truncated?"),
+        ("x.xyz", "6\n", "²\n", "x.xyz: line 1: expected the number of atoms, found '²'"),
+        ("x.gro", "\n6\n", f"\n{'9' * 5000}\n", "x.gro: line 2: expected the number of atoms, found '999"),
+        ("x.gro", "\n6\n", "\n²\n", "x.gro: line 2: expected the number of atoms, found '²'"),
+        ("x.data", "6 atoms", "100000000000 atoms", "x.data: line 3 promises 100000000000 atoms"),
+        ("x.cif", "1.0\n", "?\n", "x.cif: says of some of its sites that they are occupied by ?"),
+        ("x.xyz", "O 2.0 ", "O 1e200 ", "x.xyz: an atom is at 1e+200 Å, farther than 1e+09 Å"),
+        ("y.xyz", '"18.0', '"0.1', "y.xyz: its box: with its edges of 0.1, 18, 18 Å it is 0.1 Å thin"),
+        ("x.arc", "18.0 18.0 18.0 90.0 90.0", "18.0 18.0 18.0 90.0 180.0", "x.arc: no cell has its edges and angles"),
+        ("x.gro", "   OW", "\x1b[31m", "x.gro: atom 1 has a name with control characters"),
+    ],
+)
+def test_a_structure_that_was_made_to_break(name, old, new, expected, capsys, tmp_path):
+    text = STRUCTURES[name].replace("    O", "   OW")
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new, 1))
+    scene = FROM_FILE.replace("FILE", name).replace("[box]\nlengths_A = 18.0\n" if name == "y.xyz" else "none", "")
+    assert expected in refusal(capsys, tmp_path, scene)
+
+
+@pytest.mark.parametrize(
+    "cell", [np.array([[18.0, 0, 0], [18, 0, 0], [0, 0, 18]]), np.diag([18, np.inf, 18]), -18 * np.eye(3)]
+)
+def test_a_state_with_a_cell_that_is_none(cell, tmp_path):
+    turn = np.tile(np.eye(3), (2, 1, 1))
+    state = state_of(np.array([[0.0, 0, 0], [5, 5, 5]]), None, turn, None, cell)
+    write_state(tmp_path / "final.npz", Saved(state, ["spce"], np.zeros(2, int), None))
+    (tmp_path / "scene.toml").write_text(FROM_FILE.replace("FILE", "final.npz").replace("lengths_A = 18.0", ""))
+    with pytest.raises(StructureError, match="cell: damaged"):
+        build(Scene.read(tmp_path / "scene.toml"))
+
+
+def test_a_state_that_unpacks_to_more_than_there_is(monkeypatch, tmp_path):
+    with zipfile.ZipFile(tmp_path / "final.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("position.npy", bytes(10_000_000))
+    (tmp_path / "scene.toml").write_text(FROM_FILE.replace("FILE", "final.npz"))
+    monkeypatch.setattr(memory, "free_memory", lambda: 1e7)
+    with pytest.raises(StructureError, match=r"not enough memory: reading its 0.01 GB needs 0.02 GB of memory"):
+        build(Scene.read(tmp_path / "scene.toml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("NUMBA_NUM_THREADS", "0", "must be a whole number from 1 to 4096"),
+        ("NUMBA_NUM_THREADS", "abc", "must be a whole number from 1 to 4096"),
+        ("NUMBA_THREADING_LAYER", "x", "must be one of default, safe"),
+        ("RIGIDMD_SIMD_BITS", "0", "must be one of 128, 256, 512"),
+        ("RIGIDMD_SIMD_BITS", "64", "must be one of 128, 256, 512"),
+        ("RIGIDMD_SIMD_BITS", "abc", "must be one of 128, 256, 512"),
+    ],
+)
+def test_a_setting_of_the_machine_that_cannot_be(name, value, expected, tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD)
+    command = [sys.executable, "-m", "rigidmd", "check", "scene.toml"]
+    found = subprocess.run(command, cwd=tmp_path, env=os.environ | {name: value}, capture_output=True, text=True)
+    assert (found.returncode, found.stdout) == (2, "")
+    assert found.stderr == f"rigidmd: {name} is {value!r}, {found.stderr.split(', ', 1)[1]}"
+    assert expected in found.stderr
+
+
+def test_a_terminal_without_the_letters_ends_no_command(monkeypatch, tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD)
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, "ascii", write_through=True))
+    assert main(["check", str(tmp_path / "scene.toml")]) == 0
+    assert rb"20.0000 x 20.0000 x 20.0000 \xc5" in written.getvalue()
+
+
+# memory
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            GOOD.replace("count = 20", f"count = {10**12}"),
+            "not enough memory: a system of 1000000000000 molecules with",
+        ),
+        (GOOD.replace("count = 20", f"count = {2**63 - 1}"), "not enough memory: a system of 9223372036854775807"),
+        (
+            GOOD + '[forces]\nelectrostatics = "pme"\npme_grid = [4096, 4096, 4096]\n',
+            "a single array of it needs 551 GB",
+        ),
+    ],
+)
+def test_a_scene_beyond_the_machine_is_refused_with_numbers(text, expected, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for free in (memory, room):
+        monkeypatch.setattr(free, "free_memory", lambda: 8e9)  # between commands what is free changes
+    message = refusal(capsys, tmp_path, text, commands=("check", "energy", "run"))
+    assert expected in message
+    assert "and this machine has 8 GB free" in message
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_memory_of_a_run_is_compared_before_it_is_used(monkeypatch, tmp_path):
+    scene = Scene.from_dict(
+        {"box": {"lengths_A": 60.0, "periodic": False}, "molecules": [{"model": "spce", "count": 2000}],
+         "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.01}]}
+    )  # fmt: skip
+    assert isinstance(scene, MolecularScene)
+    needed = room.bytes_of(build(scene))
+    assert needed > 5e6
+    monkeypatch.setattr(memory, "free_memory", lambda: needed / 0.94)
+    build(scene)
+    monkeypatch.setattr(memory, "free_memory", lambda: needed / 0.96)
+    with pytest.raises(SceneError, match=r"not enough memory: the run needs .* and this machine has .* GB free"):
+        build(scene)
+
+
+def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "free_memory", lambda: 8e9)
+    text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace("interval_s = 0.1", "interval_s = 1e-8")
+    message = refusal(capsys, tmp_path, text)
+    assert "not enough memory: a run with 1e+08 samples needs 270 GB of memory, and this machine has 8 GB" in message
+
+
+def test_what_is_free_is_no_more_than_the_limits():
+    assert 1e8 < memory.free_memory() < 1e14
+    code = (
+        "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
+        "from rigidmd.core.memory import free_memory; print(free_memory())"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 1e9 < float(found.stdout) < 3e9
+
+
+@pytest.mark.parametrize(("most", "square"), [((5, 6, 7), None), ((3, 0, 4), 20), ((0, 0, 3), None), ((0, 0, 0), None)])
+def test_waves_in_columns_are_all_waves(most, square):
+    found = vectors.waves(most, square)
+    axes = [np.arange(-m, m + 1) for m in most]
+    n = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    n = n[(n**2).sum(axis=1) <= (np.inf if square is None else square)]
+    half = {tuple(v) for v in n.tolist() if tuple(v) > (0, 0, 0)}
+    listed = [
+        (int(x), int(y), int(first) + k)
+        for (x, y, first, _), count in zip(found.column, found.count, strict=True)
+        for k in range(count)
+    ]
+    assert (set(listed), len(listed), found.total) == (half, len(half), 2 * len(half))
+    assert np.array_equal(found.column[:, 3], np.cumsum(found.count) - found.count)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [(["--until", "9" * 400 + "ps"], "more than 1e+12 steps away"), (["-o", "a" * 300], "File name too long")],
+)
+def test_an_end_or_a_folder_that_cannot_be(options, expected, capsys, tmp_path):
+    assert expected in refusal(capsys, tmp_path, GOOD, *options, commands=("run",))
