@@ -185,6 +185,34 @@ def test_a_film_of_a_thousand_frames_of_water(tmp_path):
     assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 0.2).mean() > 0.02
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("summary.json", "[]", "is no summary of a run"),
+        ("summary.json", "{", "cannot be read"),
+        ("motion.csv", "t,x\n0,1\n", "has no column"),
+        ("motion.csv", "", "has no column"),
+        ("scene.toml", "[body", "scene.toml"),
+    ],
+)
+def test_damaged_files_of_a_run(name, text, said, top, tmp_path, capsys):
+    shutil.copytree(top, tmp_path / "run")
+    (tmp_path / "run" / name).write_text(text)
+    assert cli.main(["report", str(tmp_path / "run"), "-o", str(tmp_path / "page.html")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_numbers_that_are_none_are_refused(top, tmp_path, capsys):
+    shutil.copytree(top, tmp_path / "run")
+    path = tmp_path / "run" / "motion.csv"
+    for cell, said in (("x", "holds what is no number"), ("nan", "holds what is no finite number")):
+        head, line, *_ = (top / "motion.csv").read_text().splitlines()
+        path.write_text(f"{head}\n{line}\n{','.join([cell, *line.split(',')[1:]])}\n")
+        assert cli.main(["view", str(tmp_path / "run")]) == 2
+        assert said in capsys.readouterr().err
+
+
 def frames_in(path):
     """The frames of a .gif (f, h, w, 3), 0 to 1."""
     with Image.open(path) as film:

@@ -13,6 +13,7 @@ from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.measure import samples
+from rigidmd.measure.columns import BODY
 from rigidmd.measure.motion import Snapshot, motion
 from rigidmd.output.checkpoint import latest
 from rigidmd.output.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
@@ -95,44 +96,62 @@ def _summary(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
         ]
     except (OSError, ValueError) as error:
         raise OutputError(f"{path} cannot be read: {error}") from None
+    if not isinstance(found, dict):
+        raise OutputError(f"{path} is no summary of a run")
     ended = "This run was interrupted; what follows is what it wrote so far."
     return found, [ended] if found.get("interrupted") else []
 
 
-def _log(folder: Path) -> dict[str, np.ndarray]:
-    """Columns of log.csv; a last line that is cut off is left out."""
-    path = folder / LOG
+def _table(path: Path) -> dict[str, list[str]]:
+    """The columns of a CSV file by their headers; a last line that is cut off is left out. Raises OutputError."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             head, *lines = list(csv.reader(file)) or [[]]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise OutputError(f"{path} cannot be read: {error}") from None
     lines = [line for line in lines if len(line) == len(head)]
-    found = {}
-    for k, header in enumerate(head):
-        if (name := HEADERS.get(header)) is None:
-            continue
-        cells = [line[k] for line in lines]
-        try:
-            found[name] = np.array(cells) if name == "stage_name" else np.array([float(x or "nan") for x in cells])
-        except ValueError:
-            raise OutputError(f"{path}: column {header!r} holds what is no number") from None
-    if "time" not in found:
-        raise OutputError(f"{path} is no log of rigidmd: it has no column 'Time (ps)'")
-    return found
+    return {header: [line[k] for line in lines] for k, header in enumerate(head)}
+
+
+def _numbers(path: Path, header: str, cells: list[str]) -> np.ndarray:
+    """A column as numbers; what is empty is NaN. Raises OutputError."""
+    try:
+        return np.array([float(cell or "nan") for cell in cells])
+    except ValueError:
+        raise OutputError(f"{path}: column {header!r} holds what is no number") from None
+
+
+def _log(folder: Path) -> dict[str, np.ndarray]:
+    """Columns of log.csv by the names of `results[...]`."""
+    path = folder / LOG
+    table = {HEADERS[header]: (header, cells) for header, cells in _table(path).items() if header in HEADERS}
+    if lacking := [name for name in ("time", "stage_name") if name not in table]:
+        raise OutputError(f"{path} is no log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
+    return {
+        name: np.array(cells) if name == "stage_name" else _numbers(path, header, cells)
+        for name, (header, cells) in table.items()
+    }
+
+
+def _columns_of(system: BodySystem) -> list[str]:
+    """Columns that every motion of a body has."""
+    families = ["time", "position", "kinetic", "potential", "energy", "work"]
+    if system.turns:
+        families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
+    return [name for family in families for name in BODY[family].names]
 
 
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv; of a run that did not write it, those of its last checkpoint."""
     path = folder / MOTION
     if path.is_file():
-        try:
-            table = np.genfromtxt(path, delimiter=",", names=True, invalid_raise=False, ndmin=1)
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{path} cannot be read: {error}") from None
-        if not table.dtype.names or "t" not in table.dtype.names:
-            raise OutputError(f"{path} is no motion of rigidmd: it has no column 't'")
-        return {name: table[name] for name in table.dtype.names}
+        found = {header: _numbers(path, header, cells) for header, cells in _table(path).items()}
+        for name in _columns_of(system):
+            if name not in found:
+                raise OutputError(f"{path} is not the motion of this run: it has no column {name!r}")
+            if not np.isfinite(found[name]).all():
+                raise OutputError(f"{path}: column {name!r} holds what is no finite number")
+        return found
     try:
         kept, _ = latest(folder)
     except CheckpointError:

@@ -143,4 +143,8 @@ def _written(folder: Path) -> list[str]:
     marker = folder / MARKER
     if not marker.is_file():
         return []
-    return [name for name in marker.read_text(encoding="utf-8").split("\n") if name and Path(name).name == name]
+    return [
+        name
+        for name in marker.read_text(encoding="utf-8", errors="replace").split("\n")
+        if name and Path(name).name == name
+    ]
