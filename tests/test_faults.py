@@ -3,11 +3,13 @@
 Whatever happens, a run ends with one sentence, and what it has written before can be read and gone on with.
 """
 
+import ctypes
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +24,7 @@ from rigidmd.core.state_file import read_state
 from rigidmd.errors import RigidMDError
 from rigidmd.output.checkpoint import latest, read_checkpoint
 from rigidmd.output.folder import CHECKPOINT, FINAL, LOG, PREVIOUS
+from rigidmd.run.signals import interruptible
 
 SCENE = """\
 box.density_g_cm3 = 0.9
@@ -183,6 +186,22 @@ def test_a_run_that_is_stopped_by_signals_goes_on(sent, scene, tmp_path):
     for name in ("run", "whole"):
         assert cli.main(["resume", str(tmp_path / name), "--until", "0.5ps"]) == 0
     assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "run")]) == 0
+
+
+def test_ctrl_c_in_a_callback_of_a_compiler_is_not_lost(capfd):
+    """Python ignores exceptions in functions that C calls, and prints them."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        pytest.skip("Ctrl-C means something else here")
+    call = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: time.sleep(0.2) or 0)
+    presses = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT))
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        presses.start()
+        call()
+        while time.monotonic() - began < 20:
+            time.sleep(0.01)
+    assert time.monotonic() - began < 10
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.slow

@@ -1,7 +1,9 @@
 """Signals to a run. Python handles them in its main thread only; in others these do nothing."""
 
+import _thread
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 
@@ -20,28 +22,46 @@ def handled(handler: Callable[[int], None], *numbers: int) -> Iterator[None]:
             signal.signal(number, earlier)
 
 
+#: Seconds until Ctrl-C is tried again that came where Python ignores exceptions.
+AGAIN = 0.05
+
+
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Within it Ctrl-C is not lost in a compiler, which may swallow it or end in an error of its own.
+    """Within it Ctrl-C is not lost in a compiler, which ignores it while LLVM calls Python, or ends in another error.
 
-    Raises KeyboardInterrupt at the end if Ctrl-C came and nothing raised it.
+    Raises KeyboardInterrupt, at the end if it did not before.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # a program has its own way
         yield
         return
-    pressed = False
+    pressed, again, ignored = False, [], sys.unraisablehook
 
     def interrupt(number: int) -> None:
         nonlocal pressed
         pressed = True
         raise KeyboardInterrupt
 
+    def try_again(unraisable: "sys.UnraisableHookArgs") -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            ignored(unraisable)
+            return
+        again.append(threading.Timer(AGAIN, _thread.interrupt_main))
+        again[-1].start()
+
+    sys.unraisablehook = try_again
     try:
         with handled(interrupt, signal.SIGINT):
-            yield
+            try:
+                yield
+            finally:
+                for timer in again:
+                    timer.cancel()
     except Exception:
         if pressed:
             raise KeyboardInterrupt from None
         raise
+    finally:
+        sys.unraisablehook = ignored
     if pressed:
         raise KeyboardInterrupt
