@@ -68,6 +68,18 @@ def main(arguments: list[str] | None = None) -> int:
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
+    except Exception as error:
+        if not _is_of_ctrl_c(error):
+            raise
+        print("rigidmd: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _is_of_ctrl_c(error: BaseException | None) -> bool:
+    """Whether an error came of Ctrl-C, which some libraries turn into errors of their own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _parser() -> argparse.ArgumentParser:

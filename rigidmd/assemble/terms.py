@@ -125,7 +125,8 @@ def _lennard_jones(
         if one[2 * n] and other[2 * n + 1]
     }
     start = forces.switch_start_A or cutoff
-    law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
+    with np.errstate(over="ignore", invalid="ignore"):  # told below
+        law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
     if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
         raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
     return law
