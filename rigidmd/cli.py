@@ -6,9 +6,12 @@ import re
 import shlex
 import sys
 import warnings
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from rigidmd.looking.commands import add_commands
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
@@ -201,6 +204,8 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--force", action="store_true", help="replace earlier results in that folder")
     stability.set_defaults(scene="stability")
 
+    add_commands(partial(_command, commands))
+
     models = _command(
         commands,
         "models",
@@ -354,6 +359,8 @@ def _run(options: argparse.Namespace) -> int:
     print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
     if results.interrupted:
         print(f"  `rigidmd resume {shlex.quote(str(folder))}` goes on with it")
+    else:
+        print(f"  `rigidmd view {shlex.quote(str(folder))}` shows its film on a page, `rigidmd report` the page alone")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0

@@ -17,7 +17,18 @@ SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems"
 DOCS = PACKAGE / "docs"
 
 #: In the order of the list.
-CHAPTERS = ("top", "water", "molecule", "ensembles", "extending", "manual", "benchmarks", "validation", "changelog")
+CHAPTERS = (
+    "top",
+    "water",
+    "molecule",
+    "ensembles",
+    "looking",
+    "extending",
+    "manual",
+    "benchmarks",
+    "validation",
+    "changelog",
+)
 
 
 class Example(NamedTuple):

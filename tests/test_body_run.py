@@ -33,9 +33,7 @@ def test_a_run_leaves_what_it_promises(tmp_path, capsys):
     for part in ("3 degrees of freedom", "L_z error", "orthogonality", "motion.csv", "axis.png"):
         assert part in said
     names = {path.name for path in folder.iterdir() if not path.name.startswith((".rigidmd", "checkpoint"))}
-    figures = {
-        f"{name}.{end}" for name in ("axis", "angles", "ellipsoids", "path", "invariants") for end in ("png", "svg")
-    }
+    figures = {f"{name}.{end}" for name in ("axis", "angles", "omega", "invariants") for end in ("png", "svg")}
     files = {"scene.toml", "motion.csv", "motion.npz", "summary.json", "topology.gro", "trajectory.xtc"}
     assert names == figures | files
     assert (folder / "axis.png").read_bytes().startswith(b"\x89PNG")

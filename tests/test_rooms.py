@@ -22,6 +22,7 @@ ROOMS = [
     ("shipped",),
     ("run",),
     ("study",),
+    ("looking",),
     ("cli", "__main__"),
 ]
 RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
@@ -35,8 +36,9 @@ LIBRARIES = {
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
     "matplotlib": {
-        "output/figure.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
-        "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py",
+        "output/figure.py", "output/page.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
+        "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
+        "looking/film.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
     "numba": {

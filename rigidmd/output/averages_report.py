@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.bias import SHARE, AverageRun, Averages, Quantity
-from rigidmd.output.figure import curve_style, save_figure
-from rigidmd.output.report import FAINT, INK, signed
+from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
+from rigidmd.output.report import signed
 
 FILES = ("precision.csv", "precision.json", "averages.png")
 

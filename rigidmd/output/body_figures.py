@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.output.figure import save_figure
-from rigidmd.output.report import COOL, FAINT, INK, WARM
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle, save_figure, thin_series
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
@@ -26,8 +25,13 @@ def draw_motion(
     inertia: np.ndarray | None,
     invariants: list[str],
     gravity: np.ndarray | None,
+    flies: bool,
 ) -> list[Path]:
-    """Draw the figures that these columns allow, as PNG and SVG. Returns the paths. Raises OutputError."""
+    """Draw the figures that these columns allow, as PNG and SVG. Returns the paths. Raises OutputError.
+
+    inertia : of a body whose omega stays on the ellipsoids of energy and momentum; flies : of one that is pinned, the
+    path of the axis tells that of the centre of mass
+    """
     down = None if gravity is None or not np.any(gravity) else np.asarray(gravity) / np.linalg.norm(gravity)
     figures = {}
     if len(columns["t"]) > 1:
@@ -40,7 +44,7 @@ def draw_motion(
                 figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(inertia, float))
             else:
                 figures["omega"] = _omega_figure(columns)
-        if "x" in columns:
+        if flies:
             figures["path"] = _path_figure(columns, down)
         figures["invariants"] = _invariants_figure(columns, invariants)
     return [path for stem, figure in figures.items() if figure for path in _write(folder, stem, name, figure)]
@@ -76,29 +80,38 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     azimuth, lift = np.arctan2(path[0, 1], path[0, 0]) - np.radians(25), side * np.radians(25)
     eye = np.array([np.cos(azimuth) * np.cos(lift), np.sin(azimuth) * np.cos(lift), np.sin(lift)])
     sphere, disc = (figure := _new_figure("path of the body axis", 10, 5.4)).subplots(1, 2)
-    view, half = _camera(eye, UP), np.full(2, 1.12)
+    view, half = camera(eye, UP), np.full(2, 1.12)
     _shade(sphere, [(np.ones(3), FAINT)], view, half, np.zeros(2))
-    grid = [_circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
-    for circle in [*grid, *(_circle(UP, theta) for theta in range(30, 180, 30))]:
-        _front_and_back(sphere, circle, view, circle @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
-    for circle in (extremes := [_circle(UP, polar.min()), _circle(UP, polar.max())]):
-        _front_and_back(sphere, circle, view, circle @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
+    grid = [circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
+    for ring in [*grid, *(circle(UP, theta) for theta in range(30, 180, 30))]:
+        _front_and_back(sphere, ring, view, ring @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
+    for ring in (extremes := [circle(UP, polar.min()), circle(UP, polar.max())]):
+        _front_and_back(sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
     _draw_path(sphere, path, view, path @ eye, half, np.zeros(2), COOL)
     _triad(sphere, view, "xyz", down)
     sphere.set_title(f"from 25° {word} the horizon", **NOTE)
-    view = _camera(side * UP, np.eye(3)[1])
+    view = camera(side * UP, np.eye(3)[1])
     flat = path @ view[:2].T
     centre, near = (flat.max(0) + flat.min(0)) / 2, 0.625 * np.ptp(flat, axis=0).max()
     enlarged = 1e-6 < near < 0.4
     centre, half = (centre, np.full(2, near)) if enlarged else (np.zeros(2), half)
-    for circle, style in [(_circle(UP), "-"), *((circle, DASHED) for circle in extremes)]:
-        disc.plot(*view[:2] @ circle.T, color=FAINT, lw=0.9, ls=style)
+    for ring, style in [(circle(UP), "-"), *((ring, DASHED) for ring in extremes)]:
+        disc.plot(*view[:2] @ ring.T, color=FAINT, lw=0.9, ls=style)
     disc.plot([-1, 1, np.nan, 0, 0], [0, 0, np.nan, -1, 1], color=FAINT, lw=0.4, alpha=0.6)
     _draw_path(disc, path, view, path @ view[2], half, centre, COOL)
     _triad(disc, view, "xy")
     zoom = f", enlarged {_times(1.12 / near)}" if enlarged else ""
     disc.set_title(f"from {word}{zoom}; dashed: its θ {_range(polar)}", **NOTE)
+    _tell_start(figure)
     return figure
+
+
+def _tell_start(figure) -> None:
+    """A legend outside of all panels: the dot is the start."""
+    from matplotlib.lines import Line2D
+
+    dot = Line2D([], [], color=WARM, marker="o", ms=5, ls="none", label="start")
+    figure.legend(handles=[dot], loc="outside upper right", frameon=False, fontsize=9, labelcolor=FAINT)
 
 
 def _angles_figure(columns: dict[str, np.ndarray]):
@@ -107,8 +120,11 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     phi, psi = _apart(columns)
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = _new_figure("Euler angles (3-1-3)", 8, 6.4)
-    labels, cells = ("φ (°)", "θ (°)", "ψ (°)"), figure.add_gridspec(3, 1)
-    panels = _draw_series(figure, cells, time, angles, labels, 1e-5, 1.0, (COOL, WARM, COOL))
+    turning = [np.ptp(angle) > 360 for angle in angles]
+    drawn = [angle / 360 if many else angle for angle, many in zip(angles, turning, strict=True)]
+    labels = [f"{name} ({'turns' if many else '°'})" for name, many in zip("φθψ", turning, strict=True)]
+    cells = figure.add_gridspec(3, 1)
+    panels = _draw_series(figure, cells, time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
     panels[1].set_title(_range(theta), **NOTE)
     for panel, angle in zip(panels[::2], angles[::2], strict=True):
         first, last = np.round(angle[[0, -1]], 6) + 0.0
@@ -144,14 +160,14 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     energy, momentum = np.sqrt(energies[at] / inertia), np.linalg.norm(inertia * omega[at]) / inertia
     order, mean = np.argsort(inertia, kind="stable"), omega.mean(0) / fastest
     eye = np.array([0.5, 0.75, 0.45])[np.argsort(order)]
-    view = _camera(eye * np.where(mean < -1e-6, -1.0, 1.0) + 0.6 * mean, np.eye(3)[order[2]])
+    view = camera(eye * np.where(mean < -1e-6, -1.0, 1.0) + 0.6 * mean, np.eye(3)[order[2]])
     depth = np.minimum(omega / energy**2 @ view[2], omega / momentum**2 @ view[2])
     flat = omega @ view[:2].T
     whole = [max(np.linalg.norm(semi * side) for semi in (energy, momentum)) for side in view[:2]]
     half = 1.06 * np.minimum(np.maximum(whole, np.abs(flat).max(0)), 2.5 * fastest)
     half = np.maximum(half, 0.8 * half[::-1])
     near, middle = 0.75 * np.ptp(flat, axis=0).max(), (flat.max(0) + flat.min(0)) / 2
-    boxes = [(half, np.zeros(2), f"ellipsoids of energy (blue) and momentum (red), t = {time[at]:g} s")]
+    boxes = [(half, np.zeros(2), f"from the side of ω; energy (blue), momentum (red), t = {time[at]:g} s")]
     if 1e-6 * half.max() < near < 0.2 * half.max():
         boxes.append((np.full(2, near), middle, f"the path, enlarged {_times(half.max() / near)}"))
     figure = _new_figure("ω in the body frame", 6.2 + 4 * len(boxes), 5)
@@ -164,6 +180,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
         axis.set_title(title, **NOTE)
     labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
     _draw_series(figure, cells[:, -1].subgridspec(3, 1), time, omega.T, labels, 1e-9 * fastest, 2 * fastest)
+    _tell_start(figure)
     return figure
 
 
@@ -201,6 +218,7 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     _draw_series(figure, stack, columns["t"], place.T, labels, least, span)
     for column, (title, right, upward) in enumerate(planes, start=1):
         _draw_plane(figure.add_subplot(cells[:, column]), title, place, right, upward, least)
+    _tell_start(figure)
     return figure
 
 
@@ -261,7 +279,7 @@ def _draw_series(figure, cells, time, series, labels, least: float, shown: float
         low, high = values.min(), values.max()
         moves = high - low > least
         dense = moves and np.abs(np.diff(values)).sum() > 300 * (high - low)
-        panel.plot(*_thin_series(time, values), color=color, lw=0.9, alpha=0.5 if dense else 1.0)
+        panel.plot(*thin_series(time, values), color=color, lw=0.9, alpha=0.5 if dense else 1.0)
         margin = 0.06 * (high - low) if moves else shown / 2
         panel.set(ylim=(low - margin, high + margin), ylabel=label, xmargin=0)
         panel.tick_params(labelbottom=row == len(labels) - 1)
@@ -270,20 +288,6 @@ def _draw_series(figure, cells, time, series, labels, least: float, shown: float
         panels.append(panel)
     panels[-1].set_xlabel("time (s)")
     return panels
-
-
-def _camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """An orthographic view from the direction `eye`: rows to the right, upwards and towards the eye."""
-    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(toward, right), toward])
-
-
-def _circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
-    """The circle on the unit sphere at this polar angle (degrees) from a direction."""
-    right, up, toward = _camera(normal, np.eye(3)[np.abs(normal).argmin()])
-    turn, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
-    return np.sin(polar) * (np.cos(turn) * right + np.sin(turn) * up) + np.cos(polar) * toward
 
 
 def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: np.ndarray, centre: np.ndarray) -> None:
@@ -305,7 +309,7 @@ def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: n
         seen = (b * b >= a * c) & (depth > nearest + 1e-6 * half.max())
         image[seen, :3], image[seen, 3] = (1 - tint * (1 - np.array(to_rgb(color))))[seen], 1.0
         nearest[seen] = depth[seen]
-        axis.plot(*view[:2] @ (semi * _circle(view[2] / semi)).T, color=color, lw=0.8, alpha=0.6)
+        axis.plot(*view[:2] @ (semi * circle(view[2] / semi)).T, color=color, lw=0.8, alpha=0.6)
     axis.imshow(image, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), interpolation="bilinear", zorder=0)
 
 
@@ -347,17 +351,6 @@ def _plan(flat: np.ndarray, half) -> tuple[np.ndarray, dict]:
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).cumsum()])
     shown = np.flatnonzero(np.diff(np.floor(800 * way), prepend=-1.0) > 0)
     return shown, {"lw": max(0.25, 1.7 / (1 + way[-1] / 60)), "rasterized": len(shown) > MOST_POINTS}
-
-
-def _thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:
-    """A long series reduced to the lowest and highest value of each of its parts; its curve looks the same."""
-    size = len(time) // bins
-    if size < 4:
-        return time, values
-    starts = np.arange(0, len(time) // size * size, size)
-    parts = values[: len(starts) * size].reshape(-1, size)
-    kept = np.unique(np.concatenate([starts + parts.argmin(1), starts + parts.argmax(1), [0, len(time) - 1]]))
-    return time[kept], values[kept]
 
 
 def _range(degrees: np.ndarray) -> str:

@@ -2,8 +2,11 @@
 
 from itertools import pairwise
 
+import numpy as np
+
 #: Points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
 AT_ONCE = 5000
+INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 COLORS = ("#2b6f9e", "#c8553d", "#4f8a5b", "#7a5ca3", "#b8862d", "#1f2430", "#3fa7a0", "#c2569a", "#8a8f99", "#7f9a1c")
 MARKERS = "os^Dv*PX<>"
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
@@ -43,3 +46,47 @@ def save_figure(figure, target, **options) -> None:
             line.set_path_effects([InPieces()])
     with rc_context({"agg.path.chunksize": 0}):
         figure.savefig(target, **options)
+
+
+def thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:
+    """A long series reduced to the lowest and highest value of each of its parts; its curve looks the same."""
+    size = len(time) // bins
+    if size < 4:
+        return time, values
+    starts = np.arange(0, len(time) // size * size, size)
+    parts = values[: len(starts) * size].reshape(-1, size)
+    kept = np.unique(np.concatenate([starts + parts.argmin(1), starts + parts.argmax(1), [0, len(time) - 1]]))
+    return time[kept], values[kept]
+
+
+def thin_path(path: np.ndarray, most: int) -> np.ndarray:
+    """Indices of at most about so many points of a path (n, d), evenly along its length, with its ends."""
+    if len(path) <= most:
+        return np.arange(len(path))
+    way = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+    if way[-1] == 0:
+        return np.array([0, len(path) - 1])
+    marks = np.searchsorted(way, np.linspace(0, way[-1], most))
+    return np.unique(np.concatenate([marks.clip(0, len(path) - 1), [0, len(path) - 1]]))
+
+
+def camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """An orthographic view from the direction `eye`: rows to the right, upwards and towards the eye."""
+    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
+    """The circle on the unit sphere at this polar angle (degrees) from a direction."""
+    right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
+    turn, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
+    return np.sin(polar) * (np.cos(turn) * right + np.sin(turn) * up) + np.cos(polar) * toward
+
+
+def few_decades(line) -> None:
+    """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer than two of them."""
+    from matplotlib.ticker import LogFormatterSciNotation
+
+    line.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.0, 0.5)))
+    line.set_tick_params(which="minor", labelsize=7)

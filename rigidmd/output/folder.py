@@ -78,6 +78,24 @@ def continue_folder(folder: Path, names: Iterable[str]) -> None:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
 
 
+def check_is_run(folder: Path) -> None:
+    """Raise OutputError if a folder is not that of a run."""
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "is not there"
+        raise OutputError(f"{folder} {what}; name the folder of a run, such as runs/water")
+    if not (folder / MARKER).is_file() or not (folder / SCENE).is_file():
+        raise OutputError(f"{folder} is not the folder of a run: `rigidmd run` wrote no {SCENE} there")
+
+
+def add_to_folder(folder: Path, names: Iterable[str]) -> None:
+    """Note files that are made from a run beside its own: a new run in the folder removes them. Raises OutputError."""
+    everything = dict.fromkeys([*_written(folder), *names])
+    try:
+        (folder / MARKER).write_text("\n".join(everything) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {error.strerror}; name another file with -o") from None
+
+
 class FolderLock:
     """Keeps other runs out of a folder. The system ends it with the process, however that ends."""
 
@@ -125,4 +143,8 @@ def _written(folder: Path) -> list[str]:
     marker = folder / MARKER
     if not marker.is_file():
         return []
-    return [name for name in marker.read_text(encoding="utf-8").split("\n") if name and Path(name).name == name]
+    return [
+        name
+        for name in marker.read_text(encoding="utf-8", errors="replace").split("\n")
+        if name and Path(name).name == name
+    ]

@@ -6,8 +6,11 @@ import numpy as np
 
 
 class Frame(NamedTuple):
-    """A time (ps); without a trajectory file also positions (s, 3) and cell (3, 3), Å."""
+    """A time (ps); without a trajectory file also positions (s, 3) and velocities (s, 3) of sites, cell (3, 3) and
+    rotations (n, 3, 3), Å and Å/ps."""
 
     time: float
     positions: np.ndarray | None = None
     cell: np.ndarray | None = None
+    velocities: np.ndarray | None = None
+    rotation: np.ndarray | None = None

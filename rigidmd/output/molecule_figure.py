@@ -6,11 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.errors import OutputError
 from rigidmd.molecules import Molecule
-from rigidmd.output.figure import save_figure
+from rigidmd.output.figure import COOL, FAINT, INK, save_figure
 from rigidmd.output.molecule_report import COVALENT, bonds, short_source
-from rigidmd.output.report import COOL, FAINT, INK
+from rigidmd.output.target import check_target
 
 ENDINGS = (".png", ".svg", ".pdf")
 #: Colours of the elements, after Corey, Pauling and Koltun, and of all others.
@@ -33,24 +32,12 @@ class _Sphere(NamedTuple):
     radius: float  # Å
 
 
-def check_figure(path: Path, force: bool) -> None:
-    """Raise OutputError if a figure cannot be written there or would replace a file; changes nothing."""
-    if path.suffix not in ENDINGS:
-        raise OutputError(f"{path}: a figure's name ends in one of {' '.join(ENDINGS)}")
-    if path.is_dir():
-        raise OutputError(f"{path} is a folder; name a file")
-    if not path.parent.is_dir():
-        raise OutputError(f"{path} cannot be written: there is no folder {path.parent}")
-    if path.exists() and not force:
-        raise OutputError(f"{path} exists; --force replaces it, -o names another file")
-
-
 def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     """Draw a molecule into a file; the ending sets the format. Raises OutputError."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    check_figure(path, force)
+    check_target(path, ENDINGS, force, "figure")
     view = _view(m)
     seen = m.positions_body @ view.T  # right, up, towards the viewer
     spheres = [_Sphere((x, y), depth, _radius(m, i)) for i, (x, y, depth) in enumerate(seen.tolist())]

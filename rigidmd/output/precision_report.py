@@ -1,17 +1,16 @@
 """Report of `rigidmd precision`: a table, advice in words, precision.csv, .png and a self-contained page."""
 
-import base64
 import csv
-import html
 from math import hypot
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.trials import Precision, Trial
-from rigidmd.output.figure import curve_style, save_figure
-from rigidmd.output.report import FAINT, INK, signed
+from rigidmd.output.figure import FAINT, INK, curve_style, few_decades, save_figure
+from rigidmd.output.report import signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
 #: Shorter titles, so that the table fits a terminal.
@@ -83,18 +82,18 @@ def table_text(found: Precision) -> str:
     text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
     text += _columns([titles, *(row(found, t) for t in found.trials)])
     if found.sampled and (sampled := [t for t in found.trials if t.averages]):
-        rows = [_brief_headers(), *(_brief_row(found, t) for t in sampled)]
+        rows = [brief_headers(), *(brief_row(found, t) for t in sampled)]
         text += f"\n\naverages over {found.sampled:g} ps\n" + _columns(rows)
     return text
 
 
-def _brief_headers() -> list[str]:
+def brief_headers() -> list[str]:
     first, *others = ESTIMATORS.values()
     return ["integrator", "step (fs)", "T_trans (K)", f"T_rot - T_trans (K): {first}", *others, "bias of U (kJ/mol)",
             "bias of P (bar)"]  # fmt: skip
 
 
-def _brief_row(found: Precision, trial: Trial) -> list[str | None]:
+def brief_row(found: Precision, trial: Trial) -> list[str | None]:
     """The averages that differ between steps."""
     seen, best = trial.averages, found.most_exact.averages
     cells: list[str | None] = [trial.integrator, f"{trial.timestep:.3g}", signed(*seen["T_trans"]).lstrip("+")]
@@ -108,7 +107,7 @@ def _brief_row(found: Precision, trial: Trial) -> list[str | None]:
 
 def _columns(rows: list[list]) -> str:
     """Rows as text in columns; columns without values are omitted."""
-    lines = [[_short(cell) for cell in line] for line in rows]
+    lines = [[short(cell) for cell in line] for line in rows]
     kept = [k for k in range(len(lines[0])) if any(line[k] not in ("", "-") for line in lines[1:])]
     widths = [max(len(line[k]) for line in lines) for k in kept]
     text = ["  ".join(line[k].ljust(w) if k == 0 else line[k].rjust(w) for k, w in zip(kept, widths, strict=True))
@@ -116,7 +115,7 @@ def _columns(rows: list[list]) -> str:
     return "\n".join(text)
 
 
-def _short(cell) -> str:
+def short(cell) -> str:
     if cell is None:
         return "-"
     if isinstance(cell, str):
@@ -126,6 +125,11 @@ def _short(cell) -> str:
 
 def advice(found: Precision) -> list[str]:
     """Sentences on the reference, the longest stable steps, and the cheapest integrator for each accuracy."""
+    return [*remarks(found), *_cheapest_words(found)]
+
+
+def remarks(found: Precision) -> list[str]:
+    """Sentences on the reference, the longest stable steps, what failed or was left out, and the timings."""
     s = found.subject
     lines = [
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
@@ -149,9 +153,6 @@ def advice(found: Precision) -> list[str]:
     lines += _timing_words(found)
     if found.sampled:
         lines += _temperature_words(found)
-    lines += _cheapest(found, "energy_rms", "an energy error", s.energy_unit)
-    what = "Q" if any(not np.isnan(t.rotation_error) for t in found.trials) else "X"
-    lines += _cheapest(found, "trajectory_error", f"an error of {what}", "" if what == "Q" else s.length_unit)
     return lines
 
 
@@ -187,27 +188,58 @@ def _temperature_words(found: Precision) -> list[str]:
     ]
 
 
-def _cheapest(found: Precision, error: str, what: str, unit: str) -> list[str]:
-    names = list(dict.fromkeys(t.integrator for t in found.trials))
-    lines, common = [], "velocity_verlet"
-    worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
-    for target in 10.0 ** np.arange(0, -15, -2):
-        reached = {name: at for name in names if (at := found.time_for(name, error, target))}
-        if target > worst or len(reached) < 2 or (error == "trajectory_error" and target < 3 * found.reference_error):
-            continue
-        best = min(reached, key=lambda name: reached[name][0])
-        seconds, step = reached[best]
-        line = f"for {what} of {target:.0e} {unit}".rstrip()
-        line += f" the cheapest is {best} at {step:.2g} {found.subject.time_unit}"
-        if common in reached and best != common:
-            other, its_step = reached[common]
-            line += f": {other / seconds:.1f} times faster than {common} at {its_step:.2g} {found.subject.time_unit}"
+class Cheapest(NamedTuple):
+    """The integrator that reaches an error in the least run time."""
+
+    error: str  # what error this is, with its unit
+    target: float
+    integrator: str
+    step: float  # in the subject's unit, where its error is the target
+    seconds: float
+    common: str  # integrator to compare with; empty if it is the same or does not reach the target
+    times_faster: float
+    common_step: float
+
+
+def cheapest(found: Precision) -> list[Cheapest]:
+    """The cheapest integrator for each accuracy: of the energy, and of Q or X."""
+    s = found.subject
+    turning = any(not np.isnan(t.rotation_error) for t in found.trials)
+    kinds = {
+        "energy_rms": ("an energy error", s.energy_unit),
+        "trajectory_error": ("an error of Q", "") if turning else ("an error of X", s.length_unit),
+    }
+    names, common, lines = list(dict.fromkeys(t.integrator for t in found.trials)), "velocity_verlet", []
+    for error, (what, unit) in kinds.items():
+        worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
+        for target in 10.0 ** np.arange(0, -15, -2):
+            reached = {name: at for name in names if (at := found.time_for(name, error, target))}
+            blind = error == "trajectory_error" and target < 3 * found.reference_error
+            if target > worst or len(reached) < 2 or blind:
+                continue
+            best = min(reached, key=lambda name: reached[name][0])
+            seconds, step = reached[best]
+            other, its_step = reached.get(common, (np.nan, np.nan))
+            against = common if common in reached and best != common else ""
+            told = f"{what} of {target:.0e} {unit}".rstrip()
+            lines.append(Cheapest(told, float(target), best, step, seconds, against, other / seconds, its_step))
+    return lines
+
+
+def _cheapest_words(found: Precision) -> list[str]:
+    unit, lines = found.subject.time_unit, []
+    for c in cheapest(found):
+        line = f"for {c.error} the cheapest is {c.integrator} at {c.step:.2g} {unit}"
+        if c.common:
+            line += f": {c.times_faster:.1f} times faster than {c.common} at {c.common_step:.2g} {unit}"
         lines.append(line)
     return lines
 
 
 def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
     """Write all files. Returns their paths."""
+    from rigidmd.output.precision_page import precision_page
+
     with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(headers(found))
@@ -221,14 +253,24 @@ def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
             writer.writerows(average_row(found, trial) for trial in sampled)
     draw(folder / FILES[1], found)
     with whole_file(folder / FILES[2]) as temporary:
-        temporary.write_text(page(found, (folder / FILES[1]).read_bytes(), command), encoding="utf-8")
+        temporary.write_text(precision_page(found, command), encoding="utf-8")
     return [folder / name for name in written]
 
 
 def draw(path: Path, found: Precision) -> None:
-    """Log error against log run time, one curve an integrator; the best trials are ringed."""
+    """precision.png."""
+    figure = figure_of(found)
+    figure.suptitle(f"{found.subject.name}: error against run time", color=INK, x=0.01, ha="left", fontsize=11)
+    with whole_file(path) as temporary:
+        save_figure(figure, temporary, dpi=150)
+
+
+def figure_of(found: Precision):
+    """Log error against log run time, one curve an integrator with its steps; the best trials are ringed.
+
+    A bar shows the spread of the run times.
+    """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter
 
     s = found.subject
     per = "ps" if s.time_unit == "fs" else "s"
@@ -243,48 +285,26 @@ def draw(path: Path, found: Precision) -> None:
     for axis, (error, title) in zip((left, right), titles.items(), strict=True):
         for k, name in enumerate(names):
             own = [t for t in found.trials if t.integrator == name and not t.diverged and getattr(t, error) > 0]
-            axis.loglog([t.time / s.span for t in own], [getattr(t, error) for t in own], ms=3.5, lw=1.2, label=name,
-                        **curve_style(k))  # fmt: skip
+            times, errors, style = [t.time / s.span for t in own], [getattr(t, error) for t in own], curve_style(k)
+            axis.loglog(times, errors, ms=3.5, lw=1.2, label=name, **style)
+            low, high = ([abs(end(t.seconds) - t.time) / s.span for t in own] for end in (min, max))
+            axis.errorbar(times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7)
+            for time, value, trial in zip(times, errors, own, strict=True):
+                axis.annotate(f"{trial.timestep:.2g}", (time, value), xytext=(3, 3), textcoords="offset points",
+                              fontsize=5.5, color=style["color"])  # fmt: skip
         front = found.front(error)
         ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": "none is both faster and better"}
         axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
         axis.set_title(title, loc="left", fontsize=9, color=INK)
-        axis.set_xlabel(f"seconds of computing per {per}")
+        axis.set_xlabel(f"seconds of computing per {per}; at the points: the step ({s.time_unit})", color=INK)
+        axis.tick_params(colors=INK, which="both")
+        axis.spines[:].set_color(INK)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.xaxis.set_minor_formatter(NullFormatter())
+        few_decades(axis.xaxis)
+        few_decades(axis.yaxis)
     left.axhline(found.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate("error of the reference", (1, found.reference_error), xycoords=("axes fraction", "data"), fontsize=8,
                   color=FAINT, ha="right", va="bottom")  # fmt: skip
-    right.legend(frameon=False, fontsize=8, handlelength=2.8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.suptitle(f"{s.name}: error against run time", color=INK, x=0.01, ha="left", fontsize=11)
-    with whole_file(path) as temporary:
-        save_figure(figure, temporary, dpi=150)
-
-
-def page(found: Precision, picture: bytes, command: str) -> str:
-    """A self-contained page."""
-    tables = _html_table(headers(found), [row(found, trial) for trial in found.trials])
-    if sampled := [trial for trial in found.trials if trial.averages]:
-        tables += f"<h2>Averages over {found.sampled:g} ps</h2>\n"
-        tables += _html_table(_brief_headers(), [_brief_row(found, trial) for trial in sampled])
-    words = "".join(f"<li>{html.escape(line)}</li>\n" for line in advice(found))
-    name = html.escape(found.subject.name)
-    return f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{name}: error against run time</title>
-<style>body{{font:15px/1.5 system-ui,sans-serif;color:{INK};max-width:1000px;margin:2em auto;padding:0 1em}}
-img{{max-width:100%}}table{{border-collapse:collapse;font-size:13px}}td,th{{padding:2px 8px;text-align:right}}
-td:first-child,th:first-child{{text-align:left}}tr:nth-child(even){{background:#f4f5f7}}code{{color:{FAINT}}}</style>
-<h1>{name}: error against run time</h1>
-<ul>
-{words}</ul>
-<img alt="log error against log run time" src="data:image/png;base64,{base64.b64encode(picture).decode()}">
-{tables}<p><code>{html.escape(command)}</code></p></html>
-"""
-
-
-def _html_table(titles: list[str], rows: list[list]) -> str:
-    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(_short(cell))}</td>" for cell in line) + "</tr>\n" for line in rows
-    )
-    return f"<table><tr>{head}</tr>\n{body}</table>\n"
+    right.legend(frameon=False, fontsize=8, handlelength=2.8, loc="center left", bbox_to_anchor=(1.0, 0.5),
+                 labelcolor=INK)  # fmt: skip
+    return figure

@@ -10,10 +10,8 @@ import numpy as np
 from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
-from rigidmd.output.figure import save_figure
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure
 from rigidmd.scene.stage import Stage
-
-INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 POSITIONS = {
@@ -185,10 +183,10 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
             f"{last['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
-    drift.set_ylabel("drift of the conserved\nenergy (kJ/mol per molecule)")
+    drift.set_ylabel("conserved energy relative to the\nstart of the stage (kJ/mol per molecule)")
     parts.plot(time, (column["potential"] - column["potential"][-1]) / n, color=COOL, lw=0.9, label="potential")
     parts.plot(time, (column["kinetic"] - column["kinetic"][-1]) / n, color=WARM, lw=0.9, label="kinetic")
-    parts.set_ylabel("less its last value\n(kJ/mol per molecule)")
+    parts.set_ylabel("energies relative to their\nlast values (kJ/mol per molecule)")
     for name, color, label in (
         ("temperature_translation", COOL, "translation"),
         ("temperature_rotation", WARM, "rotation"),
@@ -209,7 +207,7 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
                 textcoords="offset points", fontsize=9, color=FAINT, va="top",
             )  # fmt: skip
         if axis.get_legend_handles_labels()[0]:
-            axis.legend(frameon=False, ncols=2, loc="upper right", fontsize=9)
+            axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
     figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
     with whole_file(path) as temporary:
         save_figure(figure, temporary, dpi=150)

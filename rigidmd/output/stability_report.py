@@ -1,9 +1,6 @@
 """Report of `rigidmd stability`: a table, failures in words, stability.csv, .md and a self-contained page."""
 
-import base64
 import csv
-import html
-import io
 from collections import Counter
 from math import inf, isfinite, isnan
 from pathlib import Path
@@ -12,12 +9,10 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
-from rigidmd.output.figure import save_figure
-from rigidmd.output.report import COOL, FAINT, INK, WARM
+from rigidmd.output.figure import INK, curve_style, few_decades
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
-COLORS = (COOL, WARM, "#4f8a5b", "#7a5ca3", "#b8862d", INK, FAINT, "#8fb4cf", "#e2a08f", "#9bbf9f", "#c8a2c8")
 
 
 def rows(finding: Finding) -> list[list[str]]:
@@ -101,6 +96,8 @@ def failed(findings: list[Finding]) -> bool:
 
 def write_stability(folder: Path, findings: list[Finding], command: str, machine: str) -> list[Path]:
     """Write all files. Returns their paths."""
+    from rigidmd.output.stability_page import stability_page
+
     with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(
@@ -109,7 +106,7 @@ def write_stability(folder: Path, findings: list[Finding], command: str, machine
         )  # fmt: skip
         writer.writerows(line for finding in findings for line in _csv_lines(finding))
     with whole_file(folder / FILES[1]) as temporary:
-        temporary.write_text(page(findings, command, machine), encoding="utf-8")
+        temporary.write_text(stability_page(findings, command, machine), encoding="utf-8")
     with whole_file(folder / FILES[2]) as temporary:
         temporary.write_text(markdown(findings, command, machine), encoding="utf-8")
     return [folder / name for name in FILES]
@@ -147,30 +144,40 @@ def markdown(findings: list[Finding], command: str, machine: str) -> str:
     return "\n".join([*lines, "", *(f"- {line}" for line in words(findings)), ""])
 
 
-def picture(finding: Finding) -> bytes:
-    """A small figure of a case, PNG: errors over the varied quantity, and of conserved quantities over the step."""
+def picture(finding: Finding, styles: dict[str, dict] | None = None):
+    """A small figure of a case: errors over the varied quantity, and of conserved quantities over the step.
+
+    styles : integrator -> colour and marker; None without numbers
+    """
     from matplotlib.figure import Figure
 
+    styles = styles or styles_of([finding])
     varied = len({t.x for t in finding.trials if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
     panels = [kind for kind, has in (("trials", varied), ("limits", finding.limits)) if has]
     if not panels:
-        return b""
+        return None
     figure = Figure(figsize=(4.6 * len(panels), 3.0), layout="constrained")
     for axis, kind in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
-        for k, family in enumerate(finding.families):
-            color = COLORS[k % len(COLORS)]
-            (_draw_trials if kind == "trials" else _draw_limits)(axis, finding, family, color)
+        for family in finding.families:
+            (_draw_trials if kind == "trials" else _draw_limits)(axis, finding, family, styles[family])
         axis.set_xscale("log" if _positive(axis) else "linear")
         axis.set_yscale("log")
         axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(labelsize=7, colors=INK)
-        axis.xaxis.label.set_size(8)
-        axis.yaxis.label.set_size(8)
+        axis.spines[:].set_color(INK)
+        axis.tick_params(labelsize=7, colors=INK, which="both")
+        for line in (axis.xaxis, axis.yaxis):
+            line.label.set(size=8, color=INK)
+            if line.get_scale() == "log":
+                few_decades(line)
         if axis.get_legend_handles_labels()[0]:
-            axis.legend(frameon=False, fontsize=6.5, loc="best")
-    stream = io.BytesIO()
-    save_figure(figure, stream, dpi=110)
-    return stream.getvalue()
+            axis.legend(frameon=False, fontsize=6.5, loc="upper left", bbox_to_anchor=(1.0, 1.0), labelcolor=INK)
+    return figure
+
+
+def styles_of(findings: list[Finding]) -> dict[str, dict]:
+    """Colour and marker of each integrator, the same in all figures."""
+    names = dict.fromkeys(family for finding in findings for family in finding.families)
+    return {name: {key: curve_style(k)[key] for key in ("color", "marker")} for k, name in enumerate(names)}
 
 
 def _positive(axis) -> bool:
@@ -182,19 +189,13 @@ def _positive(axis) -> bool:
 FLOOR = 1e-17
 
 
-def _draw_trials(axis, finding: Finding, family: str, color: str) -> None:
+def _draw_trials(axis, finding: Finding, family: str, style: dict) -> None:
     own = sorted((t for t in finding.trials if t.family == family and isfinite(t.x)), key=lambda t: t.x)
     right = [t for t in own if t.verdict == RIGHT]
     wrong = [t for t in own if t.verdict != RIGHT and isfinite(t.outcome.error)]
-    axis.plot(
-        [t.x for t in right],
-        [max(t.outcome.error, FLOOR) for t in right],
-        "o",
-        ms=3 + 1.5 * finding.families.index(family),
-        mfc="none",
-        color=color,
-        label=family or None,
-    )
+    hollow = {"ls": "none", "ms": 5, "mfc": "none", "label": family or None, **style}
+    axis.plot([t.x for t in right], [max(t.outcome.error, FLOOR) for t in right], **hollow)
+    color = style["color"]
     axis.plot([t.x for t in wrong], [max(t.outcome.error, FLOOR) for t in wrong], "x", ms=6, color=color)
     bound = [t for t in own if t.allowed > 0 and isfinite(t.allowed) and isfinite(t.outcome.error)]
     axis.plot([t.x for t in bound], [t.allowed for t in bound], "_", ms=6, color=color, alpha=0.6)
@@ -202,50 +203,12 @@ def _draw_trials(axis, finding: Finding, family: str, color: str) -> None:
     axis.set_ylabel(finding.error_title + "\n(dashes: allowed)")
 
 
-def _draw_limits(axis, finding: Finding, family: str, color: str) -> None:
+def _draw_limits(axis, finding: Finding, family: str, style: dict) -> None:
     for n, limit in enumerate(one for one in finding.limits if one.family == family):
         points = [(step, min(max(told, FLOOR), 1e6)) for step, told in limit.curve if not isnan(told)]
         if points:
-            axis.plot(
-                *zip(*points, strict=True), "-", marker=".", lw=0.9, ms=3, color=color, label=None if n else family
-            )
+            axis.plot(*zip(*points, strict=True), lw=0.9, ms=3, label=None if n else family, **style)
         if isfinite(limit.longest) and limit.longest > 0:
-            axis.axvline(limit.longest, color=color, lw=0.6, ls=":")
+            axis.axvline(limit.longest, color=style["color"], lw=0.6, ls=":")
     axis.set_xlabel(f"step ({finding.step_unit}); dotted: longest bounded")
     axis.set_ylabel("largest error of a conserved quantity")
-
-
-def page(findings: list[Finding], command: str, machine: str) -> str:
-    """A self-contained page."""
-    head = "".join(f"<th>{html.escape(title)}</th>" for title in HEADERS)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in line) + "</tr>\n" for f in findings for line in rows(f)
-    )
-    said = "".join(f"<li>{html.escape(line)}</li>\n" for line in words(findings))
-    meanings = "".join(f"<li><b>{v}</b>: {html.escape(meaning)}</li>\n" for v, meaning in VERDICTS.items())
-    cases = "".join(_section(finding) for finding in findings)
-    return f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>rigidmd: stability</title>
-<style>body{{font:15px/1.5 system-ui,sans-serif;color:{INK};max-width:1100px;margin:2em auto;padding:0 1em}}
-img{{max-width:100%}}table{{border-collapse:collapse;font-size:13px}}td,th{{padding:2px 8px;text-align:left}}
-tr:nth-child(even){{background:#f4f5f7}}code{{color:{FAINT}}}h2{{font-size:17px;margin:1.6em 0 .2em}}</style>
-<h1>Stability</h1>
-<ul>
-{said}</ul>
-<ul>
-{meanings}</ul>
-<table><tr>{head}</tr>
-{body}</table>
-{cases}<p><code>{html.escape(command)}</code> on {html.escape(machine)}</p></html>
-"""
-
-
-def _section(finding: Finding) -> str:
-    drawn = picture(finding)
-    image = ""
-    if drawn:
-        image = f'<img alt="{finding.name}" src="data:image/png;base64,{base64.b64encode(drawn).decode()}">\n'
-    notes = "".join(f"<li>{html.escape(note)}</li>\n" for note in finding.notes)
-    messages = dict.fromkeys(t.outcome.message for t in finding.trials if t.outcome.message)
-    notes += "".join(f"<li><code>{html.escape(message)}</code></li>\n" for message in list(messages)[:3])
-    return f"<h2>{finding.name}</h2><p>{html.escape(finding.sentence)}.</p>\n{image}<ul>\n{notes}</ul>\n"

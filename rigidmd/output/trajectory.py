@@ -2,17 +2,20 @@
 
 import contextlib
 import os
+import re
 import struct
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
 from MDAnalysis.coordinates.base import ProtoReader
+from MDAnalysis.coordinates.core import reader as open_reader
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.coordinates.PDB import PDBReader
@@ -26,11 +29,17 @@ from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.system import System
 from rigidmd.core.files import AppendedFile, whole_file
 from rigidmd.core.state import State
-from rigidmd.errors import SimulationError
+from rigidmd.errors import OutputError, SimulationError
+from rigidmd.output.connections import charges, connections
 from rigidmd.output.frame import Frame
 
 #: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
+#: Lines that tell the cell and the time of a frame in formats of text.
+BETWEEN_FRAMES = {
+    ".xyz": rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)',
+    ".pdb": rb"^REMARK +()TIME +(\S+) PS",
+}
 #: Frames are evenly spaced if intervals differ by less than this fraction of the longest.
 EVEN = 1e-6
 
@@ -51,8 +60,15 @@ def universe(system: System | BodySystem, state: State, velocities: bool = False
     u.add_TopologyAttr("masses", system.sites.mass)
     u.add_TopologyAttr("resnames", names)
     u.add_TopologyAttr("resids", np.arange(1, len(names) + 1))
+    _connect(u, system)
     set_frame(u, system, state, 0.0, 0, velocities, wrapped)
     return u
+
+
+def _connect(u: mda.Universe, system: System | BodySystem) -> None:
+    """Add charges and bonds."""
+    u.add_TopologyAttr("charges", charges(system))
+    u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system).tolist()])
 
 
 def set_frame(
@@ -84,13 +100,20 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
         if u.dimensions is None
         else np.array([dimensions(frame.cell) for frame in frames if frame.cell is not None])
     )
-    u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes)
+    velocities = np.array([frame.velocities for frame in frames])
+    u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
     return u
 
 
-def from_files(topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
-    """The Universe of a finished run's files, whose frames have these times (ps)."""
-    return mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
+def from_files(system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
+    """The Universe of a finished run's files, whose frames have these times (ps), with all that its system tells."""
+    u = mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
+    u.add_TopologyAttr("elements", system.sites.element)
+    u.add_TopologyAttr("masses", system.sites.mass)
+    if hasattr(u.atoms, "bonds"):  # a .pdb's
+        u.del_TopologyAttr("bonds")
+    _connect(u, system)
+    return u
 
 
 def _checked(times: list[float]) -> list[float]:
@@ -103,6 +126,90 @@ def _checked(times: list[float]) -> list[float]:
             stacklevel=4,
         )
     return times
+
+
+class Frames(NamedTuple):
+    """Frames of a trajectory: times (f,) ps, positions (f, s, 3) Å, and cells (f, 3, 3), None without a box.
+
+    stride : which frames of the file these are: every one, every second, ...
+    is_cut : whether the file ends within a frame
+    """
+
+    time: np.ndarray
+    positions: np.ndarray
+    cells: np.ndarray | None
+    count: int  # frames in the file
+    stride: int
+    is_cut: bool
+
+
+def read_frames(path: Path, sites: int, most: int) -> Frames:
+    """At most so many evenly spaced frames of a trajectory. A last frame that is cut off is left out.
+
+    Raises OutputError if the file cannot be read, or holds another number of sites.
+    """
+    fault = ""
+    with _quiet():
+        try:
+            return _frames(path, sites, most)
+        except (OSError, EOFError, ValueError, TypeError, IndexError, StopIteration) as error:
+            fault = " ".join(str(error).split())
+    raise OutputError(f"{path} cannot be read as a trajectory: {fault}")
+
+
+def _frames(path: Path, sites: int, most: int) -> Frames:
+    reader: Any = open_reader(str(path), format="NCDF" if path.suffix == ".nc" else path.suffix[1:])
+    with contextlib.closing(reader):
+        if reader.n_atoms != sites:
+            raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
+        count, is_cut = reader.n_frames, False
+        stride = max(1, -(-count // most))
+        times, positions, boxes = [], [], []
+        for k in range(0, count, stride):
+            try:
+                frame = reader[k]
+            except (OSError, EOFError, ValueError):
+                is_cut = True
+                break
+            times.append(frame.time)
+            positions.append(frame.positions.copy())
+            boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
+    if not times:
+        raise OutputError(f"{path} holds no whole frame")
+    told_times, told_cells = _told_in_text(path)
+    if told_times:
+        times = told_times[::stride][: len(times)]
+    cells = np.array(boxes) if all(box is not None for box in boxes) else None
+    if told_cells:
+        cells = np.array(told_cells[::stride][: len(times)])
+    return Frames(np.array(times), np.array(positions), cells, count, stride, is_cut)
+
+
+def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
+    """Times (ps) and cells (3, 3) that lines between frames of .xyz and .pdb tell, which MDAnalysis passes by."""
+    pattern = BETWEEN_FRAMES.get(path.suffix)
+    if pattern is None:
+        return [], []
+    times, cells = [], []
+    with path.open("rb") as file:
+        for line in file:
+            if (b"Time=" in line or line.startswith(b"REMARK")) and (found := re.search(pattern, line)):
+                times.append(float(found[2]))
+                if found[1]:
+                    cells.append(np.array(found[1].split(), float).reshape(3, 3))
+    return times, cells
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the warnings of readers, and what one that could not open its file says when it is removed."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        sys.unraisablehook = hook
 
 
 class _Timed(ProtoReader):
@@ -168,7 +275,7 @@ def write_topology(path: Path, system: System | BodySystem, state: State, wrappe
     with whole_file(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of missing attributes (occupancies, ...)
         sites = universe(system, state, wrapped=wrapped).select_atoms("all")
-        sites.write(str(temporary))
+        sites.write(str(temporary), **({"bonds": "all"} if path.suffix == ".pdb" else {}))
 
 
 def _check_fits(path: Path, positions: np.ndarray) -> None:
@@ -204,9 +311,12 @@ class TrajectoryFile:
         self._path, self._format, self._system = path, path.suffix, system
         self._velocities, self._wrapped = velocities, wrapped
         self._universe = universe(system, system.state, velocities)
-        self._options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": {"multiframe": True}}.get(
-            path.suffix, {}
-        )
+        forms = {
+            ".dcd": {"dt": interval},
+            ".nc": {"velocities": velocities},
+            ".pdb": {"multiframe": True, "bonds": None},  # those of the topology do
+        }
+        self._options = forms.get(path.suffix, {})
         *before, self._frames = kept or (0, 0, 0)
         offset, form = COUNTER.get(path.suffix, (0, ""))
         patched = (offset, struct.pack(form, 1)) if form else (0, b"")

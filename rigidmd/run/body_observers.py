@@ -126,12 +126,14 @@ class Figures(Observer):
             run.scene.name,
             columns=columns,
             axis_body=drawn_axis(system),
-            inertia=system.inertia if _keeps_its_ellipsoids(system) else None,
+            inertia=system.inertia if _keeps_its_ellipsoids(system, samples) else None,
             invariants=samples.invariants,
             gravity=None if gravity is None else np.array(gravity),
+            flies=system.flies,
         )
 
 
-def _keeps_its_ellipsoids(system: "BodySystem") -> bool:
-    """Whether the inertia is constant and the frame does not turn."""
-    return isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
+def _keeps_its_ellipsoids(system: "BodySystem", samples: Motion) -> bool:
+    """Whether the inertia is constant, the frame does not turn, and |L| is conserved: no torque acts."""
+    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
+    return steady and "L_size" in samples.invariants

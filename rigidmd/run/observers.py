@@ -137,8 +137,10 @@ class Frames(Observer):
             self._file.write(moment.state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))
         else:
-            positions = self._run.system.site_positions(moment.state, self._wrapped).astype(np.float32)
-            self._frames.append(Frame(moment.time, positions, moment.state.cell.copy()))
+            system, state = self._run.system, moment.state
+            positions = system.site_positions(state, self._wrapped).astype(np.float32)
+            velocities = system.site_velocities(state).astype(np.float32)
+            self._frames.append(Frame(moment.time, positions, state.cell.copy(), velocities, state.rotation.copy()))
 
     def end(self, run: "Simulation", results: "Results") -> None:
         """Hand over what was seen."""

@@ -115,5 +115,22 @@ class Results:
         if self.files:
             by_name = {path.name: path for path in self.files}
             times = [frame.time for frame in self._frames]
-            return trajectory.from_files(by_name[output.topology], by_name[output.trajectory], times)
+            return trajectory.from_files(self.system, by_name[output.topology], by_name[output.trajectory], times)
         return trajectory.in_memory(self.system, self._frames)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """The rotation matrices Q, body to lab, at the frames of `universe()` (frames, n, 3, 3).
+
+        Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. Raises
+        ValueError if nothing turns, and for molecules whose run wrote files, as those hold the positions of sites only.
+        """
+        if "Q" in self.samples.described:
+            return self["Q"][:, None]
+        if len(self.state.rotation) == 0:
+            raise ValueError("nothing turns in this run: it has points only")
+        if not self._frames:
+            raise ValueError("this run kept no frames (output.trajectory = false)")
+        if self.files:
+            raise ValueError("the files of a run hold positions, not rotations; run without a folder to keep both")
+        return np.array([frame.rotation for frame in self._frames])

@@ -55,7 +55,7 @@ from rigidmd.forces.waves.corrections import intramolecular_energy
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import align
-from rigidmd.output.report import FAINT, INK
+from rigidmd.output.figure import FAINT, INK
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 HERE = Path(__file__).resolve().parent

@@ -1,0 +1,487 @@
+"""Pages and films of runs: what is in them, what a browser shows of them, and bad input."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import sys
+from itertools import pairwise
+
+import MDAnalysis
+import numpy as np
+import pytest
+from conftest import ROOT
+from matplotlib.image import imread
+from PIL import Image, ImageSequence
+
+from rigidmd import Scene, Simulation, cli
+from rigidmd.assemble.body import build_body
+from rigidmd.looking import molecule_film
+from rigidmd.looking.mesh import UNITS, mesh_of
+from rigidmd.looking.record import read_record
+from rigidmd.mechanics.solids import SOLIDS, solid
+from rigidmd.output.connections import connections
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
+)
+in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed: what a browser shows is not tested")
+SHORT_WATER = {"stages.0.duration_ps": 0.02, "stages.1.duration_ps": 0.02, "output.trajectory_interval_ps": 0.01,
+               "output.log_interval_ps": 0.004}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def top(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "top"
+    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.5, "output.figures": False})
+    Simulation(scene, folder).run()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def water(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "water"
+    Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT_WATER), folder).run()
+    return folder
+
+
+def shown(page, out, at=None, size="420,700"):
+    """The pixels of a page in a browser, (h, w, 3), at a time of its film."""
+    flags = ["--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+             "--disable-component-update", "--disable-sync", "--enable-unsafe-swiftshader", "--hide-scrollbars"]  # fmt: skip
+    address = page.resolve().as_uri() + ("" if at is None else f"#t={at}")
+    subprocess.run(
+        [CHROMIUM, *flags, f"--user-data-dir={out.parent / 'browser'}", f"--window-size={size}", f"--screenshot={out}",
+         address],
+        check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    return imread(out)[:, :, :3]
+
+
+def data_of(page):
+    """The data of the film in a page."""
+    found = re.search(r'<script type="application/json" id="film-data">(.*?)</script>', page.read_text("utf-8"))
+    return json.loads(found[1])
+
+
+def numbers(text, kind):
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def is_alone(text):
+    """Whether a page loads nothing from elsewhere."""
+    own = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    return not re.search(r"<link|<script[^>]* src|<img[^>]* src=\"(?!data:)|url\((?!#)|@import|<image", own)
+
+
+def test_a_report_tells_of_molecules(water, tmp_path, capsys):
+    page = tmp_path / "water.html"
+    assert cli.main(["report", str(water), "-o", str(page)]) == 0
+    text = page.read_text("utf-8")
+    assert is_alone(text)
+    for title in ("Means of each stage", "Plots", "Stability margins", "What was simulated", "What was left out, and why",
+                  "Files", "How to repeat it"):  # fmt: skip
+        assert f">{title}</h2>" in text
+    record = read_record(water)
+    own = record.columns["temperature"][record.columns["stage_name"] == "nve"]
+    row = re.search(r"<tr><td>nve</td><td>0.02</td><td>5</td><td>([\d.]+) ±", text)
+    assert float(row[1]) == pytest.approx(own.mean(), abs=0.5)
+    assert "barostat: no stage has a pressure to keep" in text
+    assert page.stat().st_size < 1e6
+    assert str(page) in capsys.readouterr().out
+
+
+def test_a_report_tells_of_a_body(top, capsys):
+    assert cli.main(["report", str(top)]) == 0  # beside the run, and again
+    assert cli.main(["report", str(top)]) == 0
+    text = (top / "report.html").read_text("utf-8")
+    assert is_alone(text)
+    assert "between 40.000000° and" in text
+    assert "error of L_z" in text
+    assert "report.html" in (top / ".rigidmd-run").read_text()  # which a new run there removes
+
+
+def test_the_film_of_a_body_is_its_motion(top, tmp_path):
+    page = tmp_path / "top.html"
+    assert cli.main(["view", str(top), "-o", str(page)]) == 0
+    data, seen = data_of(page), read_record(top).columns
+    assert np.array_equal(numbers(data["time"], "<f8"), seen["t"])
+    quaternion = np.stack([seen[key] for key in ("qw", "qx", "qy", "qz")], axis=-1)
+    assert np.allclose(numbers(data["quaternion"], "<f4").reshape(-1, 4), quaternion, atol=1e-6)
+    tip = numbers(data["path"], "<f4").reshape(-1, 3)[-1]
+    assert np.allclose(tip, data["sphere"] * np.array([seen[f"q{i}3"][-1] for i in (1, 2, 3)]), atol=1e-6)
+    assert is_alone(page.read_text("utf-8"))
+    assert page.stat().st_size < 1e6
+
+
+def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch):
+    monkeypatch.setattr(molecule_film, "library", lambda: "var Chemiscope;")
+    page = tmp_path / "water.html"
+    assert cli.main(["view", str(water), "-o", str(page)]) == 0
+    data, record = data_of(page), read_record(water)
+    seen = (numbers(data["positions"], "<i2").astype(float) + data["steps"]) * data["scale"] + data["low"]
+    frames = molecule_film.frames_of(record, 100)
+    assert np.allclose(seen.reshape(frames.positions.shape), frames.positions, atol=data["scale"])
+    assert data["scale"] < 1e-3
+    assert numbers(data["time"], "<f8") == pytest.approx([0, 0.01, 0.02, 0.03, 0.04], abs=1e-6)
+    assert len(data["bonds"]) == 2 * 216
+    assert set(data["elements"]) == {"O", "H"}
+    centre = frames.positions.reshape(-1, 216, 3, 3).mean(axis=2)
+    assert centre.min() > -0.01
+    assert centre.max() < frames.cells.max() + 0.01
+
+
+@pytest.mark.parametrize("ending", [".trr", ".dcd", ".nc", ".xyz", ".pdb"])
+def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
+    more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.1.duration_ps": 0.01}
+    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
+    frames = molecule_film.frames_of(read_record(tmp_path / "run"), 100)
+    assert frames.time == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-6)
+    assert frames.cells[-1] == pytest.approx(results.state.cell, abs=1e-3)
+
+
+def test_without_chemiscope_a_sentence_says_what_to_install(water, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "chemiscope", None)
+    assert cli.main(["view", str(water)]) == 2
+    assert capsys.readouterr().err.strip().endswith("needs the extra rigidmd[view]: pip install chemiscope")
+    assert not (water / "view.html").exists()
+
+
+@in_browser
+def test_a_browser_shows_a_top_that_moves(top, tmp_path):
+    page = tmp_path / "top.html"
+    assert cli.main(["view", str(top), "-o", str(page)]) == 0
+    one, other = (shown(page, tmp_path / f"{at}.png", at)[150:400] for at in (0.05, 0.1))  # half a turn
+    red, green, blue = (np.stack([one, other])[..., k] for k in range(3))
+    assert (blue > red + 0.15).mean() > 0.02  # its sides
+    assert ((red > blue + 0.2) & (red > green + 0.2)).mean() > 0.005  # its painted side
+    assert (np.abs(one - other).max(axis=-1) > 0.2).mean() > 0.02
+
+
+@in_browser
+@pytest.mark.slow
+def test_a_browser_shows_water_that_moves(water, tmp_path):
+    pytest.importorskip("chemiscope", reason="chemiscope is not installed")
+    page = tmp_path / "water.html"
+    assert cli.main(["view", str(water), "-o", str(page)]) == 0
+    one, other = (shown(page, tmp_path / f"{at}.png", at)[150:450] for at in (0, 0.04))
+    red = (one[..., 0] > one[..., 1] + 0.3) & (one[..., 0] > one[..., 2] + 0.3)
+    assert red.mean() > 0.005  # oxygen
+    assert (np.abs(one - other).max(axis=-1) > 0.2).mean() > 0.02
+
+
+@in_browser
+@pytest.mark.slow
+def test_a_film_of_a_thousand_frames_of_water(tmp_path):
+    pytest.importorskip("chemiscope", reason="chemiscope is not installed")
+    more = SHORT_WATER | {"stages.1.duration_ps": 2.0, "output.trajectory_interval_ps": 0.002}
+    Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
+    page = tmp_path / "water.html"
+    assert cli.main(["view", str(tmp_path / "run"), "-o", str(page)]) == 0
+    assert page.stat().st_size < 30e6
+    assert len(numbers(data_of(page)["time"], "<f8")) > 1000
+    pictures = [shown(page, tmp_path / f"{at}.png", at, "1200,800")[60:560, :600] for at in (0.1, 1.9)]
+    assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 0.2).mean() > 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("summary.json", "[]", "is no summary of a run"),
+        ("summary.json", "{", "cannot be read"),
+        ("motion.csv", "t,x\n0,1\n", "has no column"),
+        ("motion.csv", "", "has no column"),
+        ("scene.toml", "[body", "scene.toml"),
+    ],
+)
+def test_damaged_files_of_a_run(name, text, said, top, tmp_path, capsys):
+    shutil.copytree(top, tmp_path / "run")
+    (tmp_path / "run" / name).write_text(text)
+    assert cli.main(["report", str(tmp_path / "run"), "-o", str(tmp_path / "page.html")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_numbers_that_are_none_are_refused(top, tmp_path, capsys):
+    shutil.copytree(top, tmp_path / "run")
+    path = tmp_path / "run" / "motion.csv"
+    for cell, said in (("x", "holds what is no number"), ("nan", "holds what is no finite number")):
+        head, line, *_ = (top / "motion.csv").read_text().splitlines()
+        path.write_text(f"{head}\n{line}\n{','.join([cell, *line.split(',')[1:]])}\n")
+        assert cli.main(["view", str(tmp_path / "run")]) == 2
+        assert said in capsys.readouterr().err
+
+
+def frames_in(path):
+    """The frames of a .gif (f, h, w, 3), 0 to 1."""
+    with Image.open(path) as film:
+        return np.array([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]) / 255
+
+
+@pytest.mark.parametrize("kind", ["top", "water"])
+def test_a_film_moves(kind, request, tmp_path, capsys):
+    path = tmp_path / "film.gif"
+    plots = ["--plots"] if kind == "water" else []
+    assert cli.main(["film", str(request.getfixturevalue(kind)), "-o", str(path), "--seconds", "0.3", *plots]) == 0
+    seen = frames_in(path)
+    assert len(seen) == 4
+    picture = seen[:, 80:, : seen.shape[1]]  # below the clock
+    ink = (picture < 0.9).any(axis=-1)
+    assert 0.02 < ink.mean() < 0.9
+    for one, other in pairwise(picture):
+        assert (np.abs(one - other).max(axis=-1) > 0.2).mean() > 1e-3
+    if plots:
+        beside = seen[:, :, int(seen.shape[2] / 1.7) :]
+        red = (beside[..., 0] > beside[..., 2] + 0.2).mean(axis=1)
+        places = red.argmax(axis=1)  # a red line in each plot, which moves to the right
+        assert red.max(axis=1).min() > 0.3
+        assert np.all(np.diff(places) > 5)
+    assert "0.3 s of film" in capsys.readouterr().out
+
+
+def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
+    from rigidmd.looking import film
+
+    monkeypatch.setattr(film.shutil, "which", lambda name: None)
+    assert film.default_name() == "film.gif"
+    assert cli.main(["film", str(top), "-o", str(tmp_path / "film.mp4")]) == 2
+    assert "needs ffmpeg" in capsys.readouterr().err
+    assert cli.main(["film", str(top), "-o", str(tmp_path / "film.avi")]) == 2
+    assert "ends in .mp4 or .gif" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not shutil.which("ffmpeg"), reason="ffmpeg is not installed: .mp4 is not tested")
+def test_a_film_as_mp4(top, tmp_path):
+    path = tmp_path / "top.mp4"
+    assert cli.main(["film", str(top), "-o", str(path), "--seconds", "0.2"]) == 0
+    assert path.read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
+    from rigidmd.looking.body_film import body_film
+    from rigidmd.looking.film import _loop
+
+    record = read_record(top)
+    film = body_film(record)
+    half = np.pi * film.time / 0.13  # half the angle of a turn in 0.13 s, about z
+    turning = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
+    still = {name: np.tile(values[0], (len(values), 1)) for name, values in film.vectors.items()}
+    end, told = _loop(record, film._replace(quaternion=turning, vectors=still))
+    assert end == pytest.approx(0.39, abs=1e-9)
+    assert "returns to its start at 0.39 s" in told[0]
+    assert _loop(record, film) == (0.5, [])  # this top has fallen and risen, but turned elsewhere
+
+
+@pytest.mark.parametrize("command", ["report", "view", "film"])
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("nothing", "is not there; name the folder of a run"),
+        ("a file", "is a file; name the folder of a run"),
+        ("no run", "is not the folder of a run"),
+        ("no samples", "the run wrote no samples yet; `rigidmd resume"),
+        ("no log", "log.csv cannot be read"),
+    ],
+)
+def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
+    folder = tmp_path / "run"
+    if fault == "a file":
+        folder.write_text("x")
+    elif fault == "no run":
+        folder.mkdir()
+    elif fault != "nothing":
+        shutil.copytree(water, folder)
+        log = folder / "log.csv"
+        log.unlink() if fault == "no log" else log.write_text(log.read_text().splitlines()[0] + "\n")
+    path = tmp_path / ("film.gif" if command == "film" else "page.html")
+    assert cli.main([command, str(folder), "-o", str(path)]) == 2
+    assert said in capsys.readouterr().err
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("fault", ["missing", "other atoms", "other shapes", "noise", "empty"])
+def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(molecule_film, "library", lambda: "")
+    folder = tmp_path / "run"
+    shutil.copytree(water, folder, ignore=shutil.ignore_patterns(".trajectory*"))
+    path = folder / "trajectory.xtc"
+    match fault:
+        case "missing":
+            path.unlink()
+        case "other atoms":
+            shutil.copyfile(top / "trajectory.xtc", path)
+        case "other shapes":
+            u = MDAnalysis.Universe(folder / "topology.gro")
+            u.atoms.positions = 2 * u.atoms.positions
+            u.atoms.write(str(path))
+        case "noise":
+            path.write_bytes(np.random.default_rng(1).bytes(5000))
+        case "empty":
+            path.write_bytes(b"")
+    said = {"missing": "is not there", "other atoms": "8 sites, must be 648", "other shapes": "have other shapes"}
+    assert cli.main(["view", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert said.get(fault, "cannot be read as a trajectory") in error
+    assert "Traceback" not in error
+    assert fault != "missing" or cli.main(["report", str(folder)]) == 0
+
+
+def test_a_run_that_was_killed_shows_what_there_is(water, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(molecule_film, "library", lambda: "")
+    folder = tmp_path / "run"
+    shutil.copytree(water, folder, ignore=shutil.ignore_patterns(".trajectory*"))
+    (folder / "summary.json").unlink()
+    for name in ("log.csv", "trajectory.xtc"):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: int(0.55 * len(whole))])
+    assert cli.main(["view", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "This run has not ended" in said
+    assert "ends within a frame" in said
+    assert "This run has not ended" in (folder / "view.html").read_text("utf-8")
+    assert len(numbers(data_of(folder / "view.html")["time"], "<f8")) == 2
+
+
+def test_a_body_that_was_killed_shows_its_last_checkpoint(top, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(top, folder)
+    whole = read_record(top).columns["q11"]
+    for name in ("summary.json", "motion.csv"):
+        (folder / name).unlink()
+    assert cli.main(["view", str(folder)]) == 0
+    assert "that of the last checkpoint" in capsys.readouterr().out
+    assert np.array_equal(read_record(folder).columns["q11"], whole)
+
+
+def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
+    monkeypatch.setattr(molecule_film, "library", lambda: "")
+    monkeypatch.setattr(molecule_film, "MOST", 3 * 3 * 648)
+    page = tmp_path / "water.html"
+    assert cli.main(["view", str(water), "-o", str(page)]) == 0
+    assert len(numbers(data_of(page)["time"], "<f8")) == 3
+    assert "3 of 5 frames are in this film, every 2th" in page.read_text("utf-8")
+
+
+def test_a_page_is_not_replaced_unless_asked(top, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    page.write_text("mine")
+    assert cli.main(["report", str(top), "-o", str(page)]) == 2
+    assert "--force replaces it" in capsys.readouterr().err
+    assert page.read_text() == "mine"
+    assert cli.main(["report", str(top), "-o", str(page), "--force"]) == 0
+    assert cli.main(["report", str(top), "-o", str(tmp_path / "page.png")]) == 2
+
+
+def volume(mesh):
+    """Of a closed surface whose faces are seen counterclockwise from outside."""
+    corners = [mesh.vertices[face] for face in mesh.faces]
+    return sum(p[0] @ np.cross(p[k], p[k + 1]) / 6 for p in corners for k in range(1, len(p) - 1))
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "cone", "cuboid", "sphere", "ellipsoid"])
+def test_the_drawn_surface_is_that_of_the_solid(shape):
+    sizes = {"radius_m": 2.0, "height_m": 3.0, "lengths_m": [1.0, 2.0, 3.0], "semi_axes_m": [1.0, 2.0, 3.0]}
+    given = {key: sizes[key] for key in SOLIDS[shape].dimensions}
+    body = {"mass_kg": 1.0, "solid": {"shape": shape, **given}}
+    scene = Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})
+    mesh = mesh_of(build_body(scene))
+    known = {"cylinder": np.pi * 12, "cone": np.pi * 4, "cuboid": 6, "sphere": np.pi * 32 / 3, "ellipsoid": np.pi * 8}
+    assert volume(mesh) == pytest.approx(known[shape], rel=0.04)
+    assert 0 < sum(mesh.painted) < len(mesh.faces)
+    outline = solid(shape, 1.0, given).outline
+    assert np.allclose(np.ptp(outline, axis=0), np.ptp(mesh.vertices, axis=0), rtol=0.01)
+
+
+def test_a_body_without_a_solid_is_drawn_as_the_cuboid_of_its_inertia():
+    lengths = np.array([1.0, 2.0, 3.0])
+    inertia = 2.0 / 12 * (lengths @ lengths - lengths**2)
+    scene = Scene.from_dict(
+        {"body": {"mass_kg": 2.0, "inertia_kg_m2": inertia.tolist()}, "run": {"duration_s": 1.0, "timestep_s": 0.1}}
+    )
+    mesh = mesh_of(build_body(scene))
+    assert np.allclose(np.ptp(mesh.vertices, axis=0), lengths)
+    assert volume(mesh) == pytest.approx(6.0)
+    assert set(UNITS) < set(SOLIDS)
+
+
+@pytest.fixture(scope="module")
+def water_in_memory():
+    return Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT_WATER)).run()
+
+
+def test_a_universe_knows_bonds_charges_masses_and_velocities(water_in_memory):
+    u = water_in_memory.universe()
+    assert len(u.bonds) == 2 * 216
+    assert u.bonds.values() == pytest.approx(1.0, abs=1e-4)  # SPC/E: 1 Å
+    assert u.select_atoms("name OW").charges == pytest.approx(-0.8476)
+    assert u.residues[5].atoms.total_charge() == pytest.approx(0.0, abs=1e-12)
+    frame = u.trajectory[-1]
+    expected = water_in_memory.system.site_velocities(water_in_memory.state)
+    assert np.allclose(frame.velocities, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_rotations_are_output(water_in_memory):
+    rotation = water_in_memory.rotation
+    u = water_in_memory.universe()
+    assert rotation.shape == (len(u.trajectory), 216, 3, 3)
+    sites = water_in_memory.system.sites
+    arms = np.einsum("nij,nsj->nsi", rotation[2], sites.offset_body.reshape(216, 3, 3))
+    u.trajectory[2]
+    seen = u.atoms.positions.reshape(216, 3, 3).astype(float)
+    assert np.allclose(arms - arms[:, :1], seen - seen[:, :1], atol=1e-4)
+
+
+def test_the_files_of_a_run_tell_the_same(tmp_path):
+    scene = Scene.read(ROOT / "systems" / "water.toml", SHORT_WATER | {"output.topology": "topology.pdb"})
+    results = Simulation(scene, tmp_path / "run").run()
+    u = results.universe()
+    assert len(u.bonds) == 2 * 216
+    assert u.atoms[0].charge == pytest.approx(-0.8476)
+    assert u.atoms[0].mass == pytest.approx(15.9994)
+    assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 2 * 216  # CONECT
+    with pytest.raises(ValueError, match="run without a folder"):
+        results.rotation  # noqa: B018
+
+
+def test_a_body_has_its_edges_as_bonds(tmp_path):
+    more = {"run.duration_s": 0.01, "output.figures": False, "output.topology": "topology.pdb"}
+    results = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run").run()
+    joined = {tuple(pair) for pair in results.universe().bonds.indices.tolist()}
+    octahedron = {
+        (i, j) for i in range(2, 8) for j in range(i + 1, 8) if j - i != 3
+    }  # tips are opposite to the third next
+    assert joined == octahedron | {(0, 1)}  # and the pivot to the centre
+    assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 13
+    assert results.rotation.shape == (21, 1, 3, 3)
+    assert np.array_equal(results.rotation[-1, 0], results["Q"][-1])
+
+
+@pytest.mark.parametrize(
+    ("body", "edges"),
+    [
+        ({"mass_kg": 1.0, "solid": {"shape": "cuboid", "lengths_m": [1.0, 2.0, 3.0]}}, 12),
+        ({"mass_kg": 1.0, "solid": {"shape": "cylinder", "radius_m": 1.0, "height_m": 2.0}}, 36),
+        ({"mass_kg": 1.0, "solid": {"shape": "ring", "radius_m": 1.0}}, 24),
+        ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, 12),
+        ({"points": [{"mass_kg": 1.0, "position_m": [x, x * x, 0.0]} for x in (0.0, 1.0, 2.0, 3.0)]}, 3),
+    ],
+)
+def test_edges_of_solids(body, edges):
+    scene = Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})
+    assert len(connections(build_body(scene))) == edges
+
+
+def test_a_gallery_leads_to_films(tmp_path, capsys):
+    folder = tmp_path / "gallery"
+    assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 0
+    index = (folder / "index.html").read_text("utf-8")
+    assert index.count("<img") == 1
+    assert 'href="heavy_top_3.html"' in index
+    assert is_alone(index)
+    assert len(numbers(data_of(folder / "heavy_top_3.html")["time"], "<f8")) == 3401
+    assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 2
+    assert "--force replaces it" in capsys.readouterr().err
+    assert cli.main(["gallery", "water", "-o", str(tmp_path / "other")]) == 2
+    assert "there is no shipped body 'water'" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
