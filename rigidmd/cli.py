@@ -367,13 +367,10 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _resume(options: argparse.Namespace) -> int:
-    from rigidmd.output.folder import MARKER, SCENE
+    from rigidmd.output.folder import SCENE, check_is_run
 
     folder = Path(options.folder)
-    if not (folder / MARKER).is_file():
-        from rigidmd.errors import OutputError
-
-        raise OutputError(f"{folder} is not the folder of a run")
+    check_is_run(folder)
     options.scene, options.output = str(folder / SCENE), options.folder
     return _run(options)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import OutputError, RigidMDError
-from rigidmd.output.folder import FINAL, LOG, MARKER, MOTION, SCENE, SUMMARY
+from rigidmd.output.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
 from rigidmd.run.provenance import differences, keys_of
 
 #: Of summary.json: what is compared besides the scene.
@@ -81,8 +81,7 @@ class Comparison:
 def compare(first: Path, second: Path) -> Comparison:
     """Compare two folders of runs. Raises OutputError if one is not such a folder."""
     for folder in (first, second):
-        if not (folder / MARKER).is_file():
-            raise OutputError(f"{folder} is not the folder of a run")
+        check_is_run(folder)
     found = Comparison((str(first), str(second)))
     scenes = [_read(folder / SCENE, found, tomllib.loads) for folder in (first, second)]
     if None not in scenes:
