@@ -477,7 +477,7 @@ def salty(edges, method, **more):
     return shaken(build(scene), 8)
 
 
-@pytest.mark.parametrize("method", [TIGHT_EWALD, TIGHT_PME])
+@pytest.mark.parametrize("method", [pytest.param(TIGHT_EWALD, marks=pytest.mark.slow), TIGHT_PME])
 def test_total_does_not_depend_on_how_it_is_split(method):
     """A charged box with everything in it; the oracle at another alpha."""
     system, engine, state = salty([13.0, 14.0, 15.0], method)
@@ -690,9 +690,9 @@ def test_single_precision_is_good_enough_for_1e_5():
 @pytest.mark.parametrize(
     ("precision", "method"),
     [
-        ("mixed", "pme"),
+        ("double", "pme"),
         ("double", "ewald"),
-        pytest.param("double", "pme", marks=pytest.mark.slow),
+        pytest.param("mixed", "pme", marks=pytest.mark.slow),
         pytest.param("mixed", "ewald", marks=pytest.mark.slow),
     ],
 )

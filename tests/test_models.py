@@ -516,7 +516,7 @@ def test_one_model_in_full(capsys):
         (["spc/e"], "did you mean spce"),
         (["tip4"], "did you mean tip4p or tip4p2005"),
         (["--draw"], "need the NAME of a model"),
-        (["spce", "-o", "spce.gif"], "ends in one of .png .svg .pdf"),
+        (["spce", "-o", "spce.gif"], "ends in .png or .svg or .pdf"),
         (["spce", "-o", "no/spce.png"], "there is no folder no"),
         (["mine.toml"], "there is no such file"),
     ],
