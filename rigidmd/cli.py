@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
-    except Exception as error:
+    except Exception as error:  # libraries turn Ctrl-C into errors of many types; all others are raised again
         if not _is_of_ctrl_c(error):
             raise
         print("rigidmd: interrupted", file=sys.stderr)
@@ -190,6 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     precision.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-precision)")
     precision.add_argument("--force", action="store_true", help="replace earlier results in that folder")
+    precision.set_defaults(writes=True)
 
     stability = _command(
         commands,
@@ -202,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--case", action="append", metavar="NAME", help="only this case; may be repeated")
     stability.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/stability)")
     stability.add_argument("--force", action="store_true", help="replace earlier results in that folder")
-    stability.set_defaults(scene="stability")
+    stability.set_defaults(scene="stability", writes=True)
 
     add_commands(partial(_command, commands))
 
@@ -247,7 +248,7 @@ def _command(commands, name: str, function, about: str, example: str) -> argpars
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(command=function, writes=function in (_run, _resume, _precision, _stability))
+    parser.set_defaults(command=function, writes=False)  # writes: files are its results, not what it prints
     return parser
 
 
@@ -265,6 +266,7 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _going_on(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(writes=True)
     parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
     parser.add_argument(
         "--walltime", type=_walltime, metavar="H:MM:SS",

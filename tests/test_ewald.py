@@ -24,7 +24,7 @@ from rigidmd.forces.waves.vectors import waves
 from rigidmd.measure.accuracy import accuracy, estimated_error
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
-from rigidmd.measure.summary import box_notes
+from rigidmd.measure.summary import outgrown_sums
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.output.report import summary_text
 from rigidmd.run import Every, Simulation
@@ -660,7 +660,7 @@ def test_a_box_that_has_outgrown_its_waves_is_noted(method):
     system = build(small_scene({"spce": 125}, 15.52, forces=forces, stages=stages))
     assert estimated_error(system, system.state.cell) == pytest.approx(system.force_error, rel=1e-12)
     for factor, told in ((1.0, 0), (1.01, 0), (1.2, 1)):
-        assert len(box_notes(system, system.state._replace(cell=factor * system.state.cell))) == told
+        assert len(outgrown_sums(system, system.state._replace(cell=factor * system.state.cell))) == told
 
 
 @pytest.mark.parametrize("order", [7, *(pytest.param(order, marks=pytest.mark.slow) for order in (3, 4, 5, 6, 8))])

@@ -150,6 +150,11 @@ def test_a_body_goes_on(integrator, tmp_path):
     assert not results.interrupted
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
+    assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 0
+    motion = tmp_path / "parts" / "motion.csv"
+    *lines, last = motion.read_text().splitlines()
+    motion.write_text("\n".join([*lines, last[: last.rindex(",")] + ",0.125"]) + "\n")
+    assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 1
 
 
 @pytest.fixture(scope="module")

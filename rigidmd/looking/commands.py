@@ -38,14 +38,14 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     gallery.add_argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)")
     gallery.add_argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)")
     gallery.add_argument("--force", action="store_true", help="replace an earlier gallery in that folder")
-    gallery.set_defaults(scene="the gallery")
+    gallery.set_defaults(scene="the gallery", writes=True)
 
 
 def _run_arguments(parser: argparse.ArgumentParser, about: str) -> None:
     parser.add_argument("folder", metavar="RUN", help="folder of a run")
     parser.add_argument("-o", "--output", metavar="FILE", help=about)
     parser.add_argument("--force", action="store_true", help="replace that file")
-    parser.set_defaults(scene="this run")
+    parser.set_defaults(scene="this run", writes=True)
 
 
 def _seconds(text: str) -> float:

@@ -90,7 +90,7 @@ def summarise(
         "notes": [
             *system.notes,
             *_drifting(system, state, samples.rows[-1]),
-            *box_notes(system, state),
+            *outgrown_sums(system, state),
             *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples.rows, k)),
             *warnings,
         ],
@@ -123,7 +123,7 @@ def _drifting(system: System, state: State, last: Sample) -> list[str]:
     ]
 
 
-def box_notes(system: System, state: State) -> list[str]:
+def outgrown_sums(system: System, state: State) -> list[str]:
     """A note if the box has grown or shrunk until waves or grid of the start no longer give the accuracy asked for."""
     if system.force_error is None or not any(stage.changes_box for stage in system.scene.stages):
         return []

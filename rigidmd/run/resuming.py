@@ -23,8 +23,8 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
         apart.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
             raise CheckpointError(f"{scene.source}: the run in the folder is longer already, {steps} steps")
-    apart_from = differences(keys_of(plain(scene), apart), keys_of(before, apart))
-    faults = [f"{key} is {now}, there {then}" for key, (now, then) in apart_from.items()]
+    unlike = differences(keys_of(plain(scene), apart), keys_of(before, apart))
+    faults = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
     found = input_digests(scene)
     faults += [f"the file of {key} has changed" for key in found if found[key] != inputs.get(key)]
     if faults:

@@ -57,7 +57,7 @@ def interruptible() -> Iterator[None]:
             finally:
                 for timer in again:
                     timer.cancel()
-    except Exception:
+    except Exception:  # a compiler that was interrupted ends in errors of many types
         if pressed:
             raise KeyboardInterrupt from None
         raise
