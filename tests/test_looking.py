@@ -19,9 +19,9 @@ from rigidmd import Scene, Simulation, cli
 from rigidmd.assemble.body import build_body
 from rigidmd.looking import molecule_film
 from rigidmd.looking.mesh import UNITS, mesh_of
-from rigidmd.looking.record import read_record
 from rigidmd.mechanics.solids import SOLIDS, solid
 from rigidmd.output.connections import connections
+from rigidmd.output.record import read_record
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""

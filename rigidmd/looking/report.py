@@ -10,10 +10,10 @@ import numpy as np
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import whole_file
 from rigidmd.looking import plots
-from rigidmd.looking.record import Record, read_record
 from rigidmd.measure.summary import mean
 from rigidmd.output.folder import SCENE
 from rigidmd.output.page import BAD, DOUBTFUL, GOOD, Raw, code, items, notes, page, section, table
+from rigidmd.output.record import Record, read_record
 from rigidmd.output.report import signed
 
 REPORT = "report.html"
