@@ -79,8 +79,8 @@ def _owners(known: dict[str, Any], folder: Path) -> dict[str, str]:
     """File -> the analysis that wrote it. Raises OutputError."""
     try:
         return {str(name): analysis for analysis, entry in known.get("analyses", {}).items() for name in entry["files"]}
-    except (KeyError, TypeError) as error:
-        raise OutputError(f"{folder / ANALYSIS} is no list of analyses: {error}") from None
+    except (KeyError, TypeError):
+        raise OutputError(f"{folder / ANALYSIS} is no list of analyses; remove it, and analyse again") from None
 
 
 def _described(curve: Curve) -> dict[str, Any]:
