@@ -167,18 +167,21 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
             raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
         count, is_cut = reader.n_frames, False
         stride = max(1, -(-count // most))
-        times, positions, boxes, velocities = [], [], [], []
-        for k in range(0, count, stride):
+        chosen = range(0, count, stride)
+        times, boxes = [], []
+        positions = np.empty((len(chosen), sites, 3), np.float32)
+        velocities = np.empty_like(positions) if count and reader.ts.has_velocities else None
+        for place, k in enumerate(chosen):
             try:
                 frame = reader[k]
             except (OSError, EOFError, ValueError):
                 is_cut = True
                 break
             times.append(frame.time)
-            positions.append(frame.positions.copy())
+            positions[place] = frame.positions
             boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
-            if frame.has_velocities:
-                velocities.append(frame.velocities.copy())
+            if velocities is not None:
+                velocities[place] = frame.velocities
     if not times:
         raise OutputError(f"{path} holds no whole frame")
     told_times, told_cells = _told_in_text(path)
@@ -187,8 +190,8 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
     cells = np.array(boxes) if all(box is not None for box in boxes) else None
     if told_cells:
         cells = np.array(told_cells[::stride][: len(times)])
-    moving = np.array(velocities) if len(velocities) == len(times) else None
-    return Frames(np.array(times), np.array(positions), cells, count, stride, is_cut, moving)
+    moving = None if velocities is None else velocities[: len(times)]
+    return Frames(np.array(times), positions[: len(times)], cells, count, stride, is_cut, moving)
 
 
 def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
