@@ -55,12 +55,17 @@ def dielectric(history: History) -> Finding:
     correlation = float(np.mean([correlation_time(dipole[:, k], gap) for k in range(3)]))
     volume = float(history.volume.mean())
     y = 4 * np.pi * COULOMB * squares.mean() / (3 * volume * history.thermal_energy)  # <M²>/(3 eps0 V kT)
-    epsilon, slope = _of_fluctuation(y, around)
     found = Finding("dielectric", "dielectric constant")
-    spread = float(error or np.nan) / float(size or np.nan) * y * slope
+    if y >= 2 * around + 1:
+        raise OutputError(
+            f"the dipole fluctuates more than it can with a permittivity of {around:g} around: the run is too short, or "
+            "the liquid freezes or is polarised"
+        )
+    epsilon, slope = _of_fluctuation(y, around)
+    spread = float(error or np.nan) / float(size or np.nan) * y * float(slope)
     surroundings = "tin foil" if np.isinf(around) else f"a permittivity of {around:g}"
     told = f"{surroundings} around, {forces.electrostatics}; correlation time of the dipole {correlation:.3g} ps"
-    found.values.append(settled("dielectric constant", "1", epsilon, spread, history.span, correlation, told))
+    found.values.append(settled("dielectric constant", "1", float(epsilon), spread, history.span, correlation, told))
     count = np.arange(1, len(dipole) + 1)
     sums = np.cumsum(np.einsum("fi,fi->f", dipole, dipole)), np.cumsum(dipole, axis=0)
     running = sums[0] / count - np.sum((sums[1] / count[:, None]) ** 2, axis=1)
@@ -74,11 +79,13 @@ def dielectric(history: History) -> Finding:
 
 
 def _of_fluctuation(y, around: float):
-    """epsilon from y = (<M²> - <M>²)/(3 eps0 V kT), and its derivative with y; around: permittivity outside.
+    """epsilon from y = (<M²> - <M>²)/(3 eps0 V kT), and its derivative with y; around: permittivity outside. NaN for y
+    of 2 around + 1 and above, which no epsilon has.
 
     (eps - 1)(2 around + 1)/(2 around + eps) = y, and eps - 1 = y with tin foil.
     """
     if np.isinf(around):
         return 1 + y, 1.0
     whole = 2 * around + 1
-    return (whole + 2 * around * y) / (whole - y), whole * (1 + 2 * around) / (whole - y) ** 2
+    left = np.where(y < whole, whole - y, np.nan)
+    return (whole + 2 * around * y) / left, (whole / left) ** 2

@@ -13,6 +13,9 @@ from rigidmd.units import BAR
 
 #: Stretches that the tensor is cut into, and ps that each must have; the longest time of its correlation, ps.
 STRETCHES, SHORTEST = 10, 2.0
+#: Points that a fit needs, and correlation over one interval below which lines of the tensor are too far apart: the
+#: trapezoidal rule is then 4% too large, if the correlation is an exponential.
+FEWEST, CLOSE = 8, 0.5
 #: The fit ends where the standard error of the mean integral is this fraction of it.
 DOUBT = 0.15
 #: Stretches drawn again, with repetition, for the error of the fit.
@@ -39,7 +42,7 @@ def viscosity(history: History) -> Finding:
     if np.ptp(gaps) > EVEN * gaps.max():
         raise OutputError("a viscosity needs the pressure tensor at equal times; its lines are not")
     size = len(history.tensor) // STRETCHES
-    if size * interval < SHORTEST:
+    if gaps.sum() + interval < STRETCHES * SHORTEST:
         need = STRETCHES * SHORTEST
         raise OutputError(
             f"a viscosity needs {need:g} ps of the pressure tensor at least; there are {gaps.sum():.3g} ps of it"
@@ -49,14 +52,20 @@ def viscosity(history: History) -> Finding:
     lags = size // 2
     factor = float(history.volume.mean()) / history.thermal_energy / MPA_S
     stretches = parts[: size * STRETCHES].reshape(STRETCHES, size, 5)
-    seen = np.array([[correlation(one[:, k], lags) for k in range(5)] for one in stretches]).reshape(-1, lags)
+    seen = np.array([[correlation(one[:, k], max(2, lags)) for k in range(5)] for one in stretches])
+    seen = seen.reshape(-1, max(2, lags))
+    if lags < FEWEST or seen[:, 1].sum() < CLOSE * seen[:, 0].sum():
+        raise OutputError(
+            f"lines of the pressure tensor {interval:.3g} ps apart are too far from each other for a viscosity: stresses "
+            "forget themselves between them; output.pressure_tensor_interval_ps = 0.01 suits water"
+        )
     running = factor * interval * (np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))
     time = interval * np.arange(lags)
     mean, scatter = running.mean(axis=0), running.std(axis=0, ddof=1)
     wide = np.flatnonzero(scatter[1:] > DOUBT * np.sqrt(len(running)) * np.abs(mean[1:]))
     settled_from = int(np.argmax(mean > 0.5 * mean.max()))
     wide = wide[wide > settled_from]
-    end = max(int(wide[0]) + 1 if len(wide) else lags, 8)
+    end = max(int(wide[0]) + 1 if len(wide) else lags, FEWEST)
     whole = _limit(time[:end], mean[:end], scatter[:end])
     random = np.random.default_rng(0)
     groups = running.reshape(STRETCHES, 5, lags)
@@ -111,12 +120,9 @@ def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float |
     return float(best[0] + best[1])
 
 
-def viscosity_of(history: History) -> tuple[float | None, str]:
-    """The viscosity of a history (mPa s) and where it is from, or why there is none."""
+def viscosity_of(history: History) -> Value:
+    """The viscosity of a history (mPa s), or why there is none."""
     try:
-        own = viscosity(history).value()
+        return viscosity(history).value()
     except OutputError as error:
-        return None, f"no correction for the size of the box without a viscosity: {error}"
-    if own.value is None:
-        return None, f"no correction for the size of the box without a viscosity: {own.note}"
-    return own.value, "that of this run"
+        return Value("viscosity", "mPa s", None, None, None, str(error))

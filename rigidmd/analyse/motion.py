@@ -61,6 +61,8 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
     """
     from rigidmd.analyse.flow import viscosity_of
 
+    if viscosity_mPa_s is not None and not 0 < viscosity_mPa_s < np.inf:
+        raise OutputError(f"viscosity_mPa_s must be a number above 0, not {viscosity_mPa_s:g}")
     interval, lags = evenly(history, "a diffusion coefficient")
     first = max(1, int(len(history) // BLOCKS * FIT_FROM))
     time = interval * np.arange(first, lags)
@@ -77,7 +79,7 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
     found = Finding("diffusion", "diffusion coefficients")
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
     edge = _cubic_edge(history)
-    eta, source = (viscosity_mPa_s, "as given") if viscosity_mPa_s else viscosity_of(history)
+    eta = viscosity_of(history) if viscosity_mPa_s is None else None
     for k, kind in enumerate(history.moving):
         name, D, error = f"D of {kind.name}", float(values[0, k]), float(errors[0, k])
         bend, doubt = float(values[1, k]), float(errors[1, k])
@@ -93,12 +95,17 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
         if own.value is None or edge is None:
             continue
         name = f"D of {kind.name} in an infinite box"
-        if eta is None:
-            found.values.append(Value(name, "1e-9 m²/s", None, None, None, source))
+        flows = viscosity_mPa_s if eta is None else eta.value
+        if flows is None:
+            told = f"no correction for the size of the box without a viscosity: {eta.note if eta else ''}"
+            found.values.append(Value(name, "1e-9 m²/s", None, None, None, told))
             continue
-        more = YEH_HUMMER * history.thermal_energy / (6 * np.pi * eta * MPA_S * edge) / NM2_PER_S
-        told = f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {eta:.3g} mPa s, {source}"
-        found.values.append(own._replace(name=name, value=own.value + more, note=told))
+        more = YEH_HUMMER * history.thermal_energy / (6 * np.pi * flows * MPA_S * edge) / NM2_PER_S
+        source = "as given, without its error" if eta is None else "that of this run"
+        told = f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {flows:.3g} mPa s, {source}"
+        doubt = more * (eta.error or 0.0) / flows if eta else 0.0
+        both = None if own.error is None else float(np.hypot(own.error, doubt))
+        found.values.append(own._replace(name=name, value=own.value + more, error=both, note=told))
     if edge is None and history.has_box:
         found.notes.append("no correction for the size of the box: that of Yeh and Hummer is for cubic boxes")
     return found

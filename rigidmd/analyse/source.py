@@ -103,15 +103,13 @@ def _history(
         if begin < first:
             notes = [*notes, f"frames before {first:g} ps are of an earlier stage"]
     slack = 1e-6 * max(abs(last), 1.0)
-    chosen = (raw.time >= begin - slack) & (raw.time <= last + slack)
-    if chosen.sum() < 2:
+    keep = np.flatnonzero((raw.time >= begin - slack) & (raw.time <= last + slack))
+    keep = keep[np.diff(raw.time[keep], prepend=-np.inf) > 0]  # not the start of a stage after the end of another
+    if len(keep) < 2:
         raise OutputError(
-            f"from {begin:g} ps on there {'is' if chosen.sum() == 1 else 'are'} {chosen.sum()} of {len(raw.time)} "
+            f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of {len(raw.time)} "
             "frames; an analysis needs two at least: run longer, or write them more often (trajectory_interval_ps)"
         )
-    time = raw.time[chosen]
-    twice = np.concatenate([[False], np.diff(time) <= slack])  # the end of a stage and the start of the next
-    keep = np.flatnonzero(chosen)[~twice]
     velocities = None if raw.velocities is None else raw.velocities[keep]
     bodies, mended = rebuilt(system, raw.sites[keep], velocities, raw.cells[keep], raw.wrapped, step)
     if not all(np.isfinite(array).all() for array in bodies if array is not None):

@@ -58,11 +58,13 @@ def rdf(
             found.notes.append(f"g(r) of {a} and {b}: there is no pair of different molecules")
             continue
         g = np.array([_g(thinned, k, a, b, width, bins, shells) for k in range(len(thinned))])
-        density = len(thinned.sites(b, slice(0, 1))[1]) / float(thinned.volume.mean())
+        # of the others that each a has, so that two molecules have one neighbour each
+        density = _possible(thinned, a, b) / len(thinned.sites(a, slice(0, 1))[1]) / float(thinned.volume.mean())
         title = f"g {a}-{b}"
         parts = [part.mean(axis=0) for part in _split(g)]
         curve.columns[title] = g.mean(axis=0)
-        curve.columns[f"n {a}-{b}"] = np.cumsum(curve.columns[title] * shells) * density
+        within = curve.columns[title] * shells * density
+        curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
         if len(parts) > 1:
             curve.errors[title] = np.std(parts, axis=0, ddof=1) / np.sqrt(len(parts))
         found.values += _peaks(f"{a}-{b}", r, curve.columns[title], parts, shells, density)
@@ -145,7 +147,7 @@ def _peaks(
 
 
 def _first_top(g: np.ndarray) -> int:
-    """Index of the first peak: the highest point before g falls to less than 0.7 of it, or by itself below 1."""
+    """Index of the first peak: the highest point from where g exceeds 1 to where it falls below 1."""
     above = np.flatnonzero(g > 1.0)
     if len(above) == 0:
         return 0

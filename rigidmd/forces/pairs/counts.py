@@ -11,8 +11,8 @@ from rigidmd.compile import kernel
 
 #: Parts of the sites that are counted independently.
 PARTS = 64
-#: Cells in the largest distance.
-WITHIN = 2
+#: Cells in the largest distance, and at most for each site.
+WITHIN, FOR_EACH = 2, 8
 
 
 @kernel(parallel=True, outer=True)
@@ -64,7 +64,8 @@ def count_pairs(
     cell (3, 3), a along x and b in the plane of x and y; edge * bins is at most half its smallest height.
     """
     inverse = np.linalg.inv(cell)
-    grid = np.maximum(1, (heights(cell) / (edge * bins / WITHIN)).astype(int))
+    finest = heights(cell) / (edge * bins / WITHIN)
+    grid = np.maximum(1, (finest / max(1.0, finest.prod() / (FOR_EACH * len(second))) ** (1 / 3)).astype(int))
     reach = np.ceil(edge * bins * grid / heights(cell) - 1e-9).astype(int)
     inside, inside_2 = ((at @ inverse) % 1.0 for at in (first, second))
     inside[inside == 1.0] = 0.0
