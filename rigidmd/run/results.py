@@ -123,7 +123,7 @@ class Results:
         """The rotation matrices Q, body to lab, at the frames of `universe()` (frames, n, 3, 3).
 
         Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. Raises
-        ValueError if nothing turns, and for molecules whose run wrote files, as those hold the positions of sites only.
+        ValueError if nothing turns, and for molecules whose run wrote files other than .gsd, which hold positions only.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]
@@ -132,5 +132,12 @@ class Results:
         if not self._frames:
             raise ValueError("this run kept no frames (output.trajectory = false)")
         if self.files:
-            raise ValueError("the files of a run hold positions, not rotations; run without a folder to keep both")
+            path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
+            if path.suffix != ".gsd":
+                raise ValueError(
+                    f"{path.name} holds positions, not rotations: write a trajectory.gsd, or run without a folder"
+                )
+            from rigidmd.output.trajectory import read_rotations
+
+            return read_rotations(path)
         return np.array([frame.rotation for frame in self._frames])

@@ -17,8 +17,8 @@ from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.watch import Watch
 from rigidmd.validation import MOST_TABLES, Count, Flag, Section
 
-TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
-WITH_VELOCITIES = (".trr", ".nc")
+TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".dcd", ".nc", ".xyz", ".pdb")
+WITH_VELOCITIES = (".trr", ".nc", ".gsd")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
@@ -41,7 +41,8 @@ class Output(Section):
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory file; the ending sets the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
+    """Trajectory file; the ending sets the format (.xtc .trr .gsd .dcd .nc .xyz .pdb); .gsd keeps
+    rotations and angular momenta; false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: str = "topology.gro"
