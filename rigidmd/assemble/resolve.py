@@ -99,6 +99,8 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
         "output": _output(scene.output),
         "stages": tuple(stage.resolved for stage in scene.stages),
     }
+    if scene.structure is not None:
+        tables["structure"] = scene.structure.model_copy(update={"topology": scene.topology})
     reads_velocities = scene.structure is not None and scene.structure.velocities
     if scene.start.temperature_K is None and not reads_velocities:
         first = scene.first_moving

@@ -11,7 +11,7 @@ from rigidmd.molecules import SIZES
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
-from rigidmd.scene.place import Box, Start, Structure
+from rigidmd.scene.place import BESIDE, NAMELESS, Box, Start, Structure
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.watch import Watch
@@ -143,11 +143,22 @@ class MolecularScene(Scene):
     def inputs(self) -> dict[str, Path]:
         """Every further file that it reads: dotted key -> path."""
         found = {} if self.structure is None else {"structure.file": self.path(self.structure.file)}
+        if (names := self.topology) is not None:
+            found["structure.topology"] = self.path(names)
         for k, species in enumerate(self.molecules):
             for key in SPECIES_FILES:
                 if (name := getattr(species, key)) is not None:
                     found[f"molecules.{k}.{key}"] = self.path(name)
         return found
+
+    @property
+    def topology(self) -> str | None:
+        """The file with the names of atoms that a trajectory as structure lacks, as the scene would name it."""
+        start = self.structure
+        if start is None or start.topology is not None or not start.file.lower().endswith(NAMELESS):
+            return None if start is None else start.topology
+        beside = [str(Path(start.file).with_name(name)) for name in BESIDE]
+        return next((name for name in beside if self.path(name).is_file()), None)
 
     @model_validator(mode="after")
     def _whole(self):
@@ -238,7 +249,7 @@ class MolecularScene(Scene):
         """Files of a scene that lie outside its folder."""
         named = []
         if isinstance(structure := data.get("structure"), dict):
-            named.append(("structure.file", structure.get("file")))
+            named += [(f"structure.{key}", structure.get(key)) for key in ("file", "topology")]
         if isinstance(species := data.get("molecules"), list):
             named += [
                 (f"molecules.{k}.{key}", entry.get(key))
