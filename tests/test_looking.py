@@ -445,7 +445,7 @@ def test_the_files_of_a_run_tell_the_same(tmp_path):
 
 
 def test_a_body_has_its_edges_as_bonds(tmp_path):
-    more = {"run.duration_s": 0.01, "output.figures": False, "output.topology": "topology.pdb"}
+    more = {"run.duration_s": 0.01, "output.figures": False}
     results = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run").run()
     joined = {tuple(pair) for pair in results.universe().bonds.indices.tolist()}
     octahedron = {

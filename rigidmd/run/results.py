@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.core.state import State
+from rigidmd.validation import settled
 
 if TYPE_CHECKING:
     import MDAnalysis
@@ -115,7 +116,9 @@ class Results:
         if self.files:
             by_name = {path.name: path for path in self.files}
             times = [frame.time for frame in self._frames]
-            return trajectory.from_files(self.system, by_name[output.topology], by_name[output.trajectory], times)
+            return trajectory.from_files(
+                self.system, by_name[settled(output.topology)], by_name[output.trajectory], times
+            )
         return trajectory.in_memory(self.system, self._frames)
 
     @property
