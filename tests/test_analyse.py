@@ -22,7 +22,16 @@ from rigidmd.forces.pairs.counts import count_pairs, heights
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, BOLTZMANN, COULOMB
 
-MIXTURE = {"argon": 4, "nitrogen": 5, "co2_epm2": 5, "spce": 6, "tip4p2005": 6, "benzene_opls": 4, "ccl4": 4, "tip5p": 3}
+MIXTURE = {
+    "argon": 4,
+    "nitrogen": 5,
+    "co2_epm2": 5,
+    "spce": 6,
+    "tip4p2005": 6,
+    "benzene_opls": 4,
+    "ccl4": 4,
+    "tip5p": 3,
+}
 SLANTED = np.array([[21.0, 0.0, 0.0], [6.0, 19.0, 0.0], [-7.0, 5.0, 23.0]])
 
 
@@ -115,7 +124,10 @@ def test_rigid_bodies_come_back_from_their_sites(mixture):
         own = found.Q[:, kind.index], Q[:, kind.index]
         arms = [np.einsum("fnij,sj->fnsi", turn, kind.molecule.positions_body) for turn in own]
         assert np.abs(arms[0] - arms[1]).max() < 1e-12
-        lab = [np.einsum("fnij,fnj->fni", turn, l[:, kind.index]) for turn, l in zip(own, (found.L, L), strict=True)]
+        lab = [
+            np.einsum("fnij,fnj->fni", turn, own_l[:, kind.index])
+            for turn, own_l in zip(own, (found.L, L), strict=True)
+        ]
         assert np.abs(lab[0] - lab[1]).max() < 1e-10
         if kind.molecule.kind not in ("point", "linear"):
             assert np.abs(own[0] - own[1]).max() < 1e-12
@@ -216,7 +228,9 @@ def pairs_by_hand(first, owner, second, owner_2, cell, edge, bins):
 
 
 @pytest.mark.parametrize("part", [1.0, 0.7, 0.36, 0.1, 0.03])
-@pytest.mark.parametrize("cell", [np.eye(3) * 20.0, SLANTED, np.diag([9.0, 31.0, 70.0])], ids=["cube", "slanted", "long"])
+@pytest.mark.parametrize(
+    "cell", [np.eye(3) * 20.0, SLANTED, np.diag([9.0, 31.0, 70.0])], ids=["cube", "slanted", "long"]
+)
 def test_pairs_are_counted_once(cell, part):
     """Grids of 1 to many cells; sites outside the box and on its faces; ordered pairs of different molecules."""
     rng = np.random.default_rng(5)
@@ -240,7 +254,9 @@ def test_an_ideal_gas_has_no_structure(n):
     found = rdf(gas, "Ar", width=0.5)
     r, g, error = (found[name] for name in ("r (A)", "g Ar-Ar", "g Ar-Ar error"))
     shells = 4 / 3 * np.pi * ((r + 0.25) ** 3 - (r - 0.25) ** 3)
-    assert np.sum(g * shells) / shells.sum() == pytest.approx(1.0, abs=4 * np.sqrt(2 / 200 / n / (n - 1) / (shells.sum() / 9000)))
+    assert np.sum(g * shells) / shells.sum() == pytest.approx(
+        1.0, abs=4 * np.sqrt(2 / 200 / n / (n - 1) / (shells.sum() / 9000))
+    )
     far = r > 3.0
     assert np.median(error[far]) > 0
     spread = (g - 1)[far] / np.maximum(error[far], np.median(error[far]))
@@ -398,7 +414,10 @@ def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
 
 
 def test_one_sentence_tells_what_is_too_short():
-    assert settled("x", "", 1.0, 0.1, 19.9, 1.0).note == "this run is 20 correlation times (1 ps) long: too short for a value"
+    assert (
+        settled("x", "", 1.0, 0.1, 19.9, 1.0).note
+        == "this run is 20 correlation times (1 ps) long: too short for a value"
+    )
     assert settled("x", "", 1.0, 0.1, 20.0, 1.0).value == 1.0
     assert settled("x", "", 1.0, 0.1, 5.0, 1.0, least=5.0).value == 1.0
     assert settled("x", "", 1.0, 0.1, 4.9, 1.0, least=5.0).value is None
@@ -489,7 +508,7 @@ def test_the_error_of_a_dielectric_constant_is_honest():
     system = build(small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"}))
     found = []
     for seed in range(60):
-        Q, mu = dipoles(np.random.default_rng(seed), system, 600, 2.0, 0.5)
+        Q, _ = dipoles(np.random.default_rng(seed), system, 600, 2.0, 0.5)
         told = dielectric(history(system, 0.5 * np.arange(600), None, np.eye(3) * 14.5, Q)).value()
         found.append((told.value, told.error))
     values, errors = np.array(found, float).T

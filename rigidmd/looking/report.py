@@ -210,7 +210,9 @@ def _files(record: Record) -> str:
     output, rows = record.scene.output, []
     about = ABOUT | {output.topology: "names and first positions, for viewers"}
     if output.trajectory:
-        about[output.trajectory] = f"positions over time: vmd {output.topology} {output.trajectory}"
+        alone = output.trajectory.endswith(".gsd")
+        viewer = f"ovito {output.trajectory}" if alone else f"vmd {output.topology} {output.trajectory}"
+        about[output.trajectory] = f"positions{' and rotations' if alone else ''} over time: {viewer}"
     for path in sorted(record.folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue
