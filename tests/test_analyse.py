@@ -124,7 +124,10 @@ def test_rigid_bodies_come_back_from_their_sites(mixture):
         own = found.Q[:, kind.index], Q[:, kind.index]
         arms = [np.einsum("fnij,sj->fnsi", turn, kind.molecule.positions_body) for turn in own]
         assert np.abs(arms[0] - arms[1]).max() < 1e-12
-        lab = [np.einsum("fnij,fnj->fni", turn, l[:, kind.index]) for turn, l in zip(own, (found.L, L), strict=True)]
+        lab = [
+            np.einsum("fnij,fnj->fni", turn, own_l[:, kind.index])
+            for turn, own_l in zip(own, (found.L, L), strict=True)
+        ]
         assert np.abs(lab[0] - lab[1]).max() < 1e-10
         if kind.molecule.kind not in ("point", "linear"):
             assert np.abs(own[0] - own[1]).max() < 1e-12
@@ -506,7 +509,7 @@ def test_the_error_of_a_dielectric_constant_is_honest():
     system = build(small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"}))
     found = []
     for seed in range(60):
-        Q, mu = dipoles(np.random.default_rng(seed), system, 600, 2.0, 0.5)
+        Q, _ = dipoles(np.random.default_rng(seed), system, 600, 2.0, 0.5)
         told = dielectric(history(system, 0.5 * np.arange(600), None, np.eye(3) * 14.5, Q)).value()
         found.append((told.value, told.error))
     values, errors = np.array(found, float).T

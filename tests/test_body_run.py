@@ -34,7 +34,7 @@ def test_a_run_leaves_what_it_promises(tmp_path, capsys):
         assert part in said
     names = {path.name for path in folder.iterdir() if not path.name.startswith((".rigidmd", "checkpoint"))}
     figures = {f"{name}.{end}" for name in ("axis", "angles", "omega", "invariants") for end in ("png", "svg")}
-    files = {"scene.toml", "motion.csv", "motion.npz", "summary.json", "topology.gro", "trajectory.xtc"}
+    files = {"scene.toml", "motion.csv", "motion.npz", "summary.json", "topology.pdb", "trajectory.xtc"}
     assert names == figures | files
     assert (folder / "axis.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (folder / "axis.svg").read_bytes()[:1000]
@@ -88,7 +88,7 @@ def test_trajectories_show_the_body(name, tmp_path):
         "run.duration_s": 0.05, "output.interval_s": 0.01, "output.trajectory": name, "output.figures": False,
         "start.velocity_m_s": [0.3, 0.2, 0.1]})  # fmt: skip
     results = Simulation(scene, tmp_path / "run").run()
-    universe = mda.Universe(str(tmp_path / "run" / "topology.gro"), str(tmp_path / "run" / name))
+    universe = mda.Universe(str(tmp_path / "run" / "topology.pdb"), str(tmp_path / "run" / name))
     assert len(universe.trajectory) == 6
     system = results.system
     assert system.scale == pytest.approx(10 / 0.2)  # the half-axis of 0.2 m is drawn with 10 Å
@@ -214,3 +214,24 @@ def test_the_scene_that_a_run_writes_runs_again_to_the_same_bits(integrator, tmp
     for one, other in zip(first.state, repeated.state, strict=True):
         assert one.tobytes() == other.tobytes()
     assert first["theta"].tobytes() == repeated["theta"].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("output", "position", "topology"),
+    [
+        ({}, [0.0, 0.0, 3.0], "topology.pdb"),
+        ({}, [0.0, 0.0, -18.0], "topology.gro"),
+        ({"trajectory_A_per_m": 1e4}, [0.0, 0.0, 0.0], "topology.gro"),
+        ({"topology": "t.gro"}, [0.0, 0.0, 0.0], "t.gro"),
+    ],
+)
+def test_a_topology_holds_the_first_place(output, position, topology):
+    data = {"body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.2}}, "start": {"position_m": position},
+            "run": {"duration_s": 0.1, "timestep_s": 0.01}}  # fmt: skip
+    assert build_body(Scene.from_dict(data | {"output": output})).scene.output.topology == topology
+    with pytest.raises(SceneError, match=r"which t\.pdb cannot hold"):
+        build_body(
+            Scene.from_dict(data | {"output": {"topology": "t.pdb"}, "start": {"position_m": [0.0, 0.0, -30.0]}})
+        )
+    with pytest.raises(SceneError, match=r"are both topology\.pdb"):
+        Scene.from_dict(data | {"output": {"trajectory": "topology.pdb"}})

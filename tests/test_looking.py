@@ -132,7 +132,7 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
     assert centre.max() < frames.cells.max() + 0.01
 
 
-@pytest.mark.parametrize("ending", [".trr", ".dcd", ".nc", ".xyz", ".pdb"])
+@pytest.mark.parametrize("ending", [".trr", ".gsd", ".dcd", ".nc", ".xyz", ".pdb"])
 def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
     more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.1.duration_ps": 0.01}
     results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
@@ -440,12 +440,13 @@ def test_the_files_of_a_run_tell_the_same(tmp_path):
     assert u.atoms[0].charge == pytest.approx(-0.8476)
     assert u.atoms[0].mass == pytest.approx(15.9994)
     assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 2 * 216  # CONECT
-    with pytest.raises(ValueError, match="run without a folder"):
-        results.rotation  # noqa: B018
+    rotation, last = results.rotation, results.state.rotation  # rebuilt from positions rounded to 0.01 Å
+    assert rotation.shape == (len(u.trajectory), 216, 3, 3)
+    assert np.abs(rotation[-1] - last).max() < 0.02
 
 
 def test_a_body_has_its_edges_as_bonds(tmp_path):
-    more = {"run.duration_s": 0.01, "output.figures": False, "output.topology": "topology.pdb"}
+    more = {"run.duration_s": 0.01, "output.figures": False}
     results = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run").run()
     joined = {tuple(pair) for pair in results.universe().bonds.indices.tolist()}
     octahedron = {

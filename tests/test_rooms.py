@@ -33,7 +33,8 @@ LIBRARIES = {
         "assemble/atoms.py", "assemble/ase_formats.py", "assemble/own_formats.py", "assemble/structure_files.py",
         "assemble/matching.py", "assemble/cells.py",
     },
-    "MDAnalysis": {"output/trajectory.py"},
+    "MDAnalysis": {"assemble/frame_reader.py", "output/trajectory.py", "output/trajectory_file.py"},
+    "gsd": {"assemble/gsd_format.py", "output/gsd_file.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
     "matplotlib": {

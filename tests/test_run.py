@@ -86,7 +86,7 @@ def test_the_final_state_starts_another_run(tmp_path):
     assert system.space == first.system.space
 
 
-@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
+@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.gsd", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
 @pytest.mark.parametrize("topology", ["topology.gro", "topology.pdb"])
 def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp_path):
     lengths, angles = [20.0, 21.0, 22.0], [80.0, 100.0, 75.0]
@@ -111,7 +111,7 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
         assert frame.dt == 0.01
         if name != "t.xyz":
             assert frame.dimensions == pytest.approx([*lengths, *angles], abs=2e-3)
-        assert frame.has_velocities == (name in ("t.trr", "t.nc"))
+        assert frame.has_velocities == (name in ("t.trr", "t.gsd", "t.nc"))
         if frame.has_velocities:
             assert frame.velocities == pytest.approx(velocities, abs=1e-3)
     text = (tmp_path / "out" / name).read_bytes()
@@ -127,7 +127,7 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
     assert (trajectory.dt, trajectory.totaltime, trajectory[3].time) == (0.01, 0.04, seen[3][0])
     copy = universe.copy().trajectory
     assert [frame.time for frame in copy[::2]] == [moment for moment, _, _ in seen[::2]]
-    if name[1:] not in (".xyz", ".pdb"):  # what MDAnalysis reads from the file alone
+    if name[1:] not in (".xyz", ".pdb", ".gsd"):  # what MDAnalysis reads from the file alone
         alone = mda.Universe(str(tmp_path / "out" / topology), str(tmp_path / "out" / name)).trajectory
         assert [frame.time for frame in alone] == pytest.approx([moment for moment, _, _ in seen], abs=1e-5)
     assert list(universe.atoms.names[:4]) == ["OW", "HW1", "HW2", "MW"]
@@ -411,7 +411,7 @@ def test_input_files_of_one_name_are_kept_apart(tmp_path):
     assert first.state.position.tobytes() == again.state.position.tobytes()
 
 
-@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.pdb", "t.xyz", "t.nc", "t.dcd"])
+@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.gsd", "t.pdb", "t.xyz", "t.nc", "t.dcd"])
 def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
     """What a kill would leave: the file is read back while the run still holds it open."""
     seen = []

@@ -22,7 +22,7 @@ from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.molecules import Molecule, Site, load_model, molecule, with_masses
-from rigidmd.output.trajectory import TrajectoryFile, write_topology
+from rigidmd.output.trajectory_file import TrajectoryFile, write_topology
 from rigidmd.scene import Scene
 from rigidmd.scene.place import Box
 from rigidmd.units import GRAM_PER_CM3

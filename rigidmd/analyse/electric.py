@@ -58,8 +58,8 @@ def dielectric(history: History) -> Finding:
     found = Finding("dielectric", "dielectric constant")
     if y >= 2 * around + 1:
         raise OutputError(
-            f"the dipole fluctuates more than it can with a permittivity of {around:g} around: the run is too short, or "
-            "the liquid freezes or is polarised"
+            f"the dipole fluctuates more than it can with a permittivity of {around:g} around: the run is too short, "
+            "or the liquid freezes or is polarised"
         )
     epsilon, slope = _of_fluctuation(y, around)
     spread = float(error or np.nan) / float(size or np.nan) * y * float(slope)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.analyse.findings import Curve, Finding, Value
 from rigidmd.analyse.history import History
-from rigidmd.analyse.registry import ORDER
+from rigidmd.analyse.registry import ORDER, place
 from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
 from rigidmd.output.figure import COLORS, FAINT, INK, few_decades, save_figure, thin_series
@@ -70,6 +70,7 @@ def write_findings(folder: Path, history: History, findings: list[Finding], fail
         }
     for name, why in failed.items():
         entries[name] = {"about": name, "values": [], "notes": [why], "curves": [], "files": [], "stretch": stretch}
+    entries = dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
     with whole_file(folder / ANALYSIS) as temporary:
         temporary.write_text(json.dumps({"analyses": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return [folder / ANALYSIS, *written]

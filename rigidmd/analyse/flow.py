@@ -57,7 +57,7 @@ def viscosity(history: History) -> Finding:
     seen = seen.reshape(-1, max(2, lags))
     if lags < FEWEST or seen[:, 1].sum() < CLOSE * seen[:, 0].sum():
         raise OutputError(
-            f"lines of the pressure tensor {interval:.3g} ps apart are too far from each other for a viscosity: stresses "
+            f"lines of the pressure tensor {interval:.3g} ps apart are too far apart for a viscosity: stresses "
             "forget themselves between them; output.pressure_tensor_interval_ps = 0.01 suits water"
         )
     running = factor * interval * (np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))

@@ -306,16 +306,21 @@ def rebuilt(
     wrapped : whether centres were put into the box; their paths are made continuous
     step : called with 1 after each frame
     """
-    fit, frames = Rebuilt(system), []
+    fit, n, f = Rebuilt(system), len(system.model.species), len(sites)
+    turning = n if len(system.state.rotation) else 0
+    position, Q = np.empty((f, n, 3)), np.empty((f, turning, 3, 3))
+    velocity, L = (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, turning, 3)))
     for k, frame in enumerate(sites):
         try:
-            frames.append(fit.bodies(frame, None if velocities is None else velocities[k]))
+            found = fit.bodies(frame, None if velocities is None else velocities[k])
         except OutputError as error:
             raise OutputError(f"frame {k + 1}: {error}") from None
+        for array, values in zip((position, Q, velocity, L), found, strict=True):
+            if array is not None:
+                array[k] = values
         step(1)
-    position, Q = np.array([f.position for f in frames]), np.array([f.Q for f in frames])
     notes = []
-    if wrapped and np.isfinite(cells[0, 0, 0]) and len(frames) > 1:
+    if wrapped and np.isfinite(cells[0, 0, 0]) and f > 1:
         inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))
         moves = np.diff(inside, axis=0)
         moves -= np.round(moves)
@@ -327,6 +332,4 @@ def rebuilt(
         inside[1:] = inside[0] + np.cumsum(moves, axis=0)
         position = np.einsum("fni,fij->fnj", inside, cells)
         notes.append("frames hold wrapped molecules; their paths were made continuous")
-    if velocities is None:
-        return Bodies(position, Q, None, None), notes
-    return Bodies(position, Q, np.array([f.velocity for f in frames]), np.array([f.L for f in frames])), notes
+    return Bodies(position, Q, velocity, L), notes

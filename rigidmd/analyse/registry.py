@@ -72,12 +72,12 @@ def chosen(names: list[str]) -> list[Analysis]:
     for name in names:
         if name not in KNOWN:
             raise OutputError(f"there is no analysis {name!r}{meant(name, KNOWN) or ';'} there are {', '.join(KNOWN)}")
-    return [KNOWN[name] for name in names] if names else sorted(KNOWN.values(), key=_place)
+    return [KNOWN[name] for name in names] if names else sorted(KNOWN.values(), key=lambda entry: place(entry.name))
 
 
-def _place(entry: Analysis) -> int:
-    """Its place among all: those of users at the end."""
-    return ORDER.index(entry.name) if entry.name in ORDER else len(ORDER)
+def place(name: str) -> int:
+    """The place of an analysis among all: those of users at the end."""
+    return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
 def trusted(path: Path) -> None:

@@ -13,10 +13,11 @@ from rigidmd.measure.summary import mean
 from rigidmd.molecules import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
-#: Frames that are used at most: those between say little more.
-MOST_FRAMES, MOST_FRAMES_WAVES, MOST_FRAMES_BONDS = 200, 100, 100
+#: Molecules in all frames together of which g(r), S(k) and hydrogen bonds are made; more frames say little more.
+ENOUGH, ENOUGH_WAVES = 200_000, 100_000
+FEWEST, MOST = 20, 500  # frames
 #: Å: largest distance and width of bins of g(r), unless others are given.
-LARGEST, WIDTH = 12.0, 0.05
+LARGEST, WIDTH = 10.0, 0.05
 #: 1/Å: largest wave vector and width of bins of S(k); wave vectors of a bin at most.
 LARGEST_WAVE, WAVE_WIDTH, WAVES = 8.0, 0.1, 24
 #: Å and degrees: largest O···O and H-O···O of a hydrogen bond (Luzar & Chandler 1996, Nature 379, 55).
@@ -45,7 +46,7 @@ def rdf(
             f"g(r) up to {largest:g} Å in bins of {width:g} Å is not possible: half the box is {half:.4g} Å"
         )
     pairs = [(first, second or first)] if first else _pairs(history)
-    thinned = history.thinned(MOST_FRAMES)
+    thinned = _thinned(history, ENOUGH)
     bins = int(largest / width + 1e-9)
     edges = width * np.arange(bins + 1)
     shells = 4 / 3 * np.pi * np.diff(edges**3)
@@ -70,6 +71,11 @@ def rdf(
     if len(thinned) < len(history):
         found.notes.append(f"of {len(thinned)} of {len(history)} frames, evenly spaced")
     return found
+
+
+def _thinned(history: History, enough: int) -> History:
+    """Evenly spaced frames with about so many molecules in all."""
+    return history.thinned(min(MOST, max(FEWEST, enough // len(history.system.model.species))))
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:
@@ -161,7 +167,7 @@ def structure_factor(history: History, name: str = "", largest: float = LARGEST_
     centres of all molecules. largest : 1/Å. Raises OutputError."""
     if not history.has_box:
         raise OutputError("a structure factor needs a box")
-    thinned = history.thinned(MOST_FRAMES_WAVES)
+    thinned = _thinned(history, ENOUGH_WAVES)
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T
     shortest = float(heights(reciprocal).min())
     if not largest > shortest:
@@ -260,7 +266,7 @@ def hydrogen_bonds(history: History, distance: float = BOND, angle: float = BOND
         )
     from rigidmd.output.trajectory import near_pairs
 
-    thinned = history.thinned(MOST_FRAMES_BONDS)
+    thinned = _thinned(history, ENOUGH)
     number = len(history.system.model.species)
     bonds = np.array([_bonds(thinned, k, distance, angle, near_pairs) for k in range(len(thinned))])  # (f, n)
     each = bonds.mean(axis=1)

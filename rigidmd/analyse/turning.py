@@ -52,19 +52,21 @@ def orientation(history: History) -> Finding:
         if note := _axes_in_words(kind):
             found.notes.append(note)
         for axis in _axes(kind):
-            values, errors = over_blocks(history, lambda part, k=kind, a=axis: _legendre(part, k, a, lags))
-            times, scatter = over_blocks(
-                history, lambda part, k=kind, a=axis: [_integral(c, interval) for c in _legendre(part, k, a, lags)]
-            )
+
+            def seen(part: History, kind=kind, axis=axis) -> np.ndarray:
+                both = _legendre(part, kind, axis, lags)
+                return np.concatenate([both, [[_integral(c, interval)] for c in both]], axis=1)
+
+            values, errors = over_blocks(history, seen)
             for l in (0, 1):  # noqa: E741
                 title = f"C{l + 1} {kind.name} axis {axis + 1}"
-                curve.columns[title], curve.errors[title] = values[l], errors[l]
+                curve.columns[title], curve.errors[title] = values[l, :-1], errors[l, :-1]
+                tau, error, left = float(values[l, -1]), float(errors[l, -1]), float(values[l, -2])
                 name = f"tau{l + 1} of {kind.name}, axis {axis + 1}"
-                if values[l][-1] > 0.5:
-                    told = f"C{l + 1} is still {values[l][-1]:.2f} after {time[-1]:.3g} ps: too short for a value"
+                if left > 0.5:
+                    told = f"C{l + 1} is still {left:.2f} after {time[-1]:.3g} ps: too short for a value"
                     found.values.append(Value(name, "ps", None, None, None, told))
                 else:
-                    tau, error = float(times[l]), float(scatter[l])
                     found.values.append(settled(name, "ps", tau, error, history.span, tau, least=LEAST_EACH))
         found.values += _rotational_diffusion(history, kind, interval, lags)
     return found

@@ -38,7 +38,7 @@ from rigidmd.validation import settled
 
 Part = TypeVar("Part", bound=NamedTuple)
 
-LARGEST_IN_GRO = 9e4  # Å: eight columns in nm
+LARGEST_IN = {".gro": 9e4, ".pdb": 990.0}  # Å: columns of text
 
 
 class Pose(NamedTuple):
@@ -282,7 +282,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     system.left_out = _left_out(system)
     if scene.output.trajectory and system.flies:
         reach = system.scale * np.abs(system.state.position).max()
-        if not reach < LARGEST_IN_GRO:
+        if not reach < LARGEST_IN[settled(scene.output.topology)[-4:]]:
             raise SceneError(
                 scene.source,
                 [

@@ -43,6 +43,8 @@ SAMPLES = 2000  # of the motion of a body
 TOLERANCE = 1e-10  # of DOP853 and RADAU
 FORMULATION = "matrix"
 TRAJECTORY_RADIUS = 10.0  # Å, of a body
+#: Å; a .pdb has no place for coordinates below -999.
+FARTHEST_IN_PDB = 900.0
 #: Largest entry of abs(QᵀQ - 1) of a body: under schemes, which keep it, and under general solvers, which do not.
 ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
@@ -101,6 +103,8 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
         "output": _output(scene.output),
         "stages": tuple(stage.resolved for stage in scene.stages),
     }
+    if scene.structure is not None:
+        tables["structure"] = scene.structure.model_copy(update={"topology": scene.topology})
     reads_velocities = scene.structure is not None and scene.structure.velocities
     if scene.start.temperature_K is None and not reads_velocities:
         first = scene.first_moving
@@ -265,10 +269,12 @@ def resolve_body(scene: BodyScene, turns: bool, radius: float) -> BodyScene:
             numbers["relative_tolerance"] = run.relative_tolerance or TOLERANCE
             numbers["absolute_tolerance"] = run.absolute_tolerance or TOLERANCE
         run = run.model_copy(update=numbers)
-    scale = TRAJECTORY_RADIUS / radius if radius > 0 else 1.0
+    scale = scene.output.trajectory_A_per_m or (TRAJECTORY_RADIUS / radius if radius > 0 else 1.0)
+    reach = scale * (radius + max(map(abs, scene.start.position_m or (0.0,))))
     output = {
         "interval_s": scene.output.interval_s or run.duration_s / SAMPLES,
-        "trajectory_A_per_m": scene.output.trajectory_A_per_m or scale,
+        "trajectory_A_per_m": scale,
+        "topology": scene.output.topology or f"topology.{'pdb' if reach < FARTHEST_IN_PDB else 'gro'}",
     }
     if watch.orthogonality is None:
         watch = watch.model_copy(update={"orthogonality": ORTHOGONALITY_OF_SOLVERS if solver else ORTHOGONALITY})

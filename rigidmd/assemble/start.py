@@ -34,6 +34,7 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
             start.frame,
             start.repeat,
             start.atom_types,
+            None if scene.topology is None else scene.path(scene.topology),
         )
         faults = []
         for k, entry in enumerate(scene.molecules):

@@ -9,10 +9,11 @@ import numpy as np
 from rigidmd.assemble.ase_formats import from_ase, read_by_ase, read_lammps, read_pdb, read_xyz
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of
 from rigidmd.assemble.own_formats import read_arc, read_cssr, read_gro
+from rigidmd.assemble.trajectory_formats import read_trajectory
 from rigidmd.core.files import file_fault
 from rigidmd.core.memory import in_words, memory_fault
 from rigidmd.errors import UNSEEN, StructureError
-from rigidmd.scene.place import LAMMPS_DATA
+from rigidmd.scene.place import BESIDE, LAMMPS_DATA, NAMELESS, TRAJECTORIES
 
 FARTHEST = 1e9  # Å, of an atom from the origin
 HEAVIEST = 1e30  # u
@@ -30,24 +31,37 @@ READERS = {
 }
 
 
-def read_atoms(path: Path, frame: int | None = None, atom_types: dict[str, str] | None = None) -> Atoms:
+def read_atoms(
+    path: Path, frame: int | None = None, atom_types: dict[str, str] | None = None, topology: Path | None = None
+) -> Atoms:
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
-    frame: 1 for the first, -1 for the last; None where there must be only one. atom_types: names of the types in a
-    LAMMPS data file.
+    frame: 1 for the first, -1 for the last; None where there must be only one, and for the last of a trajectory.
+    atom_types: names of the types in a LAMMPS data file. topology: a file with the names that a trajectory lacks.
     """
     if fault := file_fault(path):
         raise StructureError(str(path), [fault])
-    size = path.stat().st_size
-    if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
-        raise StructureError(str(path), [f"not enough memory: {fault}"])
-    atoms = _choose(path, _frames(path, atom_types), frame)()
+    suffix = path.suffix.lower()
+    if suffix in NAMELESS and topology is None:
+        looked = f"there is no {' or '.join(BESIDE)} beside it"
+        raise StructureError(
+            str(path), [f"holds no names of atoms, and {looked}: name a file that has them by structure.topology"]
+        )
+    if suffix in TRAJECTORIES:
+        atoms = read_trajectory(path, frame, None if topology is None else partial(read_atoms, topology))
+    else:
+        size = path.stat().st_size
+        if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
+            raise StructureError(str(path), [f"not enough memory: {fault}"])
+        atoms = _choose(path, _frames(path, atom_types), frame)()
     if len(atoms.position) == 0:
         raise StructureError(str(path), ["holds no atoms"])
-    for what, values in (("position", atoms.position), ("cell", atoms.cell)):
+    for what, values in (("position", atoms.position), ("velocity", atoms.velocity), ("cell", atoms.cell)):
+        if what == "velocity" and suffix not in TRAJECTORIES:
+            continue  # some atoms may have none
         if values is not None and not np.isfinite(values).all():
             bad = int(np.argmin(np.isfinite(values).all(axis=1)))
-            owner = "its box has an edge" if what == "cell" else f"atom {bad + 1} has a position"
+            owner = "its box has an edge" if what == "cell" else f"atom {bad + 1} has a {what}"
             raise StructureError(str(path), [f"{owner} that is not a finite number"])
     if (far := np.abs(atoms.position).max()) > FARTHEST:
         raise StructureError(str(path), [f"an atom is at {far:.3g} Å, farther than {FARTHEST:g} Å: is this the unit?"])
@@ -80,6 +94,8 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
     def mass(element: str) -> float:
         return HEAVY_HYDROGEN[element] if element in HEAVY_HYDROGEN else float(atomic_masses[atomic_numbers[element]])
 
+    if path.suffix.lower() in TRAJECTORIES:
+        raise StructureError(str(path), ["is a trajectory: name a structure file, or write a frame of it as one"])
     atoms = read_atoms(path)
     elements = [e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)]
     masses = np.array([mass(e) if e != "X" else 0.0 for e in elements])

@@ -121,8 +121,11 @@ class System:
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
-        centre = wrap(space_of(state.cell), state.position) if wrapped else state.position
-        return centre[self.sites.molecule] + self._arms(state)
+        return self.centres(state, wrapped)[self.sites.molecule] + self._arms(state)
+
+    def centres(self, state: State, wrapped: bool = False) -> np.ndarray:
+        """Centres of mass (n, 3), lab frame, Å; wrapped: inside the box."""
+        return wrap(space_of(state.cell), state.position) if wrapped else state.position
 
     def site_velocities(self, state: State) -> np.ndarray:
         """Velocities (s, 3) of all sites, lab frame, Å/ps."""

@@ -30,6 +30,11 @@
   warnings.addHandler((message) => { told.textContent = message; });
   const viewer = await Chemiscope.StructureVisualizer.load(config, dataset, warnings);
   const cell = document.querySelector("#film-picture > div").shadowRoot; // one picture needs no pin, copy and close
+  for (const one of cell.querySelectorAll("*")) { // the picture, whose size is in pixels, fills its frame on paper
+    if (!one.shadowRoot) continue;
+    const style = one.shadowRoot.appendChild(document.createElement("style"));
+    style.textContent = "@media print{canvas{width:100%!important;height:100%!important}button{display:none!important}}";
+  }
   for (const one of cell.querySelectorAll(".chsp-viewer-action-button")) {
     if (/activ|duplicate|remove|close/i.test(one.textContent + one.innerHTML.slice(0, 200))) one.style.display = "none";
   }

@@ -1,20 +1,17 @@
-"""Trajectories and topology files through MDAnalysis. The only room that imports it."""
+"""Universes of runs, and trajectories as they are read back, through MDAnalysis."""
 
 import contextlib
-import os
 import re
-import struct
 import sys
-import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
-from MDAnalysis.coordinates.base import ProtoReader
+from MDAnalysis.coordinates.base import ProtoReader, ReaderBase
 from MDAnalysis.coordinates.core import reader as open_reader
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.coordinates.memory import MemoryReader
@@ -27,15 +24,13 @@ from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.cells import angles_deg
+from rigidmd.assemble.gsd_format import GsdReader
 from rigidmd.assemble.system import System
-from rigidmd.core.files import AppendedFile, whole_file
 from rigidmd.core.state import State
-from rigidmd.errors import OutputError, SimulationError
+from rigidmd.errors import OutputError
 from rigidmd.output.connections import charges, connections
 from rigidmd.output.frame import Frame
 
-#: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
-LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
 #: Lines that tell the cell and the time of a frame in formats of text.
 BETWEEN_FRAMES = {
     ".xyz": rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)',
@@ -161,24 +156,27 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def _frames(path: Path, sites: int, most: int) -> Frames:
-    reader: Any = open_reader(str(path), format="NCDF" if path.suffix == ".nc" else path.suffix[1:])
+    reader: Any = open_reader(str(path), format=FORMATS.get(path.suffix, path.suffix[1:]))
     with contextlib.closing(reader):
         if reader.n_atoms != sites:
             raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
         count, is_cut = reader.n_frames, False
         stride = max(1, -(-count // most))
-        times, positions, boxes, velocities = [], [], [], []
-        for k in range(0, count, stride):
+        chosen = range(0, count, stride)
+        times, boxes = [], []
+        positions = np.empty((len(chosen), sites, 3), np.float32)
+        velocities = np.empty_like(positions) if count and reader.ts.has_velocities else None
+        for place, k in enumerate(chosen):
             try:
                 frame = reader[k]
             except (OSError, EOFError, ValueError):
                 is_cut = True
                 break
             times.append(frame.time)
-            positions.append(frame.positions.copy())
+            positions[place] = frame.positions
             boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
-            if frame.has_velocities:
-                velocities.append(frame.velocities.copy())
+            if velocities is not None:
+                velocities[place] = frame.velocities
     if not times:
         raise OutputError(f"{path} holds no whole frame")
     told_times, told_cells = _told_in_text(path)
@@ -187,8 +185,8 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
     cells = np.array(boxes) if all(box is not None for box in boxes) else None
     if told_cells:
         cells = np.array(told_cells[::stride][: len(times)])
-    moving = np.array(velocities) if len(velocities) == len(times) else None
-    return Frames(np.array(times), np.array(positions), cells, count, stride, is_cut, moving)
+    moving = None if velocities is None else velocities[: len(times)]
+    return Frames(np.array(times), positions[: len(times)], cells, count, stride, is_cut, moving)
 
 
 def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
@@ -204,6 +202,15 @@ def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
                 if found[1]:
                     cells.append(np.array(found[1].split(), float).reshape(3, 3))
     return times, cells
+
+
+def read_rotations(path: Path) -> np.ndarray:
+    """Q of all molecules at all frames (frames, n, 3, 3) of a .gsd file. Raises OutputError if it cannot be read."""
+    try:
+        with contextlib.closing(GsdReader(path)) as reader:
+            return np.array([reader.read(k).rotation() for k in range(reader.count)])
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from None
 
 
 @contextlib.contextmanager
@@ -225,6 +232,55 @@ def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tupl
     pairs = self_capped_distance(at.astype(np.float32), distance, box=box, return_distances=False)
     ways = (at[pairs[:, 1]] - at[pairs[:, 0]]).astype(np.float32)
     return pairs, ways if box is None else minimize_vectors(ways, box)
+
+
+class SitesOfGSD(ReaderBase):
+    """The sites of a .gsd file in the order of the scene, molecules whole, where the box begins at the origin.
+
+    MDAnalysis' own reader returns central particles too, and positions in the box.
+    """
+
+    units = {"time": "ps", "length": "Angstrom", "velocity": "Angstrom/ps"}  # noqa: RUF012  (MDAnalysis has it so)
+
+    def __init__(self, filename, **options):
+        super().__init__(filename, **options)
+        self._reopen()
+        self.ts = self._Timestep(self.n_atoms, **self._ts_kwargs)
+        self._read_frame(0)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the file."""
+        return self._file.count
+
+    def _reopen(self):
+        self.close()
+        self._file = GsdReader(Path(str(self.filename)))
+        self.n_atoms = len(self._file.read(0).sites)
+        self._frame = -1
+
+    def close(self):
+        """Close the file."""
+        if hasattr(self, "_file"):
+            self._file.close()
+
+    def _read_frame(self, i):
+        if not 0 <= i < self.n_frames:
+            raise OSError(f"there is no frame {i}")
+        found = self._file.read(i)
+        if len(found.sites) != self.n_atoms:
+            raise ValueError(f"frame {i + 1} has another number of sites")
+        self._frame = self.ts.frame = i
+        self.ts.positions = found.position[found.sites]
+        if (velocities := found.site_velocities()) is not None:
+            self.ts.velocities = velocities
+        self.ts.dimensions = None if found.cell is None else dimensions(found.cell)
+        self.ts.time = found.time
+        self.ts.data["step"] = found.step
+        return self.ts
+
+    def _read_next_timestep(self, ts=None):
+        return self._read_frame(self._frame + 1)
 
 
 class _Timed(ProtoReader):
@@ -270,6 +326,9 @@ class _TimedDCD(_Timed, DCDReader): ...
 class _TimedNCDF(_Timed, NCDFReader): ...
 
 
+class _TimedGSD(_Timed, SitesOfGSD): ...
+
+
 class _TimedXYZ(_Timed, XYZReader): ...
 
 
@@ -277,143 +336,8 @@ class _TimedPDB(_Timed, PDBReader): ...
 
 
 TIMED = {
-    ".xtc": _TimedXTC, ".trr": _TimedTRR, ".dcd": _TimedDCD, ".nc": _TimedNCDF, ".xyz": _TimedXYZ, ".pdb": _TimedPDB,
+    ".xtc": _TimedXTC, ".trr": _TimedTRR, ".gsd": _TimedGSD, ".dcd": _TimedDCD, ".nc": _TimedNCDF, ".xyz": _TimedXYZ,
+    ".pdb": _TimedPDB,
 }  # fmt: skip
-
-
-def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Write names, molecules and first positions, which viewers need beside a trajectory.
-
-    Raises SimulationError if the format cannot hold a position.
-    """
-    _check_fits(path, system.site_positions(state, wrapped))
-    with whole_file(path) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of missing attributes (occupancies, ...)
-        sites = universe(system, state, wrapped=wrapped).select_atoms("all")
-        sites.write(str(temporary), **({"bonds": "all"} if path.suffix == ".pdb" else {}))
-
-
-def _check_fits(path: Path, positions: np.ndarray) -> None:
-    least, largest = LIMITS.get(path.suffix, (-inf, inf))
-    for bound, beyond in ((least, positions.min() < least), (largest, positions.max() > largest)):
-        if beyond:
-            raise SimulationError(
-                f"a position is beyond the {bound:g} Å that {path.suffix} can hold: use .trr or .nc, "
-                "output.positions = 'wrapped', or of a body less output.trajectory_A_per_m"
-            )
-
-
-class TrajectoryFile:
-    """Writes frames to a file as they come. The ending sets the format.
-
-    MDAnalysis writes each frame to a file of its own in memory; its bytes go to the end of the trajectory. So every
-    write is checked, a file that ends early ends with a whole frame, and a run can go on with the file of another.
-
-    interval : time between frames (ps); only .dcd uses it, which stores it once for all frames
-    kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
-    Raises OutputError, here and in every method.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        system: System | BodySystem,
-        interval: float,
-        velocities: bool,
-        wrapped: bool,
-        kept: Sequence[int] | None = None,
-    ):
-        self._path, self._format, self._system = path, path.suffix, system
-        self._velocities, self._wrapped = velocities, wrapped
-        self._universe = universe(system, system.state, velocities)
-        forms = {
-            ".dcd": {"dt": interval},
-            ".nc": {"velocities": velocities},
-            ".pdb": {"multiframe": True, "bonds": None},  # those of the topology do
-        }
-        self._options = forms.get(path.suffix, {})
-        *before, self._frames = kept or (0, 0, 0)
-        offset, form = COUNTER.get(path.suffix, (0, ""))
-        patched = (offset, struct.pack(form, 1)) if form else (0, b"")
-        self._file = AppendedFile(path, before if kept else None, patched)
-
-    @property
-    def kept(self) -> tuple[int, int, int]:
-        """Bytes so far, all of them on the disk, their checksum, and the number of frames."""
-        return *self._file.kept, self._frames
-
-    def write(self, state: State, time: float, step: int) -> None:
-        """Add a frame with its own time (ps) and the box."""
-        set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
-        _check_fits(self._path, self._universe.trajectory.ts.positions)
-        self._file.append(self._part_of(self._whole(state, time)))
-        self._frames += 1
-        if self._format in COUNTER:
-            offset, form = COUNTER[self._format]
-            self._file.patch(offset, struct.pack(form, self._frames))
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._format == ".pdb":
-            self._file.append(PDB_END)
-        self._file.close()
-
-    def _whole(self, state: State, time: float) -> bytes:
-        """The file that has the present frame alone."""
-        options = self._options | ({"start": self._frames} if self._format == ".pdb" else {})
-        with _scratch(self._path) as path, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            form = "NCDF" if self._format == ".nc" else self._format[1:].upper()
-            writer: Any = mda.Writer(path, n_atoms=len(self._system.sites.name), format=form, **options)
-            with writer:
-                if self._format == ".xyz":
-                    writer.remark = _extended_xyz(state.cell, time)
-                elif self._format == ".pdb":
-                    writer.REMARK(f"TIME {time:.6f} PS")
-                writer.write(self._universe.atoms)
-                if self._format == ".pdb" and (box := dimensions(state.cell)):
-                    writer.CRYST1(box)  # MDAnalysis assigns lines between two models to the first
-            return Path(path).read_bytes()
-
-    def _part_of(self, whole: bytes) -> bytes:
-        """What is added to the trajectory: the frame, before the first one with the head of the file."""
-        n, first = len(self._system.sites.name), self._frames == 0
-        if self._format == ".pdb":
-            lines = whole.removesuffix(PDB_END)
-            model = lines.index(b"MODEL ")
-            return lines if first else lines[: lines.index(b"\n") + 1] + lines[model:]
-        if self._format == ".xyz":
-            return whole.removesuffix(b"\n\n") + b"\n"
-        if first or self._format not in COUNTER:
-            return whole
-        boxed = self._universe.dimensions is not None
-        size = 80 + 12 * n if self._format == ".dcd" else 4 + 12 * n * (1 + self._velocities) + 48 * boxed
-        return whole[-size:]
-
-
-#: Where a format counts its frames: offset and how the number is packed.
-COUNTER = {".dcd": (8, "<i"), ".nc": (4, ">i")}
-PDB_END = b"END\n"
-
-
-@contextlib.contextmanager
-def _scratch(path: Path) -> Iterator[str]:
-    """A path to write one frame to: in memory on Linux, elsewhere a hidden file beside the trajectory."""
-    if hasattr(os, "memfd_create"):
-        handle = os.memfd_create(path.name)
-        try:
-            yield f"/proc/self/fd/{handle}"
-        finally:
-            os.close(handle)
-    else:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".frame") as folder:
-            yield str(Path(folder) / path.name)
-
-
-def _extended_xyz(cell: np.ndarray, time: float) -> str:
-    """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
-    box = 'pbc="F F F"'
-    if cell[0, 0] < inf:
-        edges = " ".join(f"{x:.9g}" for x in cell.flat)
-        box = f'Lattice="{edges}" pbc="T T T"'
-    return f"{box} Properties=species:S:1:pos:R:3 Time={time:.9g}"
+#: What MDAnalysis calls a format, or the reader itself, where it is not the ending.
+FORMATS = {".nc": "NCDF", ".gsd": SitesOfGSD}

@@ -137,7 +137,7 @@ class BodySimulation(Simulation):
         files: list[Observer] = []
         if output.trajectory:
             with_velocities = output.trajectory.endswith((".trr", ".nc"))
-            files = [Frames(interval, output.topology, output.trajectory, with_velocities)]
+            files = [Frames(interval, settled(output.topology), output.trajectory, with_velocities)]
         if self.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
             files += [Figures()] if output.figures else []

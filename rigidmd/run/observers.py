@@ -17,7 +17,8 @@ from rigidmd.output.frame import Frame
 from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
-    from rigidmd.output.trajectory import TrajectoryFile
+    from rigidmd.output.gsd_file import GsdFile
+    from rigidmd.output.trajectory_file import TrajectoryFile
     from rigidmd.run.loop import Simulation
     from rigidmd.run.results import Results
 
@@ -100,7 +101,7 @@ class Frames(Observer):
         self._names = [topology, trajectory]
         self._velocities, self._wrapped = velocities, wrapped
         self._frames: list[Frame] = []
-        self._file: TrajectoryFile | None = None
+        self._file: TrajectoryFile | GsdFile | None = None
 
     def files(self) -> list[str]:
         """Both."""
@@ -110,7 +111,7 @@ class Frames(Observer):
         """Write the topology and open the trajectory."""
         self._run, self._frames = run, []
         if run.folder is not None:
-            from rigidmd.output.trajectory import write_topology  # MDAnalysis is slow to import
+            from rigidmd.output.trajectory_file import write_topology  # MDAnalysis is slow to import
 
             write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)
             self._open(None)
@@ -126,10 +127,10 @@ class Frames(Observer):
         self._open(kept.told["kept"])
 
     def _open(self, kept: Sequence[int] | None) -> None:
-        from rigidmd.output.trajectory import TrajectoryFile
+        from rigidmd.output.trajectory_file import open_trajectory
 
         run, path = self._run, self._run.path(self._names[1])
-        self._file = TrajectoryFile(path, run.system, self.interval, self._velocities, self._wrapped, kept)
+        self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, kept)
 
     def see(self, moment: Moment) -> None:
         """A frame."""

@@ -3,11 +3,12 @@
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from rigidmd.core.state import State
+from rigidmd.validation import settled
 
 if TYPE_CHECKING:
     import MDAnalysis
@@ -119,7 +120,9 @@ class Results:
         if self.files:
             by_name = {path.name: path for path in self.files}
             times = [frame.time for frame in self._frames]
-            return trajectory.from_files(self.system, by_name[output.topology], by_name[output.trajectory], times)
+            return trajectory.from_files(
+                self.system, by_name[settled(output.topology)], by_name[output.trajectory], times
+            )
         return trajectory.in_memory(self.system, self._frames)
 
     def analyse(self, name: str, start: float | None = None, **options: Any) -> "Finding":
@@ -180,8 +183,9 @@ class Results:
     def rotation(self) -> np.ndarray:
         """The rotation matrices Q, body to lab, at the frames of `universe()` (frames, n, 3, 3).
 
-        Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. Raises
-        ValueError if nothing turns, and for molecules whose run wrote files, as those hold the positions of sites only.
+        Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. A
+        trajectory.gsd keeps Q; from other files it is rebuilt from the positions of sites, as exactly as these are
+        written, with an arbitrary turn of linear molecules about their axes. Raises ValueError if nothing turns.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]
@@ -190,5 +194,13 @@ class Results:
         if not self._frames:
             raise ValueError("this run kept no frames (output.trajectory = false)")
         if self.files:
-            raise ValueError("the files of a run hold positions, not rotations; run without a folder to keep both")
+            path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
+            if path.suffix != ".gsd":
+                from rigidmd.analyse.history import Rebuilt
+
+                fit = Rebuilt(cast("System", self.system))
+                return np.array([fit.bodies(frame.positions, None).Q for frame in self.universe().trajectory])
+            from rigidmd.output.trajectory import read_rotations
+
+            return read_rotations(path)
         return np.array([frame.rotation for frame in self._frames])

@@ -180,7 +180,7 @@ def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"
 
 def _override(data: dict, key: str, value: Any) -> list[str]:
     """Set one dotted key in nested tables and lists in place; None removes it. Returns faults."""
-    if key == "structure.file" or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
+    if key in ("structure.file", "structure.topology") or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".", DEEPEST + 1)
     if len(parents) > DEEPEST:

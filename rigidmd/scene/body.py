@@ -312,8 +312,9 @@ class BodyOutput(Section):
     """Also write motion.npz, the same columns as arrays"""
     trajectory: str | Literal[False] = "trajectory.xtc"
     """Trajectory of points of the body for viewers; the ending sets the format; false for none"""
-    topology: str = "topology.gro"
-    """File that viewers need beside the trajectory (.gro or .pdb)"""
+    topology: str | None = None
+    """File that viewers need beside the trajectory (.gro, or .pdb, which also tells the edges of the body as bonds);
+    default: topology.pdb, or topology.gro for a body that starts more than 900 Å of the trajectory away"""
     trajectory_A_per_m: Positive | None = None
     """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second becomes a ps"""
     figures: Flag = True
@@ -331,13 +332,13 @@ class BodyOutput(Section):
 
     @field_validator("topology")
     @classmethod
-    def _topology_name(cls, name: str):
-        return file_name(name, (".gro", ".pdb"))
+    def _topology_name(cls, name: str | None):
+        return name if name is None else file_name(name, (".gro", ".pdb"))
 
     @model_validator(mode="after")
     def _apart(self):
-        if self.topology == self.trajectory:
-            raise ValueError(f"topology and trajectory are both {self.topology}; name them apart")
+        if self.trajectory and self.trajectory in (self.topology, "topology.pdb" if self.topology is None else None):
+            raise ValueError(f"topology and trajectory are both {self.trajectory}; name them apart")
         if self.axis is not None and not any(self.axis):
             raise ValueError("axis is zero, which is not a direction")
         return self

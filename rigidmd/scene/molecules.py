@@ -11,14 +11,14 @@ from rigidmd.molecules import SIZES
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
-from rigidmd.scene.place import Box, Start, Structure
+from rigidmd.scene.place import BESIDE, NAMELESS, Box, Start, Structure
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.watch import Watch
 from rigidmd.validation import MOST_TABLES, Count, Flag, Section
 
-TRAJECTORY_FORMATS = (".xtc", ".trr", ".dcd", ".nc", ".xyz", ".pdb")
-WITH_VELOCITIES = (".trr", ".nc")
+TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".dcd", ".nc", ".xyz", ".pdb")
+WITH_VELOCITIES = (".trr", ".nc", ".gsd")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
@@ -44,7 +44,8 @@ class Output(Section):
     """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line takes an
     evaluation of forces with the virial"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory file; the ending sets the format (.xtc .trr .dcd .nc .xyz .pdb); false for none"""
+    """Trajectory file; the ending sets the format (.xtc .trr .gsd .dcd .nc .xyz .pdb); .gsd keeps
+    rotations and angular momenta; false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: str = "topology.gro"
@@ -145,11 +146,22 @@ class MolecularScene(Scene):
     def inputs(self) -> dict[str, Path]:
         """Every further file that it reads: dotted key -> path."""
         found = {} if self.structure is None else {"structure.file": self.path(self.structure.file)}
+        if (names := self.topology) is not None:
+            found["structure.topology"] = self.path(names)
         for k, species in enumerate(self.molecules):
             for key in SPECIES_FILES:
                 if (name := getattr(species, key)) is not None:
                     found[f"molecules.{k}.{key}"] = self.path(name)
         return found
+
+    @property
+    def topology(self) -> str | None:
+        """The file with the names of atoms that a trajectory as structure lacks, as the scene would name it."""
+        start = self.structure
+        if start is None or start.topology is not None or not start.file.lower().endswith(NAMELESS):
+            return None if start is None else start.topology
+        beside = [str(Path(start.file).with_name(name)) for name in BESIDE]
+        return next((name for name in beside if self.path(name).is_file()), None)
 
     @model_validator(mode="after")
     def _whole(self):
@@ -240,7 +252,7 @@ class MolecularScene(Scene):
         """Files of a scene that lie outside its folder."""
         named = []
         if isinstance(structure := data.get("structure"), dict):
-            named.append(("structure.file", structure.get("file")))
+            named += [(f"structure.{key}", structure.get(key)) for key in ("file", "topology")]
         if isinstance(species := data.get("molecules"), list):
             named += [
                 (f"molecules.{k}.{key}", entry.get(key))

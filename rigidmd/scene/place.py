@@ -11,6 +11,11 @@ from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
 
 #: Endings of LAMMPS' data files.
 LAMMPS_DATA = (".data", ".lmp", ".lammps")
+#: Endings of trajectories without names of atoms, and of those that have them.
+NAMELESS = (".xtc", ".trr", ".dcd", ".nc", ".ncdf")
+TRAJECTORIES = (*NAMELESS, ".gsd")
+#: What a topology beside a trajectory is called, as in the folder of a run.
+BESIDE = ("topology.gro", "topology.pdb")
 
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 
@@ -19,10 +24,14 @@ class Structure(Section):
     """Positions at the start from a file."""
 
     file: str
-    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, or `final.npz` of an
-    earlier run; beside or below the scene"""
+    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, a trajectory (.xtc .trr
+    .gsd .dcd .nc), or `final.npz` of an earlier run; beside or below the scene"""
+    topology: str | None = None
+    """Of a trajectory that has no names (all but .gsd): a structure file with the names of its atoms, in their order.
+    Default: topology.gro or topology.pdb beside it, as in the folder of a run"""
     frame: Annotated[int, Strict()] | None = None
-    """Which of several structures in the file: 1 is the first, -1 the last; needed where there are several"""
+    """Which of several structures in the file: 1 is the first, -1 the last; needed where there are several, but for
+    trajectories, whose default is the last"""
     repeat: tuple[Count, Count, Count] = (1, 1, 1)
     """Repetitions of the file's cell along a, b, c, to make a crystal of its unit cell"""
     velocities: Flag = False
@@ -37,6 +46,14 @@ class Structure(Section):
     def _has_types(self):
         if self.atom_types is not None and not self.file.lower().endswith(LAMMPS_DATA):
             raise ValueError(f"atom_types are of LAMMPS' data files ({' '.join(LAMMPS_DATA)}), not of {self.file}")
+        return self
+
+    @model_validator(mode="after")
+    def _needs_names(self):
+        if self.topology is not None and not self.file.lower().endswith(NAMELESS):
+            raise ValueError(f"topology is of trajectories without names ({' '.join(NAMELESS)}), not of {self.file}")
+        if self.topology is not None and self.topology.lower().endswith((*TRAJECTORIES, ".npz")):
+            raise ValueError(f"topology = {self.topology!r}: name a structure file with names of atoms (.gro, .pdb)")
         return self
 
 

@@ -1,0 +1,170 @@
+"""Trajectories as structure files: the last frame of an earlier run, of this engine or another, or a clear message."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import small_scene
+from test_resume import NVT, WATER, scene
+
+from rigidmd import cli
+from rigidmd.assemble import trajectory_formats
+from rigidmd.assemble.structure import read_structure
+from rigidmd.assemble.structure_files import read_atoms, read_geometry
+from rigidmd.assemble.system import build
+from rigidmd.errors import SceneError, StructureError
+from rigidmd.output.trajectory_file import open_trajectory, write_topology
+from rigidmd.run import Simulation
+from rigidmd.scene import Scene
+
+TEXT = """
+[structure]
+file = "old.xtc"
+[[molecules]]
+model = "tip4p2005"
+[forces]
+cutoff_A = 6.0
+[[stages]]
+temperature_K = 300
+ensemble = "nvt"
+duration_ps = 0.01
+"""
+
+
+def make(folder, ending):
+    """A trajectory of two frames with its topology; returns its path and the system of the second frame."""
+    system = build(
+        small_scene({"tip4p2005": 4}, None, box={"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 95.0, 75.0]})
+    )
+    moved = system.state.copy()
+    moved.position[:] += [40.0, 1.0, -3.0]
+    moved.velocity[:] *= 2.0
+    path = folder / f"old{ending}"
+    file = open_trajectory(path, system, 1.0, ending in (".trr", ".gsd", ".nc"), False)
+    for k, state in enumerate((system.state, moved)):
+        file.write(state, float(k), k)
+    file.close()
+    write_topology(folder / "topology.gro", system, moved, wrapped=True)
+    return path, system, moved
+
+
+@pytest.mark.parametrize("ending", [".xtc", ".trr", ".gsd", ".dcd", ".nc"])
+def test_the_last_frame_of_a_trajectory(ending, tmp_path):
+    path, system, moved = make(tmp_path, ending)
+    names = None if ending == ".gsd" else tmp_path / "topology.gro"
+    found = read_structure(path, system.species, None, True, 0.15, topology=names)
+    error = 0.02 if ending == ".xtc" else 2e-5
+    assert np.abs(found.position - moved.position).max() < error
+    assert found.cell == pytest.approx(moved.cell, abs=1e-4)
+    assert found.residual_max < error
+    assert list(found.number) == [1, 2, 3, 4]
+    if ending in (".trr", ".gsd", ".nc"):
+        assert found.velocity == pytest.approx(moved.velocity, abs=1e-4)
+        spin = np.linalg.norm(moved.angular_momentum_body, axis=1)
+        assert np.linalg.norm(found.angular_momentum_body, axis=1) == pytest.approx(spin, abs=1e-3)
+    else:
+        assert found.velocity is None
+    if ending in (".trr", ".gsd"):
+        first = read_structure(path, system.species, None, True, 0.15, frame=1, topology=names)
+        assert np.abs(first.position - system.state.position).max() < error
+        assert not [other.name for other in tmp_path.iterdir() if other.name.startswith(".")]  # no offsets beside it
+
+
+@pytest.mark.parametrize(
+    ("ending", "fault", "said"),
+    [
+        (".xtc", "no names", "there is no topology.gro or topology.pdb beside it: name a file"),
+        (".xtc", "other names", "it has 16 atoms, the file with their names 3"),
+        (".dcd", "noise", "cannot be read as a trajectory"),
+        (".trr", "empty", "cannot be read as a trajectory"),
+        (".nc", "cut", "cannot be read as a trajectory"),
+        (".xtc", "frame", "structure.frame is 3: it holds 2"),
+        (".gsd", "frame", "structure.frame is 3: it holds 2"),
+        (".gsd", "noise", "Not a GSD file"),
+        (".xtc", "crash", "its reader crashed. Is it damaged?"),
+        (".xtc", "outside", "lies outside the scene's folder"),
+        (".gsd", "topology", "topology is of trajectories without names"),
+        (".xtc", "not a structure", "name a structure file with names"),
+    ],
+)
+def test_what_cannot_be_a_start(ending, fault, said, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    path = make(folder, ending)[0]
+    more = ""
+    match fault:
+        case "no names":
+            (folder / "topology.gro").unlink()
+        case "other names":
+            (folder / "topology.gro").write_text("t\n3\n" + "".join(
+                f"    1SOL  {name:>5}{k:>5}   0.000   0.000   0.{k}00\n" for k, name in enumerate(("OW", "HW1", "HW2"), 1)
+            ) + "   2.0 2.0 2.0\n")  # fmt: skip
+        case "noise":
+            path.write_bytes(np.random.default_rng(1).bytes(4000))
+        case "empty":
+            path.write_bytes(b"")
+        case "cut":
+            path.write_bytes(path.read_bytes()[:300])
+        case "frame":
+            more = "frame = 3"
+        case "crash":
+            program = tmp_path / "crash.py"
+            program.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
+            monkeypatch.setattr(trajectory_formats, "PROGRAM", program)
+        case "outside":
+            shutil.move(folder / "topology.gro", tmp_path)
+            more = 'topology = "../topology.gro"'
+        case "topology":
+            more = 'topology = "topology.gro"'
+        case "not a structure":
+            more = 'topology = "old.xtc"'
+    file = folder / "scene.toml"
+    file.write_text(TEXT.replace('"old.xtc"', f'"old{ending}"\n{more}'))
+    assert cli.main(["check", str(file)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error
+
+
+def test_damaged_gsd_as_structure(tmp_path):
+    path = make(tmp_path, ".gsd")[0]
+    content, rng = path.read_bytes(), np.random.default_rng(3)
+    refused = 0
+    for k in range(200):
+        damaged = bytearray(content)
+        for at in rng.integers(0, 5000 if k % 2 else len(content), 3):
+            damaged[at] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            read_atoms(path)
+        except StructureError:
+            refused += 1
+    assert refused > 20
+
+
+def test_a_trajectory_is_no_molecule(tmp_path):
+    with pytest.raises(StructureError, match="is a trajectory"):
+        read_geometry(make(tmp_path, ".gsd")[0])
+
+
+def test_a_run_goes_on_from_a_trajectory(tmp_path):
+    """With its velocities; both files are inputs, whose digests and copies are in the folder."""
+    first = scene(NVT, output=WATER["output"] | {"trajectory": "trajectory.trr", "topology": "topology.pdb"})
+    before = Simulation(Scene.from_dict(first), tmp_path / "old").run()
+    again = scene({k: v for k, v in NVT.items() if k not in ("ensemble", "temperature_K")}, box={}) | {
+        "molecules": [{"model": "spce"}], "structure": {"file": "old/trajectory.trr", "velocities": True},
+    }  # fmt: skip
+    del again["start"]
+    results = Simulation(Scene.from_dict(again, tmp_path), tmp_path / "new").run()
+    assert set(results.summary["input_sha256"]) == {"structure.file", "structure.topology"}
+    assert (tmp_path / "new" / "input_structure_trajectory.trr").is_file()
+    kept = Scene.read(tmp_path / "new" / "scene.toml")
+    assert Path(kept.structure.topology).name == "input_structure.topology_topology.pdb"
+    assert np.abs(build(kept).state.velocity - before.state.velocity).max() < 1e-4
+    repeated = Simulation(kept).run()
+    assert repeated.state.position.tobytes() == results.state.position.tobytes()
+    with pytest.raises(SceneError, match=r"structure\.topology"):
+        Scene.from_dict(
+            again | {"structure": {"file": "old/trajectory.trr", "topology": "none.gro", "velocities": True}}, tmp_path
+        )
