@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -103,7 +104,8 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     assert list(table(copy / "rdf.csv"))[:4] == ["r (A)", "g O-O", "g O-O error", "n O-O"]
     bonds = found["hydrogen_bonds"]["values"][0]
     assert 1.0 < bonds["value"] < 4.5
-    assert "D of spce: this run is" in text and "too short for a value" in text
+    for name in ("D of spce", "tau1 of spce, axis 2", "D_rot of spce, axis 1", "dielectric constant"):
+        assert re.search(rf"^  {name}: .* too short for a value$", text, re.MULTILINE), name
     # once more, of one analysis: the same bits, and the others stay
     kept = {name: (copy / name).read_bytes() for name in [*files, "analysis.json"] if not name.endswith(".png")}
     assert cli.main(["analyse", str(copy), "--only", "rdf, orientation", "--from", "0.02ps"]) == 0
@@ -272,7 +274,7 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
         "-b", "0.0199", "-xvg", "none", "-temp", "300", text="System\n")  # fmt: skip
     _, x, y, z, _ = xvg(topology / "Mtot.xvg")
     own = total_dipole(history) / DEBYE
-    assert np.array([x, y, z]).T == pytest.approx(own, abs=2e-4)
+    assert np.abs(np.array([x, y, z]).T - own).max() < 2e-4
     assert np.abs(own).max() > 10.0
 
 
@@ -321,7 +323,7 @@ def test_names_of_sites_are_suggested(water):
     with pytest.raises(OutputError, match=r"^there is no site 'Xe'; there are OW"):
         rdf(history, "Xe")
     for largest, width in ((20.0, 0.1), (-1.0, 0.1), (5.0, 0.0), (5.0, 6.0), (np.nan, 0.1), (5.0, np.nan)):
-        with pytest.raises(OutputError, match="is not possible: half the box is 9.3"):
+        with pytest.raises(OutputError, match=r"is not possible: half the box is 9\.3"):
             rdf(history, "OW", largest=largest, width=width)
     with pytest.raises(OutputError, match="there is no axis 'w'; name x, y or z"):
         registry.chosen(["density_profile"])[0].function(history, "w")
