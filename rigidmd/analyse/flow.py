@@ -19,7 +19,7 @@ FEWEST, CLOSE = 8, 0.5
 #: The fit ends where the standard error of the mean integral is this fraction of it. With 0.15 the noise of the tail
 #: makes values 5 to 13% too large (400 ps, correlation times of 0.1 to 0.8 ps); with 0.05 fits of 0.4 ns end too early.
 DOUBT = 0.08
-#: Share of the integral that the second half of the fit may add: what an exponential adds if 2.2 of its times are there.
+#: Share of the integral that the second half of the fit may add: what an exponential adds with 2.2 of its times there.
 GROWS = 0.25
 #: Stretches drawn again, with repetition, for the error of the fit.
 DRAWS = 50
@@ -88,9 +88,7 @@ def viscosity(history: History) -> Finding:
     ]
     grows = float(mean[end - 1] - mean[end // 2]) > GROWS * float(mean[end - 1])
     if whole is None or grows or len(drawn) < DRAWS // 2:
-        told = (
-            f"the integral of the stress correlation has not settled by {time[end - 1]:.3g} ps: too short for a value"
-        )
+        told = f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps: too short for a value"
         found.values.append(Value("viscosity", "mPa s", None, None, None, told))
         return found
     forgets = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0
