@@ -130,6 +130,7 @@ def test_results_in_memory_and_from_the_folder_agree(water):
     history = of_folder(read_record(water), 0.02)
     for name, options, column in (
         ("rdf", {"first": "OW", "second": "HW", "width": 0.2}, "g OW-HW"),
+        ("structure_factor", {"name": "OW", "largest": 3.0}, "S OW"),
         ("msd", {}, "MSD spce (A^2)"),
         ("orientation", {}, "C2 spce axis 2"),
         ("spectrum", {}, "omega spce axis 1"),

@@ -1,5 +1,7 @@
 """How molecules turn and shake: orientational correlation, rotational diffusion, spectra; from Q, L and V."""
 
+from typing import Any
+
 import numpy as np
 from scipy import signal
 
@@ -203,6 +205,7 @@ def _density_of_states(values: np.ndarray, interval: float, size: int, weight: f
     total, n = 0.0, values.shape[1]
     for first in range(0, n, 256):
         part = values[:, first : first + 256].reshape(len(values), -1)
-        _, density = signal.welch(part, 1 / interval, "hann", size, detrend=False, axis=0)
+        no: Any = False  # which the types of SciPy do not know
+        _, density = signal.welch(part, 1 / interval, "hann", size, detrend=no, axis=0)
         total = total + density.sum(axis=1)
     return weight * np.asarray(total) * PER_CM / n
