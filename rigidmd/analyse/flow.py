@@ -108,7 +108,7 @@ def viscosity(history: History) -> Finding:
 
 def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float | None:
     """Limit of a running integral by a fit of two exponentials; None where the fit fails."""
-    top, longest = float(np.max(values)), float(time[-1])
+    top, longest = float(np.max(values)), float(time[-1]) / 2  # times that were not seen to decay are noise
     if not top > 0:
         return None
 
