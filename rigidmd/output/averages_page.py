@@ -24,10 +24,7 @@ def averages_page(found: Averages, command: str) -> str:
     of = [f"{scale} ({', '.join(q.name for q in judged if report.scale(q) == scale)})" for scale in scales]
     runs = [[named(run.method), *line[1:]] for run, line in zip(found.runs, report.brief_rows(found), strict=True)]
     about = f"{found.molecules} molecules, {found.freedom} degrees of freedom, {found.stage} at {found.temperature:g} K"
-    remarks = [
-        f"{SHARE:.0%} is of {', '.join(of)}. With >, no bias was seen up to that step",
-        *report.references(found),
-    ]
+    told = f"{SHARE:.0%} is of {', '.join(of)}. Where none was seen, > tells the step up to which it is smaller"
     parts = [
         f'<p class="faint">{plain(about)}; {found.sampled:g} ps at every step</p>',
         section(
