@@ -11,14 +11,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rigidmd.analyse.registry import analysis
     from rigidmd.run import Every, Moment, Results, Simulation
     from rigidmd.scene import BodyScene, MolecularScene, Scene
 
     __version__: str
 
-__all__ = ["BodyScene", "Every", "MolecularScene", "Moment", "Results", "Scene", "Simulation"]
+__all__ = ["BodyScene", "Every", "MolecularScene", "Moment", "Results", "Scene", "Simulation", "analysis"]
 
-_HOMES = {name: "scene" if name.endswith("Scene") else "run" for name in __all__}
+_HOMES = {name: "scene" if name.endswith("Scene") else "run" for name in __all__} | {"analysis": "analyse.registry"}
 
 
 def __getattr__(name: str) -> object:

@@ -11,7 +11,9 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidmd.looking.commands import add_commands
+from rigidmd.analyse import commands as analysing
+from rigidmd.analyse.commands import time_ps
+from rigidmd.looking import commands as looking
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
@@ -205,7 +207,8 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--force", action="store_true", help="replace earlier results in that folder")
     stability.set_defaults(scene="stability", writes=True)
 
-    add_commands(partial(_command, commands))
+    analysing.add_commands(partial(_command, commands))
+    looking.add_commands(partial(_command, commands))
 
     models = _command(
         commands,
@@ -273,7 +276,7 @@ def _going_on(parser: argparse.ArgumentParser) -> None:
         help="stop shortly before this time is up, with a checkpoint and exit code 75",
     )  # fmt: skip
     parser.add_argument(
-        "--until", type=_until, metavar="TIME",
+        "--until", type=time_ps, metavar="TIME",
         help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run",
     )  # fmt: skip
 
@@ -285,14 +288,6 @@ def _walltime(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
     days, hours, minutes, seconds = (float(part or 0) for part in found.groups())
     return 86400 * days + 3600 * hours + 60 * minutes + seconds
-
-
-def _until(text: str) -> float:
-    """Picoseconds in a time such as 200ps."""
-    found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
-    return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
 
 
 def _read_scene(options: argparse.Namespace, **more):

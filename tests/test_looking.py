@@ -19,9 +19,9 @@ from rigidmd import Scene, Simulation, cli
 from rigidmd.assemble.body import build_body
 from rigidmd.looking import molecule_film
 from rigidmd.looking.mesh import UNITS, mesh_of
-from rigidmd.looking.record import read_record
 from rigidmd.mechanics.solids import SOLIDS, solid
 from rigidmd.output.connections import connections
+from rigidmd.output.record import read_record
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
@@ -440,8 +440,9 @@ def test_the_files_of_a_run_tell_the_same(tmp_path):
     assert u.atoms[0].charge == pytest.approx(-0.8476)
     assert u.atoms[0].mass == pytest.approx(15.9994)
     assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 2 * 216  # CONECT
-    with pytest.raises(ValueError, match=r"write a trajectory.gsd, or run without a folder"):
-        results.rotation  # noqa: B018
+    rotation, last = results.rotation, results.state.rotation  # rebuilt from positions rounded to 0.01 Å
+    assert rotation.shape == (len(u.trajectory), 216, 3, 3)
+    assert np.abs(rotation[-1] - last).max() < 0.02
 
 
 def test_a_body_has_its_edges_as_bonds(tmp_path):

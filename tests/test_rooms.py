@@ -19,6 +19,7 @@ ROOMS = [
     ("assemble",),
     ("measure",),
     ("output",),
+    ("analyse",),
     ("shipped",),
     ("run",),
     ("study",),
@@ -39,10 +40,11 @@ LIBRARIES = {
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
-        "looking/film.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
+        "looking/film.py", "analyse/files.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
     "numba": {
+        "forces/pairs/counts.py",
         "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lane_types.py", "compile/lanes.py",
         "compile/machine.py",
         "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.looking.mesh import Mesh, mesh_of
-from rigidmd.looking.record import Record
 from rigidmd.measure.motion import drawn_axis
 from rigidmd.output.figure import thin_path
+from rigidmd.output.record import Record
 
 #: Samples in a film at most; points of the path that is drawn at most.
 MOST, MOST_POINTS = 20_000, 3000

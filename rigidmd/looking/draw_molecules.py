@@ -4,10 +4,10 @@ from itertools import combinations, product
 
 import numpy as np
 
-from rigidmd.looking.record import Record
 from rigidmd.output.figure import FAINT, INK, camera
 from rigidmd.output.molecule_figure import COLOURS, OTHER
 from rigidmd.output.molecule_report import COVALENT
+from rigidmd.output.record import Record
 from rigidmd.output.trajectory import Frames
 
 #: Where the eye is.

@@ -14,8 +14,8 @@ from rigidmd.looking.body_film import BodyFilm, body_film
 from rigidmd.looking.draw_body import BodyPicture
 from rigidmd.looking.draw_molecules import MoleculePicture
 from rigidmd.looking.molecule_film import frames_of, thinned
-from rigidmd.looking.record import Record, read_record
 from rigidmd.output.figure import INK, WARM
+from rigidmd.output.record import Record, read_record
 
 ENDINGS = (".mp4", ".gif")
 #: Frames a second, seconds, and pixels of height of a film; inches of its picture.

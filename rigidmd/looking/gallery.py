@@ -12,10 +12,10 @@ from rigidmd.core.files import whole_file
 from rigidmd.errors import Faults
 from rigidmd.looking.body_film import body_film
 from rigidmd.looking.draw_body import BodyPicture
-from rigidmd.looking.record import Record, read_record
 from rigidmd.looking.view import write_view
 from rigidmd.output.figure import save_figure
 from rigidmd.output.page import code, page
+from rigidmd.output.record import Record, read_record
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.shipped import Example, examples

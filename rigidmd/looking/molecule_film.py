@@ -8,9 +8,9 @@ import numpy as np
 
 from rigidmd.assemble.system import Sites
 from rigidmd.errors import OutputError
-from rigidmd.looking.record import Record
 from rigidmd.looking.view import data_part, own, packed, script, stage
 from rigidmd.output.connections import connections
+from rigidmd.output.record import Record
 from rigidmd.output.trajectory import Frames, read_frames
 
 #: Coordinates in a page at most, of 2 bytes each: with base64 about 21 MB, beside 3 MB of chemiscope.

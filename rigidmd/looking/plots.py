@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.looking.record import Record
 from rigidmd.output.figure import COOL, FAINT, INK, WARM, thin_series
 from rigidmd.output.page import figure as figure_part
+from rigidmd.output.record import Record
 
 #: Inches: narrow, so that its letters can be read on a phone.
 WIDTH, HEIGHT = 4.4, 2.3

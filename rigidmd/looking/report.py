@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from rigidmd.analyse.files import drawn, read_findings
+from rigidmd.analyse.findings import with_error
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import whole_file
 from rigidmd.looking import plots
-from rigidmd.looking.record import Record, read_record
 from rigidmd.measure.summary import mean
 from rigidmd.output.folder import SCENE
-from rigidmd.output.page import BAD, DOUBTFUL, GOOD, Raw, code, items, notes, page, section, table
+from rigidmd.output.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, section, table
+from rigidmd.output.record import Record, read_record
 from rigidmd.output.report import signed
 
 REPORT = "report.html"
@@ -41,6 +43,8 @@ ABOUT = {
     "motion.csv": "position, attitude, velocities, energies and errors over time",
     "motion.npz": "the same columns as arrays",
     "final.npz": "the last state, every bit of it",
+    "pressure_tensor.csv": "the pressure tensor over time, for a viscosity",
+    "analysis.json": "values of `rigidmd analyse` with their errors",
     "checkpoint.npz": "from which `rigidmd resume` goes on",
     "checkpoint_previous.npz": "the checkpoint before it",
     "last_good_state.npz": "the last state before the run failed",
@@ -66,6 +70,7 @@ def parts(record: Record, film: str = "") -> Iterator[str]:
         yield section("Means of each stage", _means(record), _drifts(record))
     if not film:
         yield section("Plots", plots.draw(record))
+    yield section("Analyses", *_analyses(record))
     yield section("Stability margins", _margins(record))
     simulated, left_out = _told(record)
     yield section("What was simulated", code(simulated))
@@ -116,6 +121,30 @@ def _drifts(record: Record) -> str:
     titles = ["stage", "integrator", "step (fs)", "drift (kJ/mol/ns per molecule)",
               "drift (kT/ns per degree of freedom)", "energy noise (kJ/mol per molecule)", "ns/day"]  # fmt: skip
     return table(titles, rows)
+
+
+def _analyses(record: Record) -> Iterator[str]:
+    """What `rigidmd analyse` found: values, what was left out, figures."""
+    rows, left_out, figures, stretches = [], [], [], []
+    for finding, stretch in read_findings(record.folder):
+        for value in finding.values:
+            told = "" if value.value is None else with_error(value.value, value.error)
+            time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
+            rows.append([value.name, told, value.unit if told and value.unit != "1" else "", time, value.note])
+        if not finding.values and not finding.curves:
+            left_out += [f"{finding.name}: {note}" for note in finding.notes]
+        else:
+            stretches.append(stretch)
+        for curve in finding.curves:
+            svg = figure(drawn(curve), f"analysis-{curve.file}", curve.label)
+            figures.append(f"<figure>{svg}</figure>")
+    if not rows and not figures and not left_out:
+        return
+    told = "; ".join(dict.fromkeys(stretches))
+    yield f'<p class="faint">Values ± one standard error, of {html.escape(told)}.</p>' if told else ""
+    yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
+    yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
+    yield "<p>Left out:</p>" + items(left_out) if left_out else ""
 
 
 def _number(value: float | None) -> str:

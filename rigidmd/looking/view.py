@@ -12,8 +12,8 @@ import numpy as np
 from rigidmd.core.files import whole_file
 from rigidmd.looking import plots, report
 from rigidmd.looking.body_film import BodyFilm, body_film
-from rigidmd.looking.record import Record, read_record
 from rigidmd.output.page import items, page
+from rigidmd.output.record import Record, read_record
 
 VIEW = "view.html"
 HERE = Path(__file__).parent

@@ -20,6 +20,7 @@ from MDAnalysis.coordinates.TRJ import NCDFReader
 from MDAnalysis.coordinates.TRR import TRRReader
 from MDAnalysis.coordinates.XTC import XTCReader
 from MDAnalysis.coordinates.XYZ import XYZReader
+from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.cells import angles_deg
@@ -124,7 +125,8 @@ def _checked(times: list[float]) -> list[float]:
 
 
 class Frames(NamedTuple):
-    """Frames of a trajectory: times (f,) ps, positions (f, s, 3) Å, and cells (f, 3, 3), None without a box.
+    """Frames of a trajectory: times (f,) ps, positions (f, s, 3) Å, cells (f, 3, 3), None without a box, and velocities
+    (f, s, 3) Å/ps, None where the file has none.
 
     stride : which frames of the file these are: every one, every second, ...
     is_cut : whether the file ends within a frame
@@ -136,6 +138,7 @@ class Frames(NamedTuple):
     count: int  # frames in the file
     stride: int
     is_cut: bool
+    velocities: np.ndarray | None = None
 
 
 def read_frames(path: Path, sites: int, most: int) -> Frames:
@@ -159,16 +162,21 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
             raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
         count, is_cut = reader.n_frames, False
         stride = max(1, -(-count // most))
-        times, positions, boxes = [], [], []
-        for k in range(0, count, stride):
+        chosen = range(0, count, stride)
+        times, boxes = [], []
+        positions = np.empty((len(chosen), sites, 3), np.float32)
+        velocities = np.empty_like(positions) if count and reader.ts.has_velocities else None
+        for place, k in enumerate(chosen):
             try:
                 frame = reader[k]
             except (OSError, EOFError, ValueError):
                 is_cut = True
                 break
             times.append(frame.time)
-            positions.append(frame.positions.copy())
+            positions[place] = frame.positions
             boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
+            if velocities is not None:
+                velocities[place] = frame.velocities
     if not times:
         raise OutputError(f"{path} holds no whole frame")
     told_times, told_cells = _told_in_text(path)
@@ -177,7 +185,8 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
     cells = np.array(boxes) if all(box is not None for box in boxes) else None
     if told_cells:
         cells = np.array(told_cells[::stride][: len(times)])
-    return Frames(np.array(times), np.array(positions), cells, count, stride, is_cut)
+    moving = None if velocities is None else velocities[: len(times)]
+    return Frames(np.array(times), positions[: len(times)], cells, count, stride, is_cut, moving)
 
 
 def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
@@ -214,6 +223,15 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         sys.unraisablehook = hook
+
+
+def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (p, 2) of points (k, 3) that are closer than `distance`, in a cell (3, 3) or without a box, and the way
+    (p, 3) from the first to the second; Å, single precision."""
+    box = None if cell is None else np.array(dimensions(cell), np.float32)
+    pairs = self_capped_distance(at.astype(np.float32), distance, box=box, return_distances=False)
+    ways = (at[pairs[:, 1]] - at[pairs[:, 0]]).astype(np.float32)
+    return pairs, ways if box is None else minimize_vectors(ways, box)
 
 
 class SitesOfGSD(ReaderBase):

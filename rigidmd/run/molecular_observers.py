@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
 from rigidmd.measure import watch
@@ -10,6 +12,7 @@ from rigidmd.measure.samples import Samples
 from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.output.log import Log
+from rigidmd.output.pressure import TENSOR_FILE, TensorFile, tensor_row
 from rigidmd.output.report import draw_energy, drawn
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
@@ -58,6 +61,53 @@ class LogFile(Observer):
         """Close it."""
         if self._log is not None:
             self._log.close()
+
+
+class PressureTensor(Observer):
+    """pressure_tensor.csv: the pressure tensor at an interval of its own; without a folder in memory."""
+
+    def __init__(self, interval: float):
+        self.interval = interval
+        self._file: TensorFile | None = None
+        self._rows: list[list[float]] = []
+
+    def files(self) -> list[str]:
+        """One."""
+        return [TENSOR_FILE]
+
+    def begin(self, run: "MolecularSimulation") -> None:
+        """Open it."""
+        self._rows = []
+        self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE))
+
+    def memory(self) -> Checkpoint:
+        """Its size."""
+        return Checkpoint({"kept": None if self._file is None else self._file.kept}, {})
+
+    def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
+        """Open it where the checkpoint left it."""
+        self._file = TensorFile(run.path(TENSOR_FILE), kept.told["kept"])
+
+    def see(self, moment: Moment) -> None:
+        """A line."""
+        row = tensor_row(moment.time, moment.observation.pressure_tensor_bar)
+        if self._file is None:
+            self._rows.append(row)
+        else:
+            self._file.write(row)
+
+    def end(self, run: "MolecularSimulation", results: "Results") -> None:
+        """Hand it over."""
+        if self._file is None:
+            results._tensor = np.array(self._rows)
+        else:
+            results.files.append(run.path(TENSOR_FILE))
+
+    def close(self) -> None:
+        """Close it."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 class Good(NamedTuple):

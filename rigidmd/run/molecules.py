@@ -31,7 +31,7 @@ from rigidmd.output.report import summary_text
 from rigidmd.output.scene_file import input_names, write_scene
 from rigidmd.run.loop import Costs, Options, Simulation, Stretch
 from rigidmd.run.minimise import minimise
-from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, Sampler, StepWatch
+from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.provenance import plain
@@ -316,6 +316,8 @@ class MolecularSimulation(Simulation):
             velocities = bool(output.velocities)
             wrapped = output.positions == "wrapped"
             files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
+        if output.pressure_tensor_interval_ps:
+            files.append(PressureTensor(output.pressure_tensor_interval_ps))
         if self.folder is not None:
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import MDAnalysis
     import pandas
 
+    from rigidmd.analyse.findings import Finding
+    from rigidmd.analyse.history import History
     from rigidmd.assemble.body import BodySystem
     from rigidmd.assemble.system import System
     from rigidmd.measure.motion import Motion
@@ -44,6 +46,8 @@ class Results:
     signal: int | None = None
     out_of_time: bool = False
     _frames: "list[Frame]" = field(default_factory=list)
+    _tensor: np.ndarray | None = None  # (n, 7) lines of the pressure tensor, where no file holds them
+    _histories: "dict[float | None, History]" = field(default_factory=dict)  # by the time at which they begin
 
     def __repr__(self) -> str:
         return f"<Results of {self.system.scene.name}: {self._told}; results[column], .units, .summary, .universe()>"
@@ -121,12 +125,67 @@ class Results:
             )
         return trajectory.in_memory(self.system, self._frames)
 
+    def analyse(self, name: str, start: float | None = None, **options: Any) -> "Finding":
+        """The analysis of this name, one's own (`rigidmd.analysis`) or one that comes with rigidmd, as a `Finding`.
+
+        start : ps, where frames begin to count; default: where the run is found to be equilibrated. Other options are
+        those of the function. Raises OutputError.
+        """
+        from rigidmd.analyse.registry import chosen
+        from rigidmd.analyse.source import of_results
+
+        (entry,) = chosen([name])
+        if start not in self._histories:
+            self._histories[start] = of_results(self, start)
+        return entry.function(self._histories[start], **options)
+
+    def rdf(self, first: str = "", second: str = "", **options: Any) -> "Finding":
+        """g(r) of two sites, elements or species; without names of all pairs of few sites. See `analyse.structure`."""
+        return self.analyse("rdf", first=first, second=second, **options)
+
+    def structure_factor(self, name: str = "", **options: Any) -> "Finding":
+        """S(k) of sites, elements or species; without a name of the centres of mass."""
+        return self.analyse("structure_factor", name=name, **options)
+
+    def density_profile(self, axis: str = "z", **options: Any) -> "Finding":
+        """Mass density (g/cm³) of each species along x, y or z."""
+        return self.analyse("density_profile", axis=axis, **options)
+
+    def hydrogen_bonds(self, **options: Any) -> "Finding":
+        """Hydrogen bonds of a molecule, by distance (Å) and angle (degrees)."""
+        return self.analyse("hydrogen_bonds", **options)
+
+    def msd(self, **options: Any) -> "Finding":
+        """Mean squared displacement (Å²) of the centres of mass."""
+        return self.analyse("msd", **options)
+
+    def diffusion(self, **options: Any) -> "Finding":
+        """Diffusion coefficients (1e-9 m²/s); `viscosity_mPa_s` serves the correction for the size of the box."""
+        return self.analyse("diffusion", **options)
+
+    def orientation(self, **options: Any) -> "Finding":
+        """C1 and C2 about each body axis, their times (ps), and rotational diffusion (1/ps)."""
+        return self.analyse("orientation", **options)
+
+    def spectrum(self, **options: Any) -> "Finding":
+        """Densities of states (cm) of translation and rotation, and correlations of V, omega and L."""
+        return self.analyse("spectrum", **options)
+
+    def dielectric(self, **options: Any) -> "Finding":
+        """The static dielectric constant, with the boundary condition of the scene."""
+        return self.analyse("dielectric", **options)
+
+    def viscosity(self, **options: Any) -> "Finding":
+        """Shear viscosity (mPa s) from the pressure tensor (output.pressure_tensor_interval_ps)."""
+        return self.analyse("viscosity", **options)
+
     @property
     def rotation(self) -> np.ndarray:
         """The rotation matrices Q, body to lab, at the frames of `universe()` (frames, n, 3, 3).
 
-        Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. Raises
-        ValueError if nothing turns, and for molecules whose run wrote files other than .gsd, which hold positions only.
+        Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. A
+        trajectory.gsd keeps Q; from other files it is rebuilt from the positions of sites, as exactly as these are
+        written, with an arbitrary turn of linear molecules about their axes. Raises ValueError if nothing turns.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]
@@ -137,9 +196,10 @@ class Results:
         if self.files:
             path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
             if path.suffix != ".gsd":
-                raise ValueError(
-                    f"{path.name} holds positions, not rotations: write a trajectory.gsd, or run without a folder"
-                )
+                from rigidmd.analyse.history import Rebuilt
+
+                fit = Rebuilt(cast("System", self.system))
+                return np.array([fit.bodies(frame.positions, None).Q for frame in self.universe().trajectory])
             from rigidmd.output.trajectory import read_rotations
 
             return read_rotations(path)

@@ -40,6 +40,9 @@ class Output(Section):
     """Time between lines of log.csv"""
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
+    pressure_tensor_interval_ps: Interval | Literal[False] = False
+    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line takes an
+    evaluation of forces with the virial"""
     trajectory: str | Literal[False] = "trajectory.xtc"
     """Trajectory file; the ending sets the format (.xtc .trr .gsd .dcd .nc .xyz .pdb); .gsd keeps
     rotations and angular momenta; false for none"""

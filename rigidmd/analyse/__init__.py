@@ -1,0 +1,1 @@
+"""Analyses of runs of molecules: values with errors, curves, figures."""

@@ -1,0 +1,90 @@
+"""The command `analyse`. It prints and never computes."""
+
+import argparse
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+
+def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add it with `add(name, function, about, example)`."""
+    analyse = add(
+        "analyse",
+        _analyse,
+        "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each with its error",
+        "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
+    )
+    analyse.add_argument("folder", metavar="RUN", help="folder of a run")
+    analyse.add_argument(
+        "--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
+        metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them",
+    )  # fmt: skip
+    analyse.add_argument(
+        "--from", dest="start", type=time_ps, metavar="TIME",
+        help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)",
+    )  # fmt: skip
+    analyse.add_argument(
+        "--viscosity", type=_positive, metavar="MPA_S",
+        help="viscosity in mPa s for the correction of D for the size of the box (default: that of the run)",
+    )  # fmt: skip
+    analyse.add_argument(
+        "--trust", action="append", default=[], metavar="FILE.py",
+        help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated",
+    )  # fmt: skip
+    analyse.add_argument("--list", action=_List, nargs=0, help="list the analyses")
+    analyse.set_defaults(scene="this run", writes=True)
+
+
+def time_ps(text: str) -> float:
+    """Picoseconds in a time such as 200ps."""
+    found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
+    return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e12:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a viscosity above 0")
+    return value
+
+
+class _List(argparse.Action):
+    def __call__(self, parser, *_):
+        from rigidmd.analyse.registry import chosen
+
+        for entry in chosen([]):
+            print(f"{entry.name:18} {entry.about}")
+        parser.exit()
+
+
+def _analyse(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from rigidmd.analyse.all import Task, analyse_folder
+    from rigidmd.analyse.registry import trusted
+
+    for path in options.trust:
+        trusted(Path(path))
+    with tqdm(total=1.0, disable=None, leave=False, bar_format="{desc} {l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
+
+        def step(share: float, name: str) -> None:
+            bar.set_description_str(name, refresh=False)
+            bar.update(share - bar.n)
+
+        task = Task(options.only, options.start, options.viscosity)
+        done = analyse_folder(Path(options.folder), task, step)
+    history = done.history
+    print(f"{options.folder}: {len(history)} frames from {history.time[0]:g} to {history.time[-1]:g} ps")
+    for note in history.notes:
+        print(f"  {note}")
+    for finding in done.findings:
+        print(finding)
+    for name, why in done.failed.items():
+        print(f"{name}: left out: {why}")
+    print(f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd report` shows them")
+    return 0

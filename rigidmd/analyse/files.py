@@ -1,0 +1,173 @@
+"""Files of analyses in the folder of a run: analysis.json, a CSV file and a figure for each curve; and reading them."""
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidmd.analyse.findings import Curve, Finding, Value
+from rigidmd.analyse.history import History
+from rigidmd.analyse.registry import place
+from rigidmd.core.files import whole_file
+from rigidmd.errors import OutputError
+from rigidmd.output.figure import COLORS, FAINT, INK, few_decades, save_figure, thin_series
+from rigidmd.output.folder import add_to_folder
+
+ANALYSIS = "analysis.json"
+#: Inches of a figure, and curves that one holds.
+WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10
+#: Headers of columns that are kept in the file and not drawn.
+UNDRAWN = re.compile(r"n .+-.+")
+
+
+def write_findings(folder: Path, history: History, findings: list[Finding], failed: dict[str, str]) -> list[Path]:
+    """Write what was found; entries of other analyses that the folder holds stay. Returns the files.
+
+    failed : analysis -> the sentence that tells why it found nothing. Raises OutputError.
+    """
+    own = [f"{curve.file}{ending}" for finding in findings for curve in finding.curves for ending in (".csv", ".png")]
+    known = read_table(folder)
+    earlier = {name for entry in known.get("analyses", {}).values() for name in entry.get("files", ())}
+    taken = [name for name in own if (folder / name).exists() and name not in earlier]
+    if taken:
+        raise OutputError(f"{folder / taken[0]} is there and no file of an analysis; name the analysis otherwise")
+    add_to_folder(folder, [ANALYSIS, *own])
+    written = []
+    entries = dict(known.get("analyses", {}))
+    stretch = {
+        "stage": history.stage.label,
+        "from_ps": float(history.time[0]),
+        "to_ps": float(history.time[-1]),
+        "frames": len(history),
+        "notes": history.notes,
+    }
+    for finding in findings:
+        files = []
+        for curve in finding.curves:
+            path, picture = folder / f"{curve.file}.csv", folder / f"{curve.file}.png"
+            with whole_file(path) as temporary:
+                temporary.write_text(_text(curve), encoding="utf-8")
+            with whole_file(picture) as temporary:
+                save_figure(drawn(curve), temporary, dpi=150)
+            written += [path, picture]
+            files += [path.name, picture.name]
+        entries[finding.name] = {
+            "about": finding.about,
+            "values": [value._asdict() for value in finding.values],
+            "notes": finding.notes,
+            "curves": [_described(curve) for curve in finding.curves],
+            "files": files,
+            "stretch": stretch,
+        }
+    for name, why in failed.items():
+        entries[name] = {"about": name, "values": [], "notes": [why], "curves": [], "files": [], "stretch": stretch}
+    entries = dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
+    with whole_file(folder / ANALYSIS) as temporary:
+        temporary.write_text(json.dumps({"analyses": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return [folder / ANALYSIS, *written]
+
+
+def _described(curve: Curve) -> dict[str, Any]:
+    return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level}
+
+
+def _text(curve: Curve) -> str:
+    """The curve as CSV: the axis, each column, and after it its error where it has one."""
+    columns = {curve.axis[0]: curve.axis[1]}
+    for header, values in curve.columns.items():
+        columns[header] = values
+        if header in curve.errors:
+            columns[f"{header} error"] = curve.errors[header]
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(
+        [float(f"{x:.9g}") if np.isfinite(x) else None for x in row] for row in zip(*columns.values(), strict=True)
+    )
+    return stream.getvalue()
+
+
+def read_table(folder: Path) -> dict[str, Any]:
+    """analysis.json as it is; empty without one. Raises OutputError."""
+    path = folder / ANALYSIS
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from None
+    if not isinstance(found, dict) or not isinstance(found.get("analyses"), dict):
+        raise OutputError(f"{path} is no list of analyses")
+    return found
+
+
+def read_findings(folder: Path) -> list[tuple[Finding, str]]:
+    """What analyses found in the folder of a run, each with its stretch in words. Raises OutputError."""
+    found = []
+    try:
+        for name, entry in read_table(folder).get("analyses", {}).items():
+            curves = [_read_curve(folder, told) for told in entry["curves"]]
+            values = [Value(**value) for value in entry["values"]]
+            stretch = entry["stretch"]
+            words = f"{stretch['frames']} frames from {stretch['from_ps']:g} to {stretch['to_ps']:g} ps"
+            found.append((Finding(name, str(entry["about"]), values, curves, list(entry["notes"])), words))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise OutputError(f"{folder / ANALYSIS} is no list of analyses: {error}") from None
+    return found
+
+
+def _read_curve(folder: Path, told: dict[str, Any]) -> Curve:
+    path = folder / f"{Path(str(told['file'])).name}.csv"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            head, *lines = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from None
+    table = {title: np.array([float(line[k] or "nan") for line in lines]) for k, title in enumerate(head)}
+    axis = head[0]
+    errors = {title.removesuffix(" error"): table[title] for title in head if title.endswith(" error")}
+    columns = {title: table[title] for title in head[1:] if not title.endswith(" error")}
+    log = (bool(told["log"][0]), bool(told["log"][1]))
+    return Curve(str(told["file"]), (axis, table[axis]), str(told["label"]), columns, errors, log, told["level"])
+
+
+def drawn(curve: Curve):
+    """The figure of a curve: each column with a band of one standard error."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    axis = figure.subplots()
+    header, x = curve.axis
+    shown = [title for title in curve.columns if not UNDRAWN.fullmatch(title)][:MOST_CURVES]
+    seen = x > 0 if curve.log[0] else np.ones(len(x), bool)
+    if curve.level is not None:
+        axis.axhline(curve.level, color=FAINT, lw=0.7)
+    bars = np.issubdtype(x.dtype, np.integer) or (len(x) < 12 and bool((x == np.round(x)).all()))
+    for color, title in zip(COLORS, shown, strict=False):
+        values = curve.columns[title]
+        if bars:
+            axis.bar(x, values, color=color, width=0.7)
+            continue
+        axis.plot(*thin_series(x[seen], values[seen]), color=color, lw=1.0, label=title)
+        error = curve.errors.get(title)
+        if error is not None and np.isfinite(error).all():
+            axis.fill_between(x[seen], (values - error)[seen], (values + error)[seen], color=color, alpha=0.25, lw=0)
+    for line, is_log, name in ((axis.xaxis, curve.log[0], "x"), (axis.yaxis, curve.log[1], "y")):
+        if is_log:
+            getattr(axis, f"set_{name}scale")("log")
+            few_decades(line)
+    axis.set_xlabel(header.replace("(A)", "(Å)").replace("1/A", "1/Å"), fontsize=9, color=INK)
+    axis.set_ylabel(curve.label, fontsize=9, color=INK)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8, colors=INK)
+    axis.spines[:].set_color(INK)
+    if len(shown) > 1 and not bars:
+        figure.legend(
+            *axis.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=7,
+            handlelength=1.4, labelcolor=INK,
+        )  # fmt: skip
+    return figure

@@ -1,0 +1,335 @@
+"""What the molecules of a run did: their frames as rigid bodies, rebuilt from the positions and velocities of sites."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.system import System
+from rigidmd.errors import OutputError
+from rigidmd.molecules import Molecule
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BOLTZMANN
+
+#: Two intervals between frames that differ by less than this fraction are equal.
+EVEN = 1e-3
+#: Singular values of a template below this fraction of the largest are zero: it is flat or a line.
+FLAT = 1e-6
+#: Å, and fraction of a molecule's radius, by which a site may lie off the rigid molecule: files are rounded to 0.01 Å.
+OFF, OFF_RELATIVE = 0.03, 0.03
+#: Largest fraction of the box that a wrapped molecule may move between two frames to be followed.
+FAR = 0.4
+
+
+class Kind(NamedTuple):
+    """The molecules of one species: indices (k,) of molecules, and those of their sites (k, s)."""
+
+    molecule: Molecule
+    index: np.ndarray
+    sites: np.ndarray
+    moves: bool
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.molecule.name
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """Frames of a stretch of a run, for analyses. Molecules are whole and their paths continuous.
+
+    f frames, n molecules; Å, ps, u:
+    time (f,), cell (f, 3, 3) rows a, b, c, infinite edges without a box
+    positions (f, n, 3) centres of mass, lab frame; Q (f, n, 3, 3) body to lab, principal axes
+    velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where no frame has them
+    columns : samples of the same stretch by their names in `results[...]`
+    interval : time between frames, ps; None if they are not evenly spaced
+    notes : what was mended
+    """
+
+    system: System
+    stage: Stage
+    time: np.ndarray
+    cell: np.ndarray
+    positions: np.ndarray
+    Q: np.ndarray
+    velocities: np.ndarray | None
+    L: np.ndarray | None
+    columns: dict[str, np.ndarray]
+    tensor: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def span(self) -> float:
+        """Time from the first frame to the last, ps."""
+        return float(self.time[-1] - self.time[0])
+
+    @cached_property
+    def interval(self) -> float | None:
+        """Time between frames, ps; None if they are not evenly spaced."""
+        gaps = np.diff(self.time)
+        rounding = 2 * float(np.spacing(np.float32(np.abs(self.time).max())))  # files hold times in single precision
+        if len(gaps) == 0 or gaps.min() <= 0 or np.ptp(gaps) > EVEN * gaps.max() + rounding:
+            return None
+        return self.span / len(gaps)
+
+    @property
+    def has_box(self) -> bool:
+        """Whether there is a box."""
+        return bool(np.isfinite(self.cell[0, 0, 0]))
+
+    @property
+    def volume(self) -> np.ndarray:
+        """Volume of the cell in each frame (f,), Å³."""
+        return np.linalg.det(self.cell)
+
+    @cached_property
+    def temperature(self) -> float:
+        """Mean temperature of the samples, K."""
+        return float(np.mean(self.columns["temperature"]))
+
+    @property
+    def thermal_energy(self) -> float:
+        """kB T, u Å²/ps²."""
+        return BOLTZMANN * self.temperature
+
+    @cached_property
+    def kinds(self) -> list[Kind]:
+        """The species, frozen ones apart, that have molecules."""
+        return kinds_of(self.system)
+
+    @property
+    def moving(self) -> list[Kind]:
+        """Those that move."""
+        return [kind for kind in self.kinds if kind.moves]
+
+    @cached_property
+    def paths(self) -> np.ndarray:
+        """Paths of centres (f, n, 3), Å, without what a barostat scaled: sums of displacements as fractions of the
+        cell, each times the cell at its end."""
+        if not self.has_box or np.ptp(self.cell, axis=0).max() == 0.0:
+            return self.positions
+        inside = np.einsum("fni,fij->fnj", self.positions, np.linalg.inv(self.cell))
+        moves = np.einsum("fni,fij->fnj", np.diff(inside, axis=0), self.cell[1:])
+        return np.concatenate([self.positions[:1], self.positions[0] + np.cumsum(moves, axis=0)])
+
+    def sites(self, name: str, frames: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (f, k, 3) of what is called `name`, and the molecules (k,) that they belong to.
+
+        name : a site's name (HW1, or HW for HW1 and HW2) or element, or a species for its centres of mass. Raises
+        OutputError.
+        """
+        at, molecules = [], []
+        for kind in self.kinds:
+            chosen = np.array(chosen_sites(kind.molecule, name), int)
+            centre = self.positions[frames][:, kind.index]
+            if kind.name == name:
+                at.append(centre)
+                molecules.append(kind.index)
+            elif len(chosen):
+                offset = kind.molecule.positions_body[chosen]
+                arms = np.zeros((1, 1, 1, 3))
+                if self.Q.shape[1]:
+                    arms = np.einsum("fnij,sj->fnsi", self.Q[frames][:, kind.index], offset)
+                at.append((centre[:, :, None] + arms).reshape(len(centre), -1, 3))
+                molecules.append(np.repeat(kind.index, len(chosen)))
+        if not at:
+            from rigidmd.validation import meant
+
+            known = names_of(self.system)
+            raise OutputError(f"there is no site {name!r}{meant(name, known) or ';'} there are {', '.join(known)}")
+        return np.concatenate(at, axis=1), np.concatenate(molecules)
+
+    def part(self, first: int, end: int) -> "History":
+        """Some of its frames, as a history. The samples stay those of the whole."""
+        span = slice(first, end)
+        return replace(
+            self,
+            time=self.time[span],
+            cell=self.cell[span],
+            positions=self.positions[span],
+            Q=self.Q[span],
+            velocities=None if self.velocities is None else self.velocities[span],
+            L=None if self.L is None else self.L[span],
+        )
+
+    def thinned(self, most: int) -> "History":
+        """At most so many of its frames, evenly spaced."""
+        stride = max(1, -(-len(self) // most))
+        chosen = np.arange(0, len(self), stride)
+        return replace(
+            self,
+            time=self.time[chosen],
+            cell=self.cell[chosen],
+            positions=self.positions[chosen],
+            Q=self.Q[chosen],
+            velocities=None if self.velocities is None else self.velocities[chosen],
+            L=None if self.L is None else self.L[chosen],
+        )
+
+
+def chosen_sites(molecule: Molecule, name: str) -> list[int]:
+    """Sites of a molecule with this name, or else with it but for a number at the end, or else of this element."""
+    found = [k for k, own in enumerate(molecule.site_names) if own == name]
+    found = found or [k for k, own in enumerate(molecule.site_names) if own.rstrip("0123456789") == name]
+    return found or [k for k, own in enumerate(molecule.elements) if own == name and name != "X"]
+
+
+def names_of(system: System) -> list[str]:
+    """What `History.sites` knows: names of sites, then species."""
+    known = dict.fromkeys(name for m in system.species for name in m.site_names)
+    return list(known | dict.fromkeys(m.name for m in system.species))
+
+
+def kinds_of(system: System) -> list[Kind]:
+    """The species of a system that have molecules, frozen ones apart."""
+    first = np.flatnonzero(np.diff(system.sites.molecule, prepend=-1))
+    found = []
+    for k, molecule in enumerate(system.species):
+        index = np.flatnonzero(system.model.species == k)
+        if len(index):
+            sites = first[index][:, None] + np.arange(len(molecule.masses))
+            found.append(Kind(molecule, index, sites, bool(system.model.inverse_mass[k] > 0)))
+    return found
+
+
+class Bodies(NamedTuple):
+    """Rigid bodies of a frame: centres (n, 3), Q (n, 3, 3); velocities and L (n, 3) or None."""
+
+    position: np.ndarray
+    Q: np.ndarray
+    velocity: np.ndarray | None
+    L: np.ndarray | None
+
+
+class Rebuilt:
+    """Rebuilds rigid bodies from sites: fits of rigid templates, whose axes are those of `rigidmd models NAME`."""
+
+    def __init__(self, system: System):
+        self._kinds = kinds_of(system)
+        self._templates = [_template(kind.molecule) for kind in self._kinds]
+        self._n = len(system.model.species)
+        self._turning = len(system.state.rotation) > 0
+
+    def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
+        """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole.
+
+        Q of a linear molecule has an arbitrary turn about its axis.
+        """
+        centre = np.empty((self._n, 3))
+        Q = np.tile(np.eye(3), (self._n if self._turning else 0, 1, 1))
+        velocity = None if velocities is None else np.empty((self._n, 3))
+        L = None if velocities is None else np.zeros((len(Q), 3))
+        for kind, fit in zip(self._kinds, self._templates, strict=True):
+            at, own = sites[kind.sites].astype(float), kind.index
+            middle = at.mean(axis=1)
+            turn = fit.turned(at - middle[:, None])
+            centre[own] = middle - turn @ fit.middle
+            arms = np.einsum("nij,sj->nsi", turn, kind.molecule.positions_body)
+            off = np.abs(at - centre[own][:, None] - arms).max(axis=(1, 2), initial=0.0)
+            if (worst := float(off.max(initial=0.0))) > OFF + OFF_RELATIVE * kind.molecule.radius:
+                raise OutputError(
+                    f"a site of molecule {own[off.argmax()] + 1} is {worst:.2g} Å away from where its rigid "
+                    f"{kind.name} has it: the molecules of a trajectory must be whole, and those of this run"
+                )
+            if self._turning:
+                Q[own] = turn
+            if velocity is not None and L is not None and velocities is not None:
+                v, mass = velocities[kind.sites].astype(float), kind.molecule.masses
+                mean = np.einsum("s,nsi->ni", mass, v) / kind.molecule.mass
+                velocity[own] = mean
+                if self._turning:
+                    lab = np.einsum("s,nsi->ni", mass, np.cross(arms, v - mean[:, None]))
+                    L[own] = np.einsum("nij,ni->nj", turn, lab)
+        return Bodies(centre, Q, velocity, L)
+
+
+class _Template(NamedTuple):
+    """middle (3,) of the sites in the body's frame; their directions: sites (s, r) times `columns` (r, 3) of the body's
+    frame, r the number of dimensions in which they extend."""
+
+    middle: np.ndarray
+    weights: np.ndarray
+    columns: np.ndarray
+
+    def turned(self, arms: np.ndarray) -> np.ndarray:
+        """Rotations (n, 3, 3) that bring the template to sites (n, s, 3) about their middle."""
+        seen = np.einsum("nsi,sr->nri", arms, self.weights)
+        axes = np.empty((len(arms), 3, 3))  # rows: where the first, second and third of the template's own axes lie
+        rank = len(self.columns)
+        axes[:, 0] = seen[:, 0] if rank else [1.0, 0.0, 0.0]
+        axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1)[:, None]
+        beside = seen[:, 1] if rank > 1 else np.eye(3)[np.abs(axes[:, 0]).argmin(axis=1)]
+        axes[:, 1] = beside - np.einsum("ni,ni->n", beside, axes[:, 0])[:, None] * axes[:, 0]
+        axes[:, 1] /= np.linalg.norm(axes[:, 1], axis=1)[:, None]
+        axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+        return np.einsum("nri,rj->nij", axes, _right_handed(self.columns))
+
+
+def _template(molecule: Molecule) -> _Template:
+    body = molecule.positions_body
+    middle = body.mean(axis=0)
+    left, sizes, columns = np.linalg.svd(body - middle, full_matrices=False)
+    rank = int((sizes > FLAT * max(sizes[0], np.abs(body).max())).sum()) if sizes[0] > 0 else 0
+    return _Template(middle, left[:, :rank] / sizes[:rank], columns[:rank])
+
+
+def _right_handed(rows: np.ndarray) -> np.ndarray:
+    """Orthonormal rows (r, 3), r <= 3, completed to a rotation (3, 3) that keeps the first two."""
+    found = np.eye(3)
+    if len(rows):
+        found[0] = rows[0]
+        beside = rows[1] if len(rows) > 1 else np.eye(3)[np.abs(rows[0]).argmin()]
+        beside = beside - beside @ rows[0] * rows[0]
+        found[1] = beside / np.linalg.norm(beside)
+        found[2] = np.cross(found[0], found[1])
+    return found
+
+
+def rebuilt(
+    system: System,
+    sites: np.ndarray,
+    velocities: np.ndarray | None,
+    cells: np.ndarray,
+    wrapped: bool,
+    step: Callable[[int], object] = lambda frames: None,
+) -> tuple[Bodies, list[str]]:
+    """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
+
+    sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
+    wrapped : whether centres were put into the box; their paths are made continuous
+    step : called with 1 after each frame
+    """
+    fit, n, f = Rebuilt(system), len(system.model.species), len(sites)
+    turning = n if len(system.state.rotation) else 0
+    position, Q = np.empty((f, n, 3)), np.empty((f, turning, 3, 3))
+    velocity, L = (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, turning, 3)))
+    for k, frame in enumerate(sites):
+        try:
+            found = fit.bodies(frame, None if velocities is None else velocities[k])
+        except OutputError as error:
+            raise OutputError(f"frame {k + 1}: {error}") from None
+        for array, values in zip((position, Q, velocity, L), found, strict=True):
+            if array is not None:
+                array[k] = values
+        step(1)
+    notes = []
+    if wrapped and np.isfinite(cells[0, 0, 0]) and f > 1:
+        inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))
+        moves = np.diff(inside, axis=0)
+        moves -= np.round(moves)
+        if (far := float(np.abs(moves).max())) > FAR:
+            raise OutputError(
+                f"molecules move by {far:.2f} of the box between two frames, and the frames hold them wrapped: their "
+                "paths cannot be told. Write output.positions = 'unwrapped', or frames more often"
+            )
+        inside[1:] = inside[0] + np.cumsum(moves, axis=0)
+        position = np.einsum("fni,fij->fnj", inside, cells)
+        notes.append("frames hold wrapped molecules; their paths were made continuous")
+    return Bodies(position, Q, velocity, L), notes

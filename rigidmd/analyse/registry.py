@@ -1,0 +1,126 @@
+"""The analyses by name: those that come with the package, and those of users."""
+
+import runpy
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.analyse.findings import Curve, Finding, Value, settled
+from rigidmd.analyse.history import History
+from rigidmd.core.files import file_fault
+from rigidmd.errors import OutputError
+from rigidmd.measure.drift import inefficiency
+from rigidmd.measure.summary import mean
+from rigidmd.validation import meant
+
+
+class Analysis(NamedTuple):
+    """A function of a history under its name."""
+
+    name: str
+    about: str
+    function: Callable[..., Finding]
+    own: bool
+
+
+KNOWN: dict[str, Analysis] = {}
+ORDER = (
+    "rdf", "structure_factor", "density_profile", "hydrogen_bonds", "msd", "diffusion", "orientation", "spectrum",
+    "dielectric", "viscosity",
+)  # fmt: skip
+
+
+def built_in(about: str) -> Callable[[Callable[..., Finding]], Callable[..., Finding]]:
+    """Register an analysis that comes with the package under the name of its function."""
+
+    def add(function: Callable[..., Finding]) -> Callable[..., Finding]:
+        name = function.__name__
+        KNOWN[name] = Analysis(name, about, function, False)
+        return function
+
+    return add
+
+
+def analysis(function: Callable[[History], Any]) -> Callable[[History], Any]:
+    """Register an analysis of one's own under the name of its function; `rigidmd analyse --only NAME` finds it.
+
+    @rigidmd.analysis
+    def height(frames):
+        "mean height of the centres (Å)"
+        return frames.positions[:, :, 2].mean(axis=1)
+
+    The function gets the frames (`rigidmd.analyse.history.History`: time, positions, Q, L, velocities, cell, ...) and
+    returns one number for each frame (f,), or a dictionary of such arrays; means, errors, a CSV file and a figure are
+    made of them. Its first line of documentation is the title. Raises OutputError for a name that is taken.
+    """
+    name = getattr(function, "__name__", "")
+    if name in KNOWN and not KNOWN[name].own:
+        raise OutputError(f"{name} is an analysis that comes with rigidmd; name your function otherwise")
+    about = ((function.__doc__ or "").strip().splitlines() or [name])[0]
+    KNOWN[name] = Analysis(name, about, lambda history: _of_own(name, about, function, history), True)
+    return function
+
+
+def chosen(names: list[str]) -> list[Analysis]:
+    """The analyses of these names, or all. Raises OutputError."""
+    from rigidmd.analyse import electric, flow, motion, structure, turning  # noqa: F401  (they register themselves)
+
+    for name in names:
+        if name not in KNOWN:
+            raise OutputError(f"there is no analysis {name!r}{meant(name, KNOWN) or ';'} there are {', '.join(KNOWN)}")
+    return [KNOWN[name] for name in names] if names else sorted(KNOWN.values(), key=lambda entry: place(entry.name))
+
+
+def place(name: str) -> int:
+    """The place of an analysis among all: those of users at the end."""
+    return ORDER.index(name) if name in ORDER else len(ORDER)
+
+
+def trusted(path: Path) -> None:
+    """Run a Python file that defines analyses: it is code, and the user said that it may run. Raises OutputError."""
+    if fault := file_fault(path):
+        raise OutputError(f"{path}: {fault}")
+    before = set(KNOWN)
+    try:
+        runpy.run_path(str(path))
+    except OutputError:
+        raise
+    except Exception as error:  # whatever a stranger's file raises
+        raise OutputError(f"{path} raised {type(error).__name__}: {error}") from error
+    if not set(KNOWN) - before and not any(entry.own for entry in KNOWN.values()):
+        raise OutputError(f"{path} defines no analysis: put @rigidmd.analysis before a function of frames")
+
+
+def _of_own(name: str, about: str, function: Callable[[History], Any], history: History) -> Finding:
+    """Means and errors of what a function of users gives."""
+    try:
+        found = function(history)
+    except Exception as error:  # whatever a stranger's function raises
+        raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
+    series = dict(found) if isinstance(found, Mapping) else {name: found}
+    values, columns = [], {}
+    for title, given in series.items():
+        try:
+            array = np.asarray(given, float)
+        except (TypeError, ValueError):
+            array = np.array([])
+        if array.shape != (len(history),):
+            raise OutputError(
+                f"the analysis {name} must give one number for each of the {len(history)} frames, or a dictionary of "
+                f"such arrays; {title!r} has the shape {np.shape(given)}"
+            )
+        if not np.isfinite(array).all():
+            raise OutputError(
+                f"the analysis {name}: {title!r} is no finite number at frame {np.isfinite(array).argmin() + 1}"
+            )
+        columns[str(title)] = array
+        value, error = mean(array)
+        gap = history.span / (len(history) - 1)
+        if np.ptp(array) == 0 or value is None or error is None:
+            values.append(Value(str(title), "", float(array[0]), 0.0))
+        else:
+            tau = 0.5 * gap * inefficiency(array - array.mean())
+            values.append(settled(str(title), "", value, error, history.span, tau))
+    return Finding(name, about, values, [Curve(name, ("Time (ps)", history.time), about, columns)])

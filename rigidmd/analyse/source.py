@@ -1,0 +1,168 @@
+"""Where histories come from: the folder of a run, or results in memory; and where production begins."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidmd.analyse.history import History, rebuilt
+from rigidmd.assemble.system import System
+from rigidmd.core.state import NO_CELL
+from rigidmd.errors import OutputError
+from rigidmd.output.pressure import TENSOR_FILE, read_tensor
+from rigidmd.output.record import Record
+from rigidmd.output.trajectory import read_frames
+
+if TYPE_CHECKING:
+    from rigidmd.run.results import Results
+
+#: Numbers of 8 bytes that frames may take in memory; a trajectory that needs more is thinned out.
+MOST_NUMBERS = 150_000_000
+#: Samples of a stage without which its equilibration is not looked for.
+FEW = 40
+
+
+def of_folder(record: Record, start: float | None = None, step: Callable[[int], object] = lambda n: None) -> History:
+    """The history of a run of molecules from its folder, from `start` (ps) on or where production begins.
+
+    step : called with a number of frames that are done. Raises OutputError.
+    """
+    if record.is_body:
+        raise OutputError(
+            f"{record.folder} is the run of a single body, and analyses are of molecules; `rigidmd report` shows it"
+        )
+    system, output = record.molecules, record.scene.output
+    if not output.trajectory:
+        raise OutputError(f"{record.folder}: this run wrote no trajectory (output.trajectory = false) to analyse")
+    path = record.folder / output.trajectory
+    if not path.is_file():
+        raise OutputError(f"{record.folder}: its trajectory {output.trajectory} is not there")
+    sites = len(system.sites.molecule)
+    most = max(2, MOST_NUMBERS // (3 * sites + 18 * len(system.model.species)))
+    frames = read_frames(path, sites, most)
+    tensor = read_tensor(record.folder / TENSOR_FILE)
+    notes = list(record.missing)
+    if frames.stride > 1:
+        notes.append(f"every {frames.stride}th frame is used: {frames.count} are more than memory should hold")
+    if frames.is_cut:
+        notes.append(f"{path.name} ends within a frame, which is left out")
+    cells = np.tile(NO_CELL, (len(frames.time), 1, 1)) if frames.cells is None else frames.cells
+    raw = _Raw(frames.time, frames.positions, frames.velocities, cells, output.positions == "wrapped")
+    try:
+        return _history(system, record.columns, raw, tensor, start, notes, step)
+    except OutputError as error:
+        raise OutputError(f"{path}: {error}") from None
+
+
+def of_results(results: "Results", start: float | None = None) -> History:
+    """The history of a run of molecules in this process. Raises OutputError."""
+    from rigidmd.output.record import read_record
+
+    system = results.system
+    if not isinstance(system, System):
+        raise OutputError("this is the run of a single body, and analyses are of molecules")
+    if results.files:
+        return of_folder(read_record(results.files[0].parent), start)
+    frames = results._frames
+    if not frames:
+        raise OutputError("this run kept no frames (output.trajectory = false) to analyse")
+    raw = _Raw(
+        np.array([frame.time for frame in frames]),
+        np.array([frame.positions for frame in frames]),
+        np.array([frame.velocities for frame in frames]),
+        np.array([frame.cell for frame in frames]),
+        system.scene.output.positions == "wrapped",
+    )
+    columns = {name: results[name] for name in results.units}
+    return _history(system, columns, raw, results._tensor, start, [], lambda n: None)
+
+
+class _Raw:
+    """Frames as they were written."""
+
+    def __init__(self, time, sites, velocities, cells, wrapped: bool):
+        self.time, self.sites, self.velocities, self.cells, self.wrapped = time, sites, velocities, cells, wrapped
+
+
+def _history(
+    system: System,
+    columns: dict[str, np.ndarray],
+    raw: _Raw,
+    tensor: np.ndarray | None,
+    start: float | None,
+    notes: list[str],
+    step: Callable[[int], object],
+) -> History:
+    stage, first, last = _last_stage(system, columns)
+    if start is None:
+        own = (columns["time"] >= first) & (columns["time"] <= last)
+        begin = production(columns, own, stage.changes_box)
+        notes = [*notes, f"production begins at {begin:g} ps, as detected in the stage from {first:g} to {last:g} ps"]
+    else:
+        begin = start
+        if begin < first:
+            notes = [*notes, f"frames before {first:g} ps are of an earlier stage"]
+    slack = 1e-6 * max(abs(last), 1.0)
+    keep = np.flatnonzero((raw.time >= begin - slack) & (raw.time <= last + slack))
+    keep = keep[np.diff(raw.time[keep], prepend=-np.inf) > 0]  # not the start of a stage after the end of another
+    if len(keep) < 2:
+        raise OutputError(
+            f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of {len(raw.time)} "
+            "frames; an analysis needs two at least: run longer, or write them more often (trajectory_interval_ps)"
+        )
+    velocities = None if raw.velocities is None else raw.velocities[keep]
+    bodies, mended = rebuilt(system, raw.sites[keep], velocities, raw.cells[keep], raw.wrapped, step)
+    if not all(np.isfinite(array).all() for array in bodies if array is not None):
+        raise OutputError("a frame holds what is no finite number")
+    samples = (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
+    if tensor is not None:
+        tensor = tensor[(tensor[:, 0] >= begin - slack) & (tensor[:, 0] <= last + slack)]
+    return History(
+        system=system,
+        stage=stage,
+        time=raw.time[keep],
+        cell=raw.cells[keep],
+        positions=bodies.position,
+        Q=bodies.Q,
+        velocities=bodies.velocity,
+        L=bodies.L,
+        columns={name: values[samples] for name, values in columns.items()},
+        tensor=tensor,
+        notes=[*notes, *mended],
+    )
+
+
+def _last_stage(system: System, columns: dict[str, np.ndarray]):
+    """The last stage in which time passes and of which there are samples, with its begin and end, ps."""
+    names, time = columns["stage_name"], columns["time"]
+    stages = [stage for stage in system.scene.stages if not stage.is_minimisation]
+    if not stages:
+        raise OutputError("this run is a minimisation, in which no time passes: there is nothing to average")
+    for stage in reversed(stages):
+        own = np.flatnonzero(names == stage.label)
+        if len(own):
+            return stage, float(time[max(0, own[0] - 1)]), float(time[own[-1]])
+    raise OutputError("the run has not come to a stage in which time passes")
+
+
+def production(columns: dict[str, np.ndarray], own: np.ndarray, box_moves: bool) -> float:
+    """Time (ps) at which a stage, the samples `own`, is equilibrated.
+
+    By the potential energy, and by the density if the box moves; the later one of the two. See `steady_from`.
+    """
+    time = columns["time"][own]
+    if len(time) < FEW:
+        return float(time[0])
+    begin = 0
+    for name in ("potential", "density") if box_moves else ("potential",):
+        begin = max(begin, steady_from(columns[name][own]))
+    return float(time[begin])
+
+
+def steady_from(values: np.ndarray) -> int:
+    """Index in the first half of a series (n,) from which on its mean has the smallest standard error, were its values
+    independent: the marginal standard error rule (White 1997, Simulation 69, 323)."""
+    left = np.arange(len(values), 0, -1)
+    sums, squares = (np.cumsum(x[::-1])[::-1] for x in (values - values.mean(), (values - values.mean()) ** 2))
+    error = (squares - sums**2 / left) / left.astype(float) ** 2
+    return int(np.argmin(error[: len(values) // 2 + 1]))

@@ -1,0 +1,597 @@
+"""Analyses of frames that are made up: rigid molecules rebuilt, and values that are known beforehand."""
+
+from math import inf
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from rigidmd.analyse.correlation import correlation, squared_displacement
+from rigidmd.analyse.electric import dielectric
+from rigidmd.analyse.findings import settled
+from rigidmd.analyse.flow import viscosity
+from rigidmd.analyse.history import History, kinds_of, rebuilt
+from rigidmd.analyse.motion import MPA_S, NM2_PER_S, diffusion, msd
+from rigidmd.analyse.source import steady_from
+from rigidmd.analyse.structure import density_profile, hydrogen_bonds, rdf, structure_factor
+from rigidmd.analyse.turning import PER_CM, orientation, spectrum
+from rigidmd.assemble.system import build
+from rigidmd.core.state import NO_CELL
+from rigidmd.errors import OutputError
+from rigidmd.forces.pairs.counts import count_pairs, heights
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.units import BAR, BOLTZMANN, COULOMB
+
+MIXTURE = {
+    "argon": 4,
+    "nitrogen": 5,
+    "co2_epm2": 5,
+    "spce": 6,
+    "tip4p2005": 6,
+    "benzene_opls": 4,
+    "ccl4": 4,
+    "tip5p": 3,
+}
+SLANTED = np.array([[21.0, 0.0, 0.0], [6.0, 19.0, 0.0], [-7.0, 5.0, 23.0]])
+
+
+def system_of(counts, edge=40.0, cutoff=5.0, **sections):
+    return build(small_scene(counts, edge, **{"forces": {"cutoff_A": cutoff}} | sections))
+
+
+def history(system, time, positions, cell=None, Q=None, velocities=None, L=None, tensor=None, temperature=300.0):
+    """Frames as they are given; a cell for all of them, or one for each."""
+    f, n = len(time), len(system.model.species)
+    cell = NO_CELL if cell is None else np.asarray(cell)
+    if positions is None:
+        positions = np.zeros((f, n, 3))
+    return History(
+        system, system.scene.stages[-1], np.asarray(time), np.broadcast_to(cell, (f, 3, 3)), positions,
+        np.empty((f, 0, 3, 3)) if Q is None else Q, velocities, L, {"temperature": np.full(f, temperature)}, tensor,
+    )  # fmt: skip
+
+
+def brownian(rng, frames, n, D, interval, drift=0.0):
+    """Paths (f, n, 3) of walkers with a diffusion coefficient D, Å²/ps."""
+    steps = np.sqrt(2 * D * interval) * rng.standard_normal((frames, n, 3)) + drift * interval
+    return np.cumsum(steps, axis=0)
+
+
+def noise_with_memory(rng, frames, shape, variance, time, interval):
+    """Ornstein and Uhlenbeck's process: stationary, with a correlation exp(-t/time)."""
+    keep = np.exp(-interval / time)
+    x = np.sqrt(variance) * rng.standard_normal(shape)
+    found = np.empty((frames, *shape))
+    for k in range(frames):
+        found[k] = x
+        x = keep * x + np.sqrt(variance * (1 - keep**2)) * rng.standard_normal(shape)
+    return found
+
+
+def rotations_about(turns):
+    """Rotation matrices (..., 3, 3) of vectors (..., 3), rad."""
+    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(turns, -1, 0)
+    none = np.zeros_like(x)
+    cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*turns.shape, 3)
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
+
+
+# rebuilding
+
+
+@pytest.fixture(scope="module")
+def mixture():
+    molecules = [{"model": name, "count": count} for name, count in MIXTURE.items()]
+    molecules += [{"model": "spce", "name": "wall", "count": 2, "frozen": True}]
+    return build(small_scene({}, 40.0, molecules=molecules, forces={"cutoff_A": 9.0}))
+
+
+def states(system, frames, seed=0):
+    """Random states of a system, one for each frame."""
+    rng = np.random.default_rng(seed)
+    moves = system.model.inverse_mass[system.model.species] > 0
+    found = []
+    for _ in range(frames):
+        state = system.state.copy()
+        n = len(state.position)
+        state.position[:] += 30.0 * rng.standard_normal((n, 3))
+        state.rotation[:] = random_rotations(rng, n)
+        state.velocity[:] = moves[:, None] * rng.standard_normal((n, 3))
+        freely = system.model.inverse_inertia[system.model.species] > 0
+        state.angular_momentum_body[:] = freely * rng.standard_normal((n, 3))
+        found.append(state)
+    return found
+
+
+def test_rigid_bodies_come_back_from_their_sites(mixture):
+    told = states(mixture, 3)
+    sites = np.array([mixture.site_positions(state) for state in told])
+    velocities = np.array([mixture.site_velocities(state) for state in told])
+    cells = np.array([state.cell for state in told])
+    found, notes = rebuilt(mixture, sites, velocities, cells, wrapped=False)
+    assert notes == []
+    position, Q, V, L = (
+        np.array([getattr(state, name) for state in told])
+        for name in ("position", "rotation", "velocity", "angular_momentum_body")
+    )
+    assert np.abs(found.position - position).max() < 1e-12
+    assert np.abs(found.velocity - V).max() < 1e-12
+    assert np.abs(np.linalg.det(found.Q) - 1).max() < 1e-12
+    kinds = {kind.molecule.kind for kind in kinds_of(mixture)}
+    assert kinds == {"point", "linear", "asymmetric", "symmetric", "spherical"}
+    for kind in kinds_of(mixture):
+        own = found.Q[:, kind.index], Q[:, kind.index]
+        arms = [np.einsum("fnij,sj->fnsi", turn, kind.molecule.positions_body) for turn in own]
+        assert np.abs(arms[0] - arms[1]).max() < 1e-12
+        lab = [
+            np.einsum("fnij,fnj->fni", turn, own_l[:, kind.index])
+            for turn, own_l in zip(own, (found.L, L), strict=True)
+        ]
+        assert np.abs(lab[0] - lab[1]).max() < 1e-10
+        if kind.molecule.kind not in ("point", "linear"):
+            assert np.abs(own[0] - own[1]).max() < 1e-12
+            assert np.abs(found.L[:, kind.index] - L[:, kind.index]).max() < 1e-10
+
+
+def test_wrapped_paths_become_continuous(mixture):
+    rng = np.random.default_rng(3)
+    state = mixture.state.copy()
+    steps = np.cumsum(2.0 * rng.standard_normal((40, len(state.position), 3)), axis=0)
+    state.rotation[:] = random_rotations(rng, len(state.position))
+    moved = []
+    for step in steps:
+        now = state.copy()
+        now.position[:] += step
+        moved.append(now)
+    cells = np.array([now.cell for now in moved])
+    whole, wrapped = (
+        rebuilt(mixture, np.array([mixture.site_positions(now, put) for now in moved]), None, cells, put)
+        for put in (False, True)
+    )
+    assert np.abs(np.diff(whole[0].position, axis=0) - np.diff(wrapped[0].position, axis=0)).max() < 1e-10
+    assert np.ptp(whole[0].position, axis=0).max() > 30.0
+    assert wrapped[1] == ["frames hold wrapped molecules; their paths were made continuous"]
+    assert wrapped[0].velocity is None and wrapped[0].L is None
+    far = np.array([mixture.site_positions(now, True) for now in moved[::12]])
+    with pytest.raises(OutputError, match=r"move by 0\.\d\d of the box between two frames, .* wrapped"):
+        rebuilt(mixture, far, None, cells[:4], True)
+
+
+def test_torn_molecules_are_found(mixture):
+    (state,) = states(mixture, 1)
+    sites = np.array([mixture.site_positions(state)] * 2)
+    torn = int(np.flatnonzero(mixture.sites.molecule == 15)[1])
+    sites[1, torn, 0] += 40.0
+    with pytest.raises(OutputError, match=r"frame 2: a site of molecule 16 is \d+ Å away from where its rigid spce"):
+        rebuilt(mixture, sites, None, np.array([state.cell] * 2), wrapped=False)
+
+
+def test_rounding_of_files_leaves_molecules_whole(mixture):
+    (state,) = states(mixture, 1)
+    rough = np.round(mixture.site_positions(state), 2)
+    found, _ = rebuilt(mixture, rough[None], None, state.cell[None], wrapped=False)
+    assert np.abs(found.position[0] - state.position).max() < 0.01
+
+
+def test_scaling_the_box_moves_nothing():
+    system = system_of({"argon": 8})
+    rng = np.random.default_rng(1)
+    inside, walk = rng.random((8, 3)) + 5.0, brownian(rng, 30, 8, 0.01, 1.0) / 30.0
+    cells = SLANTED * (1 + 0.1 * np.sin(np.arange(30)))[:, None, None]
+    time = np.arange(30.0)
+    scaled = history(system, time, np.einsum("ni,fij->fnj", inside, cells), cells)
+    assert np.abs(scaled.paths - scaled.positions[0]).max() < 1e-11
+    assert msd(scaled)["MSD argon (A^2)"].max() < 1e-20
+    moving = history(system, time, np.einsum("fni,fij->fnj", inside + walk, cells), cells)
+    steps = np.einsum("fni,fij->fnj", np.diff(walk, axis=0), cells[1:])
+    assert np.abs(np.diff(moving.paths, axis=0) - steps).max() < 1e-11
+
+
+def test_times_of_files_are_even_though_rounded():
+    """Single precision at 10 ns cannot tell 4 fs better than to a quarter."""
+    system = system_of({"argon": 2})
+    time = (10_000 + 0.004 * np.arange(50)).astype(np.float32).astype(float)
+    assert history(system, time, None).interval == pytest.approx(0.004, rel=0.01)
+    assert history(system, [0.0, 1.0, 3.0], None).interval is None
+    with pytest.raises(OutputError, match=r"needs frames at equal times; here they are 1 to 2 ps apart"):
+        msd(history(system, [0.0, 1.0, 3.0], None))
+    with pytest.raises(OutputError, match="needs at least 20 frames; there are 19"):
+        msd(history(system, np.arange(19.0), None))
+
+
+# correlation functions
+
+
+def test_correlations_are_those_of_the_definition():
+    rng = np.random.default_rng(0)
+    series = rng.standard_normal((23, 3, 2))
+    direct = [np.mean(series[: 23 - k] * series[k:]) for k in range(11)]
+    assert correlation(series, 11) == pytest.approx(direct, abs=1e-14)
+    path = np.cumsum(rng.standard_normal((23, 4, 3)), axis=0) + 1000.0
+    direct = [np.mean(np.sum((path[k:] - path[: 23 - k]) ** 2, axis=2)) for k in range(11)]
+    assert squared_displacement(path, 11) == pytest.approx(direct, abs=1e-10)
+
+
+# structure
+
+
+def pairs_by_hand(first, owner, second, owner_2, cell, edge, bins):
+    """Distances to the nearest image, from all 27 of them."""
+    images = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]) @ cell
+    fold = np.linalg.inv(cell)
+    first, second = ((at @ fold % 1.0) @ cell for at in (first, second))
+    ways = second[None, :, None] - first[:, None, None] + images
+    gap = np.linalg.norm(ways, axis=-1)
+    seen = gap[owner[:, None] != owner_2[None, :]].ravel()
+    return np.histogram(seen[seen < edge * bins], edge * np.arange(bins + 1))[0]
+
+
+@pytest.mark.parametrize("part", [1.0, 0.7, 0.36, 0.1, 0.03])
+@pytest.mark.parametrize(
+    "cell", [np.eye(3) * 20.0, SLANTED, np.diag([9.0, 31.0, 70.0])], ids=["cube", "slanted", "long"]
+)
+def test_pairs_are_counted_once(cell, part):
+    """Grids of 1 to many cells; sites outside the box and on its faces; ordered pairs of different molecules."""
+    rng = np.random.default_rng(5)
+    at = rng.normal(0.5, 1.5, (80, 3)) @ cell
+    at[:4] = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [-1e-17, 0.3, 1]]) @ cell
+    other, owner, owner_2 = rng.random((30, 3)) @ cell, rng.integers(0, 25, 80), rng.integers(0, 25, 30)
+    bins = 12
+    edge = part * 0.5 * heights(cell).min() / bins
+    for second, second_owner in ((at, owner), (other, owner_2)):
+        counted = count_pairs(at, owner, second, second_owner, cell, edge, bins)
+        assert counted.tolist() == pairs_by_hand(at, owner, second, second_owner, cell, edge, bins).tolist()
+
+
+@pytest.mark.parametrize("n", [2, 3, 8, 60])
+def test_an_ideal_gas_has_no_structure(n):
+    """In a slanted cell that breathes, g = 1 also for two molecules; each has n - 1 others; S = 1."""
+    system = system_of({"argon": n}, 25.0)
+    rng = np.random.default_rng(n)
+    cells = SLANTED * (1 + 0.05 * rng.standard_normal(200))[:, None, None]
+    gas = history(system, np.arange(200.0), np.einsum("fni,fij->fnj", rng.random((200, n, 3)), cells), cells)
+    found = rdf(gas, "Ar", width=0.5)
+    r, g, error = (found[name] for name in ("r (A)", "g Ar-Ar", "g Ar-Ar error"))
+    shells = 4 / 3 * np.pi * ((r + 0.25) ** 3 - (r - 0.25) ** 3)
+    assert np.sum(g * shells) / shells.sum() == pytest.approx(
+        1.0, abs=4 * np.sqrt(2 / 200 / n / (n - 1) / (shells.sum() / 9000))
+    )
+    far = r > 3.0
+    assert np.median(error[far]) > 0
+    spread = (g - 1)[far] / np.maximum(error[far], np.median(error[far]))
+    assert np.abs(spread).max() < 6.0
+    density = (n - 1) / gas.volume.mean()
+    each = g * shells * density
+    assert found["n Ar-Ar"] == pytest.approx(np.cumsum(each) - 0.5 * each, rel=0.01, abs=1e-9)
+    assert found["n Ar-Ar"][-1] == pytest.approx(density * 4 / 3 * np.pi * r[-1] ** 3, rel=0.35 if n < 8 else 0.1)
+    waves = structure_factor(gas, largest=3.0)
+    assert np.mean(waves["S centres"]) == pytest.approx(1.0, abs=0.05)
+    pulls = (waves["S centres"] - 1) / waves["S centres error"]
+    assert np.sqrt(np.mean(pulls**2)) < 2.5
+
+
+def test_two_atoms_at_a_distance_have_one_neighbour():
+    system = system_of({"argon": 2}, 25.0)
+    positions = np.zeros((10, 2, 3))
+    positions[:, 1, 2] = 4.02
+    found = rdf(history(system, np.arange(10.0), positions, np.eye(3) * 25.0), "Ar", width=0.1)
+    assert found["n Ar-Ar"][-1] == pytest.approx(1.0, abs=1e-12)
+    assert np.flatnonzero(found["g Ar-Ar"]).tolist() == [40]
+    waves = structure_factor(history(system, np.arange(10.0), positions, np.eye(3) * 25.0), largest=1.0)
+    assert waves["S centres"].max() <= 2.0
+
+
+def test_the_profile_of_a_density_is_where_the_mass_is():
+    system = system_of({"spce": 4}, 25.0)
+    positions = np.zeros((10, 4, 3))
+    positions[..., 2] = np.array([0.1, 0.1, 0.6, -24.4])
+    Q = np.broadcast_to(np.eye(3), (10, 4, 3, 3))
+    found = density_profile(history(system, np.arange(10.0), positions, np.eye(3) * 25.0, Q), "z", bins=50)
+    rho = found["density spce (g/cm3)"]
+    assert np.flatnonzero(rho).tolist() == [0, 1]
+    assert rho[0] == pytest.approx(rho[1])
+    mass = 4 * system.species[0].mass
+    assert rho.mean() == pytest.approx(mass * 1.66053906660 / 25.0**3)
+    assert found["z (A)"][[0, -1]] == pytest.approx([0.25, 24.75])
+
+
+def test_hydrogen_bonds_are_those_of_the_geometry():
+    """A bond that points at its neighbour through the wall; one that is 25° off, and one that is 35° off."""
+    system = system_of({"spce": 2}, 25.0)
+    body = system.species[0].positions_body
+    arm = body[1] - body[0]
+    arm = arm / np.linalg.norm(arm)
+    for off, gap, expected in ((0.0, 2.8, 1.0), (25.0, 2.8, 1.0), (35.0, 2.8, 0.0), (0.0, 3.6, 0.0)):
+        way = rotations_about(np.array([0.0, 0.0, np.radians(off)])) @ arm
+        positions = np.zeros((4, 2, 3))
+        positions[:, 1] = gap * way + np.array([25.0, -50.0, 0.0])
+        # the second turns its hydrogens away, and its oxygen is where the first one's bond points
+        flip = np.eye(3)
+        Q = np.broadcast_to(np.stack([np.eye(3), flip]), (4, 2, 3, 3))
+        found = hydrogen_bonds(history(system, np.arange(4.0), positions, np.eye(3) * 25.0, Q))
+        assert found.value().value == pytest.approx(expected), off
+
+
+# motion
+
+
+def test_diffusion_is_that_of_a_random_walk_and_its_error_honest():
+    """Scatter over seeds against the error that is told."""
+    system = system_of({"argon": 16}, 25.0)
+    D, found = 0.25, []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        walk = history(system, 4.0 * np.arange(400), brownian(rng, 400, 16, D, 4.0), np.eye(3) * 25.0)
+        told = diffusion(walk, viscosity_mPa_s=0.85).value("D of argon")
+        found += [] if told.value is None else [(told.value, told.error)]
+    assert len(found) >= 55  # few are refused for what is chance
+    values, errors = np.array(found).T
+    assert values.mean() == pytest.approx(D / NM2_PER_S, abs=4 * values.std() / np.sqrt(len(found)))
+    assert 0.6 < values.std() / np.sqrt(np.mean(errors**2)) < 1.6
+    assert np.mean(np.abs(values - D / NM2_PER_S) < 4 * errors) > 0.95
+
+
+def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
+    """2.837297 kT/(6 pi eta L): 298.15 K, 0.896 mPa s and 24.86 Å give 0.279e-9 m²/s."""
+    system = system_of({"argon": 16}, 24.86)
+    rng = np.random.default_rng(0)
+    time, path = 4.0 * np.arange(400), brownian(rng, 400, 16, 0.25, 4.0)
+    found = diffusion(history(system, time, path, np.eye(3) * 24.86, temperature=298.15), viscosity_mPa_s=0.896)
+    own, infinite = found.value("D of argon"), found.value("D of argon in an infinite box")
+    by_hand = 2.837297 * 1.380649e-23 * 298.15 / (6 * np.pi * 0.896e-3 * 24.86e-10) / 1e-9
+    assert infinite.value - own.value == pytest.approx(by_hand, rel=1e-6)
+    assert infinite.error == own.error
+    alone = diffusion(history(system, time, path, np.eye(3) * 24.86))
+    assert "without a viscosity" in alone.value("D of argon in an infinite box").note
+    slanted = diffusion(history(system, time, path, SLANTED), viscosity_mPa_s=0.896)
+    assert "for cubic boxes" in slanted.notes[-1] and len(slanted.values) == 1
+    for wrong in (0.0, -1.0, inf, np.nan):
+        with pytest.raises(OutputError, match="viscosity_mPa_s must be a number above 0"):
+            diffusion(history(system, time, path, np.eye(3) * 24.86), viscosity_mPa_s=wrong)
+
+
+def test_what_does_not_diffuse_gives_no_value():
+    """Free flight bends upwards, a cage downwards; a walk too short for neighbours to change is told as that."""
+    system = system_of({"argon": 16}, 25.0)
+    rng = np.random.default_rng(0)
+    time, box = 0.5 * np.arange(400), np.eye(3) * 25.0
+    flight = time[:, None, None] * rng.standard_normal((16, 3))
+    cage = noise_with_memory(rng, 400, (16, 3), 1.0, 5.0, 0.5)
+    for path in (flight, cage):
+        (told,) = diffusion(history(system, time, path, SLANTED)).values
+        assert told.value is None and "too short for a value" in told.note
+    (told,) = diffusion(history(system, time, brownian(rng, 400, 16, 0.25, 0.5), SLANTED)).values
+    assert told.value is None and "correlation times" in told.note
+    with pytest.raises(OutputError, match="needs at least 40 frames; there are 39"):
+        diffusion(history(system, time[:39], flight[:39], box))
+    assert diffusion(history(system, time[:40], flight[:40], box)).values
+
+
+# turning
+
+
+def test_free_rotational_diffusion_decays_as_it_must():
+    """C1 = exp(-2 D t), C2 = exp(-6 D t) of a sphere that turns at random."""
+    system = system_of({"ccl4": 60}, 60.0, 9.0)
+    D, interval, frames, rng = 0.05, 0.4, 600, np.random.default_rng(2)
+    turns = rotations_about(np.sqrt(2 * D * interval) * rng.standard_normal((frames, 60, 3)))
+    Q = np.empty((frames, 60, 3, 3))
+    Q[0] = random_rotations(rng, 60)
+    for k in range(1, frames):
+        Q[k] = Q[k - 1] @ turns[k]
+    found = orientation(history(system, interval * np.arange(frames), None, np.eye(3) * 60, Q))
+    # mean cosine and P2 of one turn, exact for steps of a finite size
+    angle = np.linalg.norm(np.sqrt(2 * D * interval) * rng.standard_normal((400_000, 3)), axis=1)
+    once = [(1 + 2 * np.cos(angle)).mean() / 3, (1 + 2 * np.cos(angle) + 2 * np.cos(2 * angle)).mean() / 5]
+    time = found["Time (ps)"]
+    for axis in (1, 2, 3):
+        for l in (1, 2):  # noqa: E741
+            title = f"C{l} ccl4 axis {axis}"
+            rate = -np.log(once[l - 1]) / interval
+            expected, error = np.exp(-rate * time), found[f"{title} error"]
+            assert found[title][0] == pytest.approx(1.0, abs=1e-12)
+            assert np.all(np.abs(found[title] - expected) < 5 * np.maximum(error, np.median(error)))
+            tau = found.value(f"tau{l} of ccl4, axis {axis}")
+            assert abs(tau.value - 1 / rate) < 4 * tau.error + 0.02 / rate
+            assert rate == pytest.approx((2, 6)[l - 1] * D, rel=0.05)
+        told = found.value(f"D_rot of ccl4, axis {axis}")
+        assert abs(told.value - D) < 4 * told.error
+        assert told.error < 0.05 * D
+
+
+def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
+    system = system_of({"ccl4": 8}, 40.0, 9.0)
+    rng, time = np.random.default_rng(0), np.arange(100.0)
+    still = np.broadcast_to(random_rotations(rng, 8), (100, 8, 3, 3))
+    told = orientation(history(system, time, None, np.eye(3) * 40, still)).value("tau1 of ccl4, axis 1")
+    assert told.value is None and told.note == "C1 is still 1.00 after 10 ps: too short for a value"
+    wild = random_rotations(rng, 800).reshape(100, 8, 3, 3)
+    told = orientation(history(system, time, None, np.eye(3) * 40, wild)).value("D_rot of ccl4, axis 1")
+    assert told.value is None and "between frames, 1 ps apart: write them more often" in told.note
+    with pytest.raises(OutputError, match="no molecule of this run turns"):
+        orientation(history(system_of({"argon": 2}), time, None, np.eye(3) * 40))
+
+
+def test_one_sentence_tells_what_is_too_short():
+    assert (
+        settled("x", "", 1.0, 0.1, 19.9, 1.0).note
+        == "this run is 20 correlation times (1 ps) long: too short for a value"
+    )
+    assert settled("x", "", 1.0, 0.1, 20.0, 1.0).value == 1.0
+    assert settled("x", "", 1.0, 0.1, 5.0, 1.0, least=5.0).value == 1.0
+    assert settled("x", "", 1.0, 0.1, 4.9, 1.0, least=5.0).value is None
+    assert settled("x", "", np.nan, 0.1, 5.0, 1.0).value is None
+    assert settled("x", "", 1.0, 0.1, 5.0, 0.0).value is None
+
+
+def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
+    """Springs at 120/cm and librations at 300, 500 and 700/cm, with energies of kT each on the average."""
+    system = system_of({"spce": 40}, 30.0)
+    rng, frames, interval = np.random.default_rng(0), 2000, 0.004
+    time, m = interval * np.arange(frames), system.species[0]
+
+    def swing(wave_number, weight, shape):
+        size = np.sqrt(rng.exponential(2 * BOLTZMANN * 300 / weight, shape))
+        size *= np.sqrt(2 * BOLTZMANN * 300 / weight / np.mean(size**2))
+        return size * np.cos(2 * np.pi * PER_CM * wave_number * time[:, None, None] + 2 * np.pi * rng.random(shape))
+
+    velocities = swing(120.0, m.mass, (40, 3))
+    L = np.concatenate([swing(c, i, (40, 1)) * i for c, i in zip((300, 500, 700), m.inertia, strict=True)], axis=2)
+    Q = np.broadcast_to(random_rotations(rng, 40), (frames, 40, 3, 3))
+    found = spectrum(history(system, time, None, np.eye(3) * 30, Q, velocities, L))
+    step = found["wave number (1/cm)"][1]
+    expected = {"V spce": (120, 3), **{f"omega spce axis {k}": (200 + 100 * k + 100 * (k - 1), 1) for k in (1, 2, 3)}}
+    for title, (wave_number, freedom) in expected.items():
+        assert found.value(f"highest peak of {title}").value == pytest.approx(wave_number, abs=0.6 * step)
+        assert np.sum(found[title]) * step == pytest.approx(freedom, rel=0.03)
+    sparse = history(system, 10 * time, None, np.eye(3) * 30, Q, velocities, L)
+    with pytest.raises(OutputError, match="needs velocities"):
+        spectrum(history(system, time, None, np.eye(3) * 30, Q))
+    with pytest.raises(OutputError, match=r"frames 0\.08 ps apart are too far from each other"):
+        every = slice(None, None, 20)
+        spectrum(history(system, time[every], None, np.eye(3) * 30, Q[every], velocities[every], L[every]))
+    assert sparse.interval == pytest.approx(0.04)
+
+
+# electric
+
+
+def dipoles(rng, system, frames, time, interval):
+    """Q (f, n, 3, 3) of molecules that keep their dipoles along or against the axes of the lab, each a telegraph."""
+    n = len(system.model.species)
+    change = 0.5 * (1 - np.exp(-interval / time))
+    signs = np.cumprod(np.where(rng.random((frames, n)) < change, -1, 1), axis=0) * rng.choice([-1, 1], n)
+    dipole = system.species[0].charges @ system.species[0].positions_body
+    along = int(np.abs(dipole).argmax())
+    Q = np.zeros((frames, n, 3, 3))
+    for k in range(n):
+        Q[:, k, k % 3, along] = signs[:, k] * np.sign(dipole[along])
+        Q[:, k, (k + 1) % 3, (along + 1) % 3] = signs[:, k]
+        Q[:, k, (k + 2) % 3, (along + 2) % 3] = 1.0
+    return Q, float(np.linalg.norm(dipole))
+
+
+FORCES = {
+    "tin foil": {"electrostatics": "pme"},
+    "vacuum": {"electrostatics": "ewald", "ewald_surface_permittivity": 1.0},
+    "water around": {"electrostatics": "ewald", "ewald_surface_permittivity": 80.0},
+    "reaction field": {"electrostatics": "reaction_field", "reaction_field_permittivity": 78.5},
+    "conducting": {"electrostatics": "reaction_field", "reaction_field_permittivity": inf},
+}
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_the_dielectric_constant_of_independent_dipoles(name):
+    """<M²> = n mu², in a box that makes epsilon about 3; time of the dipole 2 ps."""
+    scene = {"forces": {"cutoff_A": 7.0} | FORCES[name]}
+    system = build(small_scene({"spce": 30}, 14.5, **scene))
+    Q, mu = dipoles(np.random.default_rng(4), system, 4000, 2.0, 0.5)
+    found = dielectric(history(system, 0.5 * np.arange(4000), None, np.eye(3) * 14.5, Q)).value()
+    y = 4 * np.pi * COULOMB * 30 * mu**2 / (3 * 14.5**3 * BOLTZMANN * 300)
+    around = {"vacuum": 1.0, "water around": 80.0, "reaction field": 78.5}.get(name)
+    epsilon = found.value
+    if around is None:
+        assert abs(epsilon - 1 - y) < 4 * found.error
+        back = epsilon - 1
+    else:
+        back = (epsilon - 1) * (2 * around + 1) / (2 * around + epsilon)
+    assert found.correlation_ps == pytest.approx(2.0, rel=0.3)
+    assert 0.02 < found.error / epsilon < 0.5
+    M = np.einsum("fnij,j->fi", Q, system.species[0].charges @ system.species[0].positions_body)
+    seen = (np.mean(np.sum(M**2, axis=1)) - np.sum(M.mean(axis=0) ** 2)) / (30 * mu**2)
+    assert back == pytest.approx(y * seen, rel=1e-9)
+    assert seen == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_error_of_a_dielectric_constant_is_honest():
+    system = build(small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"}))
+    found = []
+    for seed in range(60):
+        Q, _ = dipoles(np.random.default_rng(seed), system, 600, 2.0, 0.5)
+        told = dielectric(history(system, 0.5 * np.arange(600), None, np.eye(3) * 14.5, Q)).value()
+        found.append((told.value, told.error))
+    values, errors = np.array(found, float).T
+    assert 0.6 < values.std() / np.sqrt(np.mean(errors**2)) < 1.6
+
+
+def test_dipoles_without_a_dielectric_constant():
+    time, box = np.arange(100.0), np.eye(3) * 14.5
+    still = np.broadcast_to(np.eye(3), (100, 30, 3, 3))
+    forces = {"cutoff_A": 7.0}
+    for scene, words in (
+        ({"spce": 30}, "an electric field acts"),
+        ({"spce": 30}, "has no known boundary"),
+        ({"na_spce": 2, "cl_spce": 2}, "has a net charge"),
+        ({"argon": 30}, "no molecule has charges"),
+        ({"co2_epm2": 30}, "no molecule has a dipole"),
+    ):
+        more = {"fields": {"electric_V_per_nm": [0, 0, 0.1]}} if "field" in words else {}
+        kind = "dsf" if "boundary" in words else "pme"
+        if "argon" not in scene:
+            more["forces"] = forces | {"electrostatics": kind}
+        system = build(small_scene(scene, 14.5, **{"forces": forces} | more))
+        n = len(system.model.species)
+        with pytest.raises(OutputError, match=words):
+            dielectric(history(system, time, None, box, still[:, :n] if len(system.state.rotation) else None))
+    system = build(small_scene({"spce": 30}, 14.5, forces=forces | {"electrostatics": "pme"}))
+    Q, _ = dipoles(np.random.default_rng(0), system, 100, 10.0, 0.5)
+    told = dielectric(history(system, 0.5 * time, None, box, Q)).value()
+    assert told.value is None and "too short for a value" in told.note
+
+
+# flow
+
+
+def stresses(rng, frames, eta, forget, interval, volume):
+    """A pressure tensor (f, 7), bar, whose five components decay within `forget` ps to a viscosity eta (mPa s)."""
+    variance = eta * MPA_S * BOLTZMANN * 300 / volume / forget / BAR**2
+    tensor = noise_with_memory(rng, frames, (6,), variance, forget, interval)
+    tensor[:, :3] *= np.sqrt(2)  # so that half the difference of two has that variance
+    return np.column_stack([interval * np.arange(frames), tensor])
+
+
+def test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest():
+    system, found = system_of({"argon": 8}, 25.0), []
+    for seed in range(12):
+        tensor = stresses(np.random.default_rng(seed), 20_000, 0.85, 0.1, 0.02, 25.0**3)
+        told = viscosity(history(system, [0.0, 400.0], None, np.eye(3) * 25.0, tensor=tensor)).value()
+        found.append((told.value, told.error))
+        assert told.correlation_ps == pytest.approx(0.1, rel=0.3)
+    values, errors = np.array(found).T
+    assert np.abs((values - 0.85) / errors).max() < 4
+    assert 0.6 < values.std(ddof=1) / np.sqrt(np.mean(errors**2)) < 1.6
+    assert values.mean() == pytest.approx(0.85, abs=4 * values.std(ddof=1) / np.sqrt(12))
+
+
+def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
+    system, time, box = system_of({"argon": 8}, 25.0), [0.0, 400.0], np.eye(3) * 25.0
+    tensor = stresses(np.random.default_rng(0), 2000, 0.85, 0.1, 0.02, 25.0**3)
+    for lines, words in (
+        (None, "needs the pressure tensor"),
+        (tensor[:1], "needs the pressure tensor"),
+        (tensor[:990], r"at least; there are 19.8 ps of it"),
+        (tensor[np.r_[:500, 600:2000]], "at equal times"),
+        (tensor[::10], "0.2 ps apart are too far from each other"),
+        (tensor * [100, 1, 1, 1, 1, 1, 1], "2 ps apart are too far from each other"),
+    ):
+        with pytest.raises(OutputError, match=words):
+            viscosity(history(system, time, None, box, tensor=lines))
+    with pytest.raises(OutputError, match="needs a box"):
+        viscosity(history(system, time, None, tensor=tensor))
+    slow = stresses(np.random.default_rng(0), 2000, 0.85, 20.0, 0.02, 25.0**3)
+    told = viscosity(history(system, time, None, box, tensor=slow)).value()
+    assert told.value is None and "too short for a value" in told.note
+
+
+# production
+
+
+def test_a_transient_is_left_out():
+    rng = np.random.default_rng(0)
+    for shift in (200, 300):
+        values = rng.standard_normal(1000) + 30 * np.exp(-np.arange(1000) / (shift / 5))
+        assert 0.4 * shift < steady_from(values) < 1.7 * shift
+    assert steady_from(np.ones(100)) == 0
+    assert max(steady_from(np.cumsum(rng.standard_normal(1000))) for _ in range(10)) <= 500
+    assert np.median([steady_from(rng.standard_normal(1000)) for _ in range(50)]) < 150
