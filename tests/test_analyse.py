@@ -397,7 +397,7 @@ def test_free_rotational_diffusion_decays_as_it_must():
             assert rate == pytest.approx((2, 6)[l - 1] * D, rel=0.05)
         told = found.value(f"D_rot of ccl4, axis {axis}")
         assert abs(told.value - D) < 4 * told.error
-        assert told.error < 0.05 * D
+        assert told.error < 0.1 * D
 
 
 def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
@@ -445,13 +445,14 @@ def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
     for title, (wave_number, freedom) in expected.items():
         assert found.value(f"highest peak of {title}").value == pytest.approx(wave_number, abs=0.6 * step)
         assert np.sum(found[title]) * step == pytest.approx(freedom, rel=0.03)
-    sparse = history(system, 10 * time, None, np.eye(3) * 30, Q, velocities, L)
+        memory = found[f"correlation {title}"]
+        assert memory[0] == pytest.approx(1.0)
+        assert memory[5] == pytest.approx(np.cos(2 * np.pi * PER_CM * wave_number * 5 * interval), abs=0.02)
     with pytest.raises(OutputError, match="needs velocities"):
         spectrum(history(system, time, None, np.eye(3) * 30, Q))
-    with pytest.raises(OutputError, match=r"frames 0\.08 ps apart are too far from each other"):
-        every = slice(None, None, 20)
+    with pytest.raises(OutputError, match=r"frames 0\.016 ps apart .* spce axis 2 forgets itself"):
+        every = slice(None, None, 4)  # V and one of three angular velocities would do
         spectrum(history(system, time[every], None, np.eye(3) * 30, Q[every], velocities[every], L[every]))
-    assert sparse.interval == pytest.approx(0.04)
 
 
 # electric
@@ -483,12 +484,12 @@ FORCES = {
 
 @pytest.mark.parametrize("name", FORCES)
 def test_the_dielectric_constant_of_independent_dipoles(name):
-    """<M²> = n mu², in a box that makes epsilon about 3; time of the dipole 2 ps."""
+    """<M²> = n mu², in a box that makes epsilon 2.3 with tin foil and 3.2 in vacuum; time of the dipole 2 ps."""
     scene = {"forces": {"cutoff_A": 7.0} | FORCES[name]}
-    system = build(small_scene({"spce": 30}, 14.5, **scene))
+    system = build(small_scene({"spce": 30}, 24.0, **scene))
     Q, mu = dipoles(np.random.default_rng(4), system, 4000, 2.0, 0.5)
-    found = dielectric(history(system, 0.5 * np.arange(4000), None, np.eye(3) * 14.5, Q)).value()
-    y = 4 * np.pi * COULOMB * 30 * mu**2 / (3 * 14.5**3 * BOLTZMANN * 300)
+    found = dielectric(history(system, 0.5 * np.arange(4000), None, np.eye(3) * 24.0, Q)).value()
+    y = 4 * np.pi * COULOMB * 30 * mu**2 / (3 * 24.0**3 * BOLTZMANN * 300)
     around = {"vacuum": 1.0, "water around": 80.0, "reaction field": 78.5}.get(name)
     epsilon = found.value
     if around is None:
@@ -497,7 +498,7 @@ def test_the_dielectric_constant_of_independent_dipoles(name):
     else:
         back = (epsilon - 1) * (2 * around + 1) / (2 * around + epsilon)
     assert found.correlation_ps == pytest.approx(2.0, rel=0.3)
-    assert 0.02 < found.error / epsilon < 0.5
+    assert 0.005 < found.error / epsilon < 0.1
     M = np.einsum("fnij,j->fi", Q, system.species[0].charges @ system.species[0].positions_body)
     seen = (np.mean(np.sum(M**2, axis=1)) - np.sum(M.mean(axis=0) ** 2)) / (30 * mu**2)
     assert back == pytest.approx(y * seen, rel=1e-9)
@@ -527,7 +528,7 @@ def test_dipoles_without_a_dielectric_constant():
         ({"co2_epm2": 30}, "no molecule has a dipole"),
     ):
         more = {"fields": {"electric_V_per_nm": [0, 0, 0.1]}} if "field" in words else {}
-        kind = "dsf" if "boundary" in words else "pme"
+        kind = "damped_shifted_force" if "boundary" in words else "pme"
         if "argon" not in scene:
             more["forces"] = forces | {"electrostatics": kind}
         system = build(small_scene(scene, 14.5, **{"forces": forces} | more))
@@ -537,6 +538,13 @@ def test_dipoles_without_a_dielectric_constant():
     system = build(small_scene({"spce": 30}, 14.5, forces=forces | {"electrostatics": "pme"}))
     Q, _ = dipoles(np.random.default_rng(0), system, 100, 10.0, 0.5)
     told = dielectric(history(system, 0.5 * time, None, box, Q)).value()
+    vacuum = build(small_scene({"spce": 30}, 14.5, forces=forces | FORCES["vacuum"]))
+    with pytest.raises(OutputError, match="fluctuates more than it can with a permittivity of 1 around"):
+        dielectric(
+            history(
+                vacuum, 0.5 * np.arange(4000), None, box, dipoles(np.random.default_rng(4), vacuum, 4000, 2.0, 0.5)[0]
+            )
+        )
     assert told.value is None and "too short for a value" in told.note
 
 
@@ -573,7 +581,7 @@ def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
         (tensor[:990], r"at least; there are 19.8 ps of it"),
         (tensor[np.r_[:500, 600:2000]], "at equal times"),
         (tensor[::10], "0.2 ps apart are too far from each other"),
-        (tensor * [100, 1, 1, 1, 1, 1, 1], "2 ps apart are too far from each other"),
+        (tensor[::100], "2 ps apart are too far from each other"),
     ):
         with pytest.raises(OutputError, match=words):
             viscosity(history(system, time, None, box, tensor=lines))

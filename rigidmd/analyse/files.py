@@ -11,11 +11,11 @@ import numpy as np
 
 from rigidmd.analyse.findings import Curve, Finding, Value
 from rigidmd.analyse.history import History
-from rigidmd.analyse.registry import place
+from rigidmd.analyse.registry import ORDER, place
 from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
 from rigidmd.output.figure import COLORS, FAINT, INK, few_decades, save_figure, thin_series
-from rigidmd.output.folder import add_to_folder
+from rigidmd.output.folder import add_to_folder, written_by_runs
 
 ANALYSIS = "analysis.json"
 #: Inches of a figure, and curves that one holds.
@@ -29,12 +29,17 @@ def write_findings(folder: Path, history: History, findings: list[Finding], fail
 
     failed : analysis -> the sentence that tells why it found nothing. Raises OutputError.
     """
-    own = [f"{curve.file}{ending}" for finding in findings for curve in finding.curves for ending in (".csv", ".png")]
     known = read_table(folder)
-    earlier = {name for entry in known.get("analyses", {}).values() for name in entry.get("files", ())}
-    taken = [name for name in own if (folder / name).exists() and name not in earlier]
-    if taken:
-        raise OutputError(f"{folder / taken[0]} is there and no file of an analysis; name the analysis otherwise")
+    owner, marked = _owners(known, folder), written_by_runs(folder)
+    own = {}
+    for finding in findings:
+        for name in (f"{curve.file}{ending}" for curve in finding.curves for ending in (".csv", ".png")):
+            if own.setdefault(name, finding.name) != finding.name or owner.get(name, finding.name) != finding.name:
+                other = own[name] if own[name] != finding.name else owner[name]
+                raise OutputError(f"{folder / name} is of the analysis {other}; name {finding.name} otherwise")
+            known_there = name in owner or (finding.name in ORDER and name in marked)
+            if (folder / name).exists() and not known_there:
+                raise OutputError(f"{folder / name} is there and no file of an analysis; name {finding.name} otherwise")
     add_to_folder(folder, [ANALYSIS, *own])
     written = []
     entries = dict(known.get("analyses", {}))
@@ -71,6 +76,14 @@ def write_findings(folder: Path, history: History, findings: list[Finding], fail
     return [folder / ANALYSIS, *written]
 
 
+def _owners(known: dict[str, Any], folder: Path) -> dict[str, str]:
+    """File -> the analysis that wrote it. Raises OutputError."""
+    try:
+        return {str(name): analysis for analysis, entry in known.get("analyses", {}).items() for name in entry["files"]}
+    except (KeyError, TypeError):
+        raise OutputError(f"{folder / ANALYSIS} is no list of analyses; remove it, and analyse again") from None
+
+
 def _described(curve: Curve) -> dict[str, Any]:
     return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level}
 
@@ -99,9 +112,9 @@ def read_table(folder: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        raise OutputError(f"{path} cannot be read: {error}") from None
+        raise OutputError(f"{path} cannot be read: {error}; remove it, and analyse again") from None
     if not isinstance(found, dict) or not isinstance(found.get("analyses"), dict):
-        raise OutputError(f"{path} is no list of analyses")
+        raise OutputError(f"{path} is no list of analyses; remove it, and analyse again")
     return found
 
 
@@ -115,7 +128,7 @@ def read_findings(folder: Path) -> list[tuple[Finding, str]]:
             stretch = entry["stretch"]
             words = f"{stretch['frames']} frames from {stretch['from_ps']:g} to {stretch['to_ps']:g} ps"
             found.append((Finding(name, str(entry["about"]), values, curves, list(entry["notes"])), words))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise OutputError(f"{folder / ANALYSIS} is no list of analyses: {error}") from None
     return found
 
@@ -129,8 +142,8 @@ def _read_curve(folder: Path, told: dict[str, Any]) -> Curve:
         raise OutputError(f"{path} cannot be read: {error}") from None
     table = {title: np.array([float(line[k] or "nan") for line in lines]) for k, title in enumerate(head)}
     axis = head[0]
-    errors = {title.removesuffix(" error"): table[title] for title in head if title.endswith(" error")}
-    columns = {title: table[title] for title in head[1:] if not title.endswith(" error")}
+    columns = {title: table[title] for title in head[1:] if title.removesuffix(" error") not in set(head) - {title}}
+    errors = {title.removesuffix(" error"): table[title] for title in head[1:] if title not in columns}
     log = (bool(told["log"][0]), bool(told["log"][1]))
     return Curve(str(told["file"]), (axis, table[axis]), str(told["label"]), columns, errors, log, told["level"])
 

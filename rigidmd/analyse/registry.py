@@ -56,8 +56,10 @@ def analysis(function: Callable[[History], Any]) -> Callable[[History], Any]:
     made of them. Its first line of documentation is the title. Raises OutputError for a name that is taken.
     """
     name = getattr(function, "__name__", "")
-    if name in KNOWN and not KNOWN[name].own:
+    if name in ORDER:  # whether those are registered yet or not
         raise OutputError(f"{name} is an analysis that comes with rigidmd; name your function otherwise")
+    if not name.isidentifier():
+        raise OutputError(f"an analysis has the name of its function, and {name or function!r} is no name: use def")
     about = ((function.__doc__ or "").strip().splitlines() or [name])[0]
     KNOWN[name] = Analysis(name, about, lambda history: _of_own(name, about, function, history), True)
     return function
@@ -82,14 +84,14 @@ def trusted(path: Path) -> None:
     """Run a Python file that defines analyses: it is code, and the user said that it may run. Raises OutputError."""
     if fault := file_fault(path):
         raise OutputError(f"{path}: {fault}")
-    before = set(KNOWN)
+    before = dict(KNOWN)
     try:
         runpy.run_path(str(path))
-    except OutputError:
-        raise
-    except Exception as error:  # whatever a stranger's file raises
+    except OutputError as error:
+        raise OutputError(f"{path}: {error}") from None
+    except (Exception, SystemExit) as error:  # whatever a stranger's file raises
         raise OutputError(f"{path} raised {type(error).__name__}: {error}") from error
-    if not set(KNOWN) - before and not any(entry.own for entry in KNOWN.values()):
+    if not any(entry.own and entry is not before.get(name) for name, entry in KNOWN.items()):
         raise OutputError(f"{path} defines no analysis: put @rigidmd.analysis before a function of frames")
 
 
@@ -97,9 +99,11 @@ def _of_own(name: str, about: str, function: Callable[[History], Any], history: 
     """Means and errors of what a function of users gives."""
     try:
         found = function(history)
-    except Exception as error:  # whatever a stranger's function raises
+    except (Exception, SystemExit) as error:  # whatever a stranger's function raises
         raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
     series = dict(found) if isinstance(found, Mapping) else {name: found}
+    if not series:
+        raise OutputError(f"the analysis {name} gave an empty dictionary")
     values, columns = [], {}
     for title, given in series.items():
         try:

@@ -134,13 +134,14 @@ def _history(
 
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
     """The last stage in which time passes and of which there are samples, with its begin and end, ps."""
-    names, time = columns["stage_name"], columns["time"]
-    stages = [stage for stage in system.scene.stages if not stage.is_minimisation]
-    if not stages:
+    names, time, stages = columns["stage_name"], columns["time"], system.scene.stages
+    if all(stage.is_minimisation for stage in stages):
         raise OutputError("this run is a minimisation, in which no time passes: there is nothing to average")
-    for stage in reversed(stages):
-        own = np.flatnonzero(names == stage.label)
-        if len(own):
+    before = time[0] + np.cumsum([0.0, *(stage.duration for stage in stages)])  # of stages with the same name
+    for k in reversed(range(len(stages))):
+        stage = stages[k]
+        own = np.flatnonzero((names == stage.label) & (time > before[k] + 0.5e-3 * stage.timestep_fs))
+        if len(own) and not stage.is_minimisation:
             return stage, float(time[max(0, own[0] - 1)]), float(time[own[-1]])
     raise OutputError("the run has not come to a stage in which time passes")
 

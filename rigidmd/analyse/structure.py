@@ -169,6 +169,11 @@ def structure_factor(history: History, name: str = "", largest: float = LARGEST_
         raise OutputError("a structure factor needs a box")
     thinned = _thinned(history, ENOUGH_WAVES)
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T
+    shortest = float(heights(reciprocal).min())
+    if not largest > shortest:
+        raise OutputError(
+            f"this box has no wave vector shorter than {largest:g} 1/Å; the shortest is {shortest:.3g} 1/Å"
+        )
     waves, bin_of = _waves(reciprocal, largest)
     bins = int(bin_of.max()) + 1
     used, members = np.unique(bin_of, return_inverse=True)
@@ -227,6 +232,8 @@ def density_profile(history: History, axis: str = "z", bins: int = 100) -> Findi
         raise OutputError(f"there is no axis {axis!r}; name x, y or z (the edges a, b and c of the box)")
     if not history.has_box:
         raise OutputError("a profile of the density needs a box")
+    if bins < 1:
+        raise OutputError(f"a profile needs at least one of its bins, not {bins}")
     k = "xyz".index(axis)
     height = float(np.mean([heights(cell)[k] for cell in history.cell]))
 

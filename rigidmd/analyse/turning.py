@@ -156,12 +156,6 @@ def spectrum(history: History) -> Finding:
         raise OutputError("a spectrum needs velocities in the frames: output.trajectory = 'trajectory.trr' keeps them")
     interval, lags = evenly(history, "a spectrum")
     velocities = history.velocities
-    near = correlation(velocities[:, history.moving[0].index], 2)
-    if near[1] < CLOSE * near[0]:
-        raise OutputError(
-            f"frames {interval:g} ps apart are too far from each other for a spectrum: velocities forget themselves "
-            "between them; output.trajectory_interval_ps = 0.004 suits water"
-        )
     size = min(len(history), 2 * lags)
     found = Finding("spectrum", "densities of states")
     wave_numbers = np.fft.rfftfreq(size, interval) / PER_CM
@@ -174,15 +168,21 @@ def spectrum(history: History) -> Finding:
         if m.degrees_of_freedom > 3:
             L = history.L[:, kind.index]
             lab = np.einsum("fnij,fnj->fni", history.Q[:, kind.index], L)
-            memory.columns[f"L {kind.name}"] = _normalised(lab, lags)
+            memory.columns[f"correlation L {kind.name}"] = _normalised(lab, lags)
             if len(_axes(kind)) == 1:  # which of the two other axes is which has no meaning
                 series.append((f"omega {kind.name}", lab / m.inertia[2], float(m.inertia[2])))
             else:
                 for k, moment in enumerate(m.inertia.tolist()):
                     series.append((f"omega {kind.name} axis {k + 1}", L[..., k : k + 1] / moment, moment))
         for title, values, mass in series:
+            seen = _normalised(values, lags)
+            if not seen[1] > CLOSE:
+                raise OutputError(
+                    f"frames {interval:g} ps apart are too far from each other for a spectrum: {title} forgets itself "
+                    "between them; output.trajectory_interval_ps = 0.004 suits water"
+                )
             power.columns[title] = _density_of_states(values, interval, size, mass / history.thermal_energy)
-            memory.columns[title] = _normalised(values, lags)
+            memory.columns[f"correlation {title}"] = seen
             top = int(np.argmax(power.columns[title][1:])) + 1
             at, half = float(wave_numbers[top]), float(wave_numbers[1] / 2)
             found.values.append(Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution"))

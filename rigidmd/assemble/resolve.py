@@ -96,6 +96,8 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
     if not faults and scene.forces.electrostatics in ("ewald", "pme"):
         found, faults, grid = _ewald(scene.forces, facts, numbers["cutoff_A"])
         numbers |= found
+    if scene.output.pressure_tensor_interval_ps and facts.space.volume == inf:
+        faults.append("output.pressure_tensor_interval_ps needs a periodic box: without one there is no pressure")
     tables = {
         "forces": scene.forces.model_copy(update=numbers),
         "output": _output(scene.output),

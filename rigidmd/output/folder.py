@@ -32,7 +32,7 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
                 raise OutputError(f"{folder} is not empty and holds no earlier run; name another folder with -o")
             if not force:
                 raise OutputError(f"{folder} holds an earlier run; --force replaces it, -o names another folder")
-            doomed = {(folder / name).resolve() for name in _written(folder)}
+            doomed = {(folder / name).resolve() for name in written_by_runs(folder)}
             for path in inputs:
                 if path.resolve() in doomed:
                     raise OutputError(
@@ -58,7 +58,7 @@ def make_folder(
         if lock is not None and not lock.is_taken:
             lock.take()
             check_folder(folder, force, inputs)  # another run may have made it meanwhile
-        for name in _written(folder):
+        for name in written_by_runs(folder):
             (folder / name).unlink(missing_ok=True)
         (folder / MARKER).write_text("\n".join(names) + "\n", encoding="utf-8")
     except OSError as error:
@@ -72,7 +72,7 @@ def continue_folder(folder: Path, names: Iterable[str]) -> None:
     """
     try:
         (folder / SUMMARY).unlink(missing_ok=True)
-        everything = dict.fromkeys([*_written(folder), *names])
+        everything = dict.fromkeys([*written_by_runs(folder), *names])
         (folder / MARKER).write_text("\n".join(everything) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
@@ -89,7 +89,7 @@ def check_is_run(folder: Path) -> None:
 
 def add_to_folder(folder: Path, names: Iterable[str]) -> None:
     """Note files that are made from a run beside its own: a new run in the folder removes them. Raises OutputError."""
-    everything = dict.fromkeys([*_written(folder), *names])
+    everything = dict.fromkeys([*written_by_runs(folder), *names])
     try:
         (folder / MARKER).write_text("\n".join(everything) + "\n", encoding="utf-8")
     except OSError as error:
@@ -127,7 +127,7 @@ class FolderLock:
 def never_began(folder: Path) -> bool:
     """Whether a run was ended in a folder before its first checkpoint: nothing is lost if it begins again."""
     ended = (CHECKPOINT, PREVIOUS, FINAL, LAST_GOOD, SUMMARY, MOTION)
-    if CHECKPOINT not in _written(folder) or any((folder / name).exists() for name in ended):
+    if CHECKPOINT not in written_by_runs(folder) or any((folder / name).exists() for name in ended):
         return False
     log = folder / LOG
     return not log.exists() or len(log.read_bytes().splitlines()) <= 2  # its header, its start
@@ -138,7 +138,7 @@ def is_empty(folder: Path) -> bool:
     return not folder.exists() or all(path.name == LOCK for path in folder.iterdir())
 
 
-def _written(folder: Path) -> list[str]:
+def written_by_runs(folder: Path) -> list[str]:
     """Files that an earlier run in this folder may have written; only plain names, whatever its marker contains."""
     marker = folder / MARKER
     if not marker.is_file():

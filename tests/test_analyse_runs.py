@@ -1,0 +1,514 @@
+"""Analyses of runs: the command, files, bad input, and other programs on the very same frames."""
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import MDAnalysis
+import numpy as np
+import pytest
+from conftest import ROOT, small_scene
+from MDAnalysis.analysis.msd import EinsteinMSD
+from MDAnalysis.analysis.rdf import InterRDF
+
+import rigidmd
+from rigidmd import Scene, Simulation, cli
+from rigidmd.analyse import registry
+from rigidmd.analyse.electric import total_dipole
+from rigidmd.analyse.source import of_folder
+from rigidmd.assemble.system import build
+from rigidmd.errors import OutputError, SceneError
+from rigidmd.output.record import read_record
+from rigidmd.units import DEBYE
+
+sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
+from peer_engines import gro, top
+
+SHORT = {"stages.0.duration_ps": 0.02, "stages.1.duration_ps": 0.2, "output.trajectory_interval_ps": 0.004,
+         "output.trajectory": "trajectory.trr", "output.log_interval_ps": 0.004, "output.figure": False,
+         "output.pressure_tensor_interval_ps": 0.004}  # fmt: skip
+GROMACS = shutil.which("gmx")
+needs_gromacs = pytest.mark.skipif(not GROMACS, reason="GROMACS is not installed")
+
+
+@pytest.fixture(scope="module")
+def water(tmp_path_factory):
+    """216 waters, 51 frames of 0.2 ps at constant energy."""
+    folder = tmp_path_factory.mktemp("runs") / "water"
+    Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT), folder).run()
+    return folder
+
+
+@pytest.fixture
+def copy(water, tmp_path):
+    """The run, to be spoilt."""
+    return Path(shutil.copytree(water, tmp_path / "run"))
+
+
+@pytest.fixture
+def own():
+    """Forgets analyses that a test defines."""
+    before = dict(registry.KNOWN)
+    yield
+    registry.KNOWN.clear()
+    registry.KNOWN.update(before)
+
+
+def said(capsys, *arguments, code=2):
+    """What the command says of it: one sentence, without a traceback."""
+    assert cli.main(["analyse", *map(str, arguments)]) == code
+    found = capsys.readouterr().err.strip()
+    assert found.startswith("rigidmd: ") and "\n" not in found and "Traceback" not in found
+    return found
+
+
+def table(path):
+    """The columns of a CSV file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        head, *lines = list(csv.reader(file))
+    return {title: np.array([float(line[k] or "nan") for line in lines]) for k, title in enumerate(head)}
+
+
+def names(folder):
+    """Files of a folder, without those that MDAnalysis leaves beside a trajectory."""
+    return sorted(path.name for path in folder.iterdir() if "_offsets." not in path.name)
+
+
+# the command
+
+
+def test_all_analyses_of_a_run_by_one_command(copy, capsys):
+    before = names(copy)
+    assert cli.main(["analyse", str(copy), "--from", "0.02ps"]) == 0
+    text = capsys.readouterr().out
+    found = json.loads((copy / "analysis.json").read_text())["analyses"]
+    assert set(found) == set(registry.ORDER)
+    left_out = [name for name, entry in found.items() if not entry["curves"] and not entry["values"]]
+    assert left_out == ["viscosity"]
+    assert "viscosity: left out: a viscosity needs 20 ps of the pressure tensor at least; there are 0.2 ps" in text
+    files = [name for entry in found.values() for name in entry["files"]]
+    assert sorted([*before, "analysis.json", *files]) == names(copy)
+    assert set(files) <= set((copy / ".rigidmd-run").read_text().split("\n"))  # which a new run removes
+    for entry in found.values():
+        for curve in entry["curves"]:
+            columns = table(copy / f"{curve['file']}.csv")
+            assert all(len(values) > 3 and np.isfinite(values).all() for values in columns.values()), curve
+        for value in entry["values"]:
+            assert value["value"] is not None or "too short" in value["note"], value
+            assert value["value"] is None or value["error"] is not None, value
+    assert list(table(copy / "rdf.csv"))[:4] == ["r (A)", "g O-O", "g O-O error", "n O-O"]
+    bonds = found["hydrogen_bonds"]["values"][0]
+    assert 1.0 < bonds["value"] < 4.5
+    assert "D of spce: this run is" in text and "too short for a value" in text
+    # once more, of one analysis: the same bits, and the others stay
+    kept = {name: (copy / name).read_bytes() for name in [*files, "analysis.json"] if not name.endswith(".png")}
+    assert cli.main(["analyse", str(copy), "--only", "rdf, orientation", "--from", "0.02ps"]) == 0
+    assert {name: (copy / name).read_bytes() for name in kept} == kept
+    assert cli.main(["analyse", str(copy), "--only", "rdf", "--from", "100fs"]) == 0
+    again = json.loads((copy / "analysis.json").read_text())["analyses"]
+    assert again["rdf"]["stretch"]["from_ps"] == pytest.approx(0.1, abs=0.003)
+    assert again["rdf"] != found["rdf"] and again["spectrum"] == found["spectrum"]
+    capsys.readouterr()
+
+
+def test_the_list_is_that_of_all(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["analyse", "--list"])
+    assert ended.value.code == 0
+    told = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert told == list(registry.ORDER)
+
+
+def test_results_in_memory_and_from_the_folder_agree(water):
+    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT)).run()
+    history = of_folder(read_record(water), 0.02)
+    for name, options, column in (
+        ("rdf", {"first": "OW", "second": "HW", "width": 0.2}, "g OW-HW"),
+        ("msd", {}, "MSD spce (A^2)"),
+        ("orientation", {}, "C2 spce axis 2"),
+        ("spectrum", {}, "omega spce axis 1"),
+        ("density_profile", {"bins": 5}, "density spce (g/cm3)"),
+        ("dielectric", {}, "Mz (D)"),
+    ):
+        here = getattr(results, name)(start=0.02, **options)[column]
+        there = registry.chosen([name])[0].function(history, **options)[column]
+        assert here == pytest.approx(there, rel=2e-3, abs=2e-3 * np.abs(there).max()), name
+    seen = results._histories[0.02]
+    assert np.array_equal(seen.tensor, history.tensor)
+    assert len(seen.tensor) == 51 and seen.interval == pytest.approx(0.004)
+    assert np.abs(seen.Q - history.Q).max() < 1e-5
+    assert np.abs(seen.L - history.L).max() < 1e-3
+    state = results.state
+    last = np.abs(seen.positions[-1] - state.position).max(), np.abs(seen.Q[-1] - state.rotation).max()
+    assert max(last) < 1e-5  # frames are in single precision
+    assert np.abs(seen.L[-1] - state.angular_momentum_body).max() < 1e-3
+    tensor = np.array([results[f"pressure_{k}"] for k in ("xx", "yy", "zz", "xy", "xz", "yz")]).T
+    assert np.array_equal(history.tensor[1:, 1:], tensor[-50:])
+
+
+def test_a_file_of_the_pressure_tensor_is_read_with_care(copy):
+    lines = (copy / "pressure_tensor.csv").read_text().splitlines()
+    rng = np.random.default_rng(0)
+    rows = [",".join(map(repr, [round(0.02 + 0.004 * k, 9), *rng.normal(0, 500, 6).tolist()])) for k in range(10)]
+    (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows]) + "\n" + rows[0][:-30])
+    history = of_folder(read_record(copy), 0.02)
+    assert history.tensor.shape == (10, 7)  # the line that is cut is left out
+    (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows, "0,x,0,0,0,0,0"]))
+    with pytest.raises(OutputError, match=r"pressure_tensor.csv holds what is no number"):
+        of_folder(read_record(copy))
+    (copy / "pressure_tensor.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(OutputError, match=r"is no pressure tensor of rigidmd: its columns must be"):
+        of_folder(read_record(copy))
+    (copy / "pressure_tensor.csv").write_text("")
+    with pytest.raises(OutputError, match=r"is no pressure tensor of rigidmd"):
+        of_folder(read_record(copy))
+
+
+# other programs on the very same frames
+
+
+def test_g_of_r_is_that_of_mdanalysis(water):
+    u = MDAnalysis.Universe(str(water / "topology.gro"), str(water / "trajectory.trr"))
+    history = of_folder(read_record(water), 0.02)
+    first = len(u.trajectory) - len(history)
+    assert len(history) == 51
+    for a, b, block in (("OW", "OW", (1, 1)), ("OW", "HW", (1, 2)), ("HW", "HW", (2, 2))):
+        selected = (u.select_atoms(f"name {name}*") for name in (a, b))
+        peer = InterRDF(*selected, nbins=90, range=(0, 9.0), exclusion_block=block).run(start=first)
+        found = registry.chosen(["rdf"])[0].function(history, a, b, 9.0, 0.1)[f"g {a}-{b}"]
+        assert np.abs(found - peer.results.rdf).max() < 1e-3  # a pair at the edge of a bin
+        assert np.abs(found - peer.results.rdf).mean() < 1e-5
+
+
+def test_displacements_are_those_of_mdanalysis(water):
+    u = MDAnalysis.Universe(str(water / "topology.gro"), str(water / "trajectory.trr"))
+    u.add_TopologyAttr("masses", np.tile(build(Scene.read(ROOT / "systems" / "water.toml")).species[0].masses, 216))
+    history = of_folder(read_record(water), 0.02)
+    first = len(u.trajectory) - len(history)
+    centres = np.array([u.atoms.center_of_mass(compound="residues") for _ in u.trajectory[first:]])
+    assert np.abs(centres - history.positions).max() < 1e-5
+    points = MDAnalysis.Universe.empty(216, trajectory=True)
+    points.load_new(history.positions.astype(np.float32), order="fac")
+    peer = EinsteinMSD(points, select="all", msd_type="xyz", fft=False).run().results.timeseries
+    found = registry.chosen(["msd"])[0].function(history)["MSD spce (A^2)"]
+    assert found == pytest.approx(peer[: len(found)], abs=1e-8)
+
+
+@pytest.fixture(scope="module")
+def topology(water):
+    """A GROMACS run input of the waters, written from our own molecules."""
+    system = read_record(water).molecules
+    species = system.species[0]
+    sites = {
+        "position": system.site_positions(system.state).reshape(216, -1, 3), "template": species.positions_body,
+        "edge": system.state.cell[0, 0], "name": species.site_names, "mass": species.masses, "charge": species.charges,
+        "sigma": np.where(species.epsilon > 0, species.sigma, 1.0), "epsilon": species.epsilon / 100,
+    }  # fmt: skip
+    folder = water.parent / "gromacs"
+    folder.mkdir()
+    (folder / "run.gro").write_text(gro(sites, np.zeros_like(sites["position"])))
+    (folder / "run.top").write_text(top(sites))
+    (folder / "run.mdp").write_text("cutoff-scheme = verlet\nrvdw = 0.9\nrcoulomb = 0.9\ncoulombtype = PME\n")
+    gmx(folder, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr", "-maxwarn", "2")
+    gmx(folder, "make_ndx", "-f", "run.tpr", "-o", "run.ndx", text="del 1-20\na OW\na HW1 HW2\nq\n")
+    return folder
+
+
+def gmx(folder, *arguments, text=""):
+    done = subprocess.run(
+        [GROMACS, "-quiet", "-nobackup", *arguments],
+        cwd=folder,
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
+    return done.stdout
+
+
+def xvg(path):
+    return np.array([line.split() for line in path.read_text().splitlines() if line[0] not in "#@&"], float).T
+
+
+@needs_gromacs
+def test_g_of_r_is_that_of_gromacs(water, topology):
+    history = of_folder(read_record(water), 0.02)
+    for a, b in (("OW", "OW"), ("OW", "HW")):
+        other = {"OW": "OW", "HW": "HW1_HW2"}
+        gmx(topology, "rdf", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-n", "run.ndx", "-o", "rdf.xvg",
+            "-ref", other[a], "-sel", other[b], "-bin", "0.01", "-rmax", "0.9", "-excl", "-b", "0.0199", "-xvg", "none")  # fmt: skip
+        r, g = xvg(topology / "rdf.xvg")
+        half = registry.chosen(["rdf"])[0].function(history, a, b, 9.0, 0.05)[f"g {a}-{b}"]
+        shells = np.diff((0.05 * np.arange(181)) ** 3)  # its bins have their middles where ours of half the width meet
+        found = (half * shells)[1:-1].reshape(-1, 2).sum(axis=1) / shells[1:-1].reshape(-1, 2).sum(axis=1)
+        assert r[1 : 1 + len(found)] == pytest.approx(0.01 * np.arange(1, 90))
+        found *= 215 / 216  # it counts the own molecule among those that could be there
+        assert np.abs(g[1 : 1 + len(found)] - found).max() < 0.0015  # three decimals, and a pair at the edge of a bin
+        assert np.abs(g[1 : 1 + len(found)] - found).mean() < 0.0004
+
+
+@needs_gromacs
+def test_displacements_are_those_of_gromacs(water, topology):
+    history = of_folder(read_record(water), 0.02)
+    gmx(topology, "trjconv", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-b", "0.0199", "-t0", "0",
+        "-timestep", "1", "-o", "slow.trr", text="System\n")  # as it does not find times again that are no whole numbers  # fmt: skip
+    gmx(topology, "msd", "-f", "slow.trr", "-s", "run.tpr", "-n", "run.ndx", "-o", "msd.xvg",
+        "-mol", "mol.xvg", "-trestart", "1", "-xvg", "none", "-sel", "System")  # fmt: skip
+    value = xvg(topology / "msd.xvg")[1]
+    found = registry.chosen(["msd"])[0].function(history)["MSD spce (A^2)"]
+    assert 100 * value[: len(found)] == pytest.approx(found, rel=1e-5)
+    assert found[-1] > 0.01
+
+
+@needs_gromacs
+def test_the_total_dipole_is_that_of_gromacs(water, topology):
+    history = of_folder(read_record(water), 0.02)
+    gmx(topology, "dipoles", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-n", "run.ndx", "-o", "Mtot.xvg",
+        "-b", "0.0199", "-xvg", "none", "-temp", "300", text="System\n")  # fmt: skip
+    _, x, y, z, _ = xvg(topology / "Mtot.xvg")
+    own = total_dipole(history) / DEBYE
+    assert np.array([x, y, z]).T == pytest.approx(own, abs=2e-4)
+    assert np.abs(own).max() > 10.0
+
+
+# bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--only", "rfd"], "there is no analysis 'rfd'; did you mean rdf? there are"),
+        (["--only", "viscosty"], "did you mean viscosity?"),
+        (["--from", "1ns"], "from 1000 ps on there are 0 of 56 frames; an analysis needs two at least"),
+        (["--from", "0.22ps"], "from 0.22 ps on there is 1 of 56 frames"),
+        (["--only", "diffusion", "--from", "0.1ps"], "a diffusion coefficient needs at least 40 frames; there are"),
+        (["--only", "viscosity"], "a viscosity needs 20 ps of the pressure tensor at least"),
+        (["--trust", "nowhere.py"], "nowhere.py: "),
+    ],
+)
+def test_what_cannot_be_analysed_is_one_sentence(options, words, water, capsys):
+    before = names(water)
+    assert words in said(capsys, water, *options)
+    assert names(water) == before
+
+
+@pytest.mark.parametrize("time", ["-5ps", "10", "soon", "5 days", ""])
+def test_a_time_without_sense_is_refused(time, water, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["analyse", str(water), f"--from={time}"])
+    assert ended.value.code == 2
+    assert "is not a time with a unit, such as 200ps or 1.5ns" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "thick", "nan", "inf"])
+def test_a_viscosity_without_sense_is_refused(value, water, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["analyse", str(water), f"--viscosity={value}"])
+    assert ended.value.code == 2
+    assert "is not a viscosity above 0" in capsys.readouterr().err
+
+
+def test_names_of_sites_are_suggested(water):
+    history = of_folder(read_record(water), 0.02)
+    rdf = registry.chosen(["rdf"])[0].function
+    with pytest.raises(OutputError, match=r"^there is no site 'ow'; did you mean OW\? there are OW, HW1, HW2, spce$"):
+        rdf(history, "OW", "ow")
+    with pytest.raises(OutputError, match=r"^there is no site 'Xe'; there are OW"):
+        rdf(history, "Xe")
+    for largest, width in ((20.0, 0.1), (-1.0, 0.1), (5.0, 0.0), (5.0, 6.0), (np.nan, 0.1), (5.0, np.nan)):
+        with pytest.raises(OutputError, match="is not possible: half the box is 9.3"):
+            rdf(history, "OW", largest=largest, width=width)
+    with pytest.raises(OutputError, match="there is no axis 'w'; name x, y or z"):
+        registry.chosen(["density_profile"])[0].function(history, "w")
+    with pytest.raises(OutputError, match="bins"):
+        registry.chosen(["density_profile"])[0].function(history, "z", bins=0)
+    for largest in (0.01, -1.0, np.nan):
+        with pytest.raises(OutputError, match="no wave vector"):
+            registry.chosen(["structure_factor"])[0].function(history, largest=largest)
+    elements, centres = rdf(history, "O", "H", width=0.5), rdf(history, "spce", width=0.5)
+    assert np.array_equal(elements["g O-H"], rdf(history, "OW", "HW", width=0.5)["g OW-HW"])
+    assert centres["g spce-spce"].max() > 1.4
+    assert rdf(history, "OW").value("g OW-OW: first peak").value == pytest.approx(3.0, abs=0.4)
+
+
+def test_a_run_that_was_killed_is_analysed_as_far_as_it_came(copy, capsys):
+    (copy / "summary.json").unlink()
+    log, trajectory = copy / "log.csv", copy / "trajectory.trr"
+    log.write_text("\n".join(log.read_text().splitlines()[:40]) + '\n0.1,"nv')
+    trajectory.write_bytes(trajectory.read_bytes()[:-1000])
+    assert cli.main(["analyse", str(copy), "--only", "msd", "--from", "0.02ps"]) == 0
+    text = capsys.readouterr().out
+    assert "This run has not ended" in text and "trajectory.trr ends within a frame, which is left out" in text
+    found = json.loads((copy / "analysis.json").read_text())["analyses"]["msd"]["stretch"]
+    assert found["to_ps"] < 0.16 and found["frames"] == 34
+
+
+def test_a_folder_that_is_no_run_of_molecules(tmp_path, copy, capsys):
+    assert "nowhere" in said(capsys, tmp_path / "nowhere")
+    assert str(tmp_path) in said(capsys, tmp_path)
+    (copy / "trajectory.trr").write_bytes(b"nothing")
+    assert "cannot be read as a trajectory" in said(capsys, copy)
+    (copy / "trajectory.trr").unlink()
+    assert "its trajectory trajectory.trr is not there" in said(capsys, copy)
+    scene = (copy / "scene.toml").read_text()
+    (copy / "scene.toml").write_text(
+        scene.replace('trajectory = "trajectory.trr"', "trajectory = false").replace("velocities = true", "")
+    )
+    assert "wrote no trajectory (output.trajectory = false)" in said(capsys, copy)
+    top = tmp_path / "top"
+    body = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.figures": False})
+    results = Simulation(body, top).run()
+    assert "is the run of a single body, and analyses are of molecules" in said(capsys, top)
+    with pytest.raises(OutputError, match="this is the run of a single body, and analyses are of molecules"):
+        results.rdf()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"analyses": 3}', '{"analyses": {"rdf": 1}}', '{"analyses": {"rdf": {}}}', "\xff"]
+)
+def test_a_damaged_table_is_told_and_kept(text, copy, capsys):
+    path = copy / "analysis.json"
+    path.write_text(text, encoding="latin-1")
+    before = names(copy)
+    found = said(capsys, copy, "--only", "msd", "--from", "0.02ps")
+    assert str(path) in found and "remove it, and analyse again" in found
+    assert path.read_text(encoding="latin-1") == text and names(copy) == before
+
+
+def test_files_of_others_are_not_overwritten(copy, capsys, own):
+    (copy / "msd.csv").write_text("mine\n")
+    assert f"{copy / 'msd.csv'} is there and no file of an analysis" in said(
+        capsys, copy, "--only", "msd", "--from", "0.02ps"
+    )
+    assert (copy / "msd.csv").read_text() == "mine\n" and not (copy / "analysis.json").exists()
+    (copy / "msd.csv").unlink()
+    assert cli.main(["analyse", str(copy), "--only", "msd", "--from", "0.02ps"]) == 0
+    (copy / "analysis.json").unlink()  # files of this command may be written anew
+    assert cli.main(["analyse", str(copy), "--only", "msd,dielectric", "--from", "0.02ps"]) == 0
+    trusted = copy.parent / "own.py"
+    for name, words in (
+        ("log", "log.csv is there and no file"),
+        ("dipole", "dipole.csv is of the analysis dielectric"),
+    ):
+        trusted.write_text(f"import rigidmd\n@rigidmd.analysis\ndef {name}(frames):\n    return frames.time\n")
+        before = {path.name: path.read_bytes() for path in copy.iterdir()}
+        capsys.readouterr()
+        assert words in said(capsys, copy, "--trust", trusted, "--only", name, "--from", "0.02ps")
+        assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_told(copy, capsys):
+    copy.chmod(0o555)
+    try:
+        assert str(copy) in said(capsys, copy, "--only", "msd")
+    finally:
+        copy.chmod(0o755)
+
+
+# analyses of one's own
+
+
+OWN = """import numpy as np
+import rigidmd
+
+@rigidmd.analysis
+def height(frames):
+    "mean height of the centres (A)"
+    return frames.positions[:, :, 2].mean(axis=1)
+
+@rigidmd.analysis
+def spins(frames):
+    return {"L": np.abs(frames.L).mean(axis=(1, 2)), "one": np.ones(len(frames))}
+"""
+
+
+def test_a_function_of_ones_own_is_found_by_name(copy, capsys, own):
+    (copy.parent / "own.py").write_text(OWN)
+    trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
+    assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
+    entries = json.loads((copy / "analysis.json").read_text())["analyses"]
+    assert entries["height"]["about"] == "mean height of the centres (A)"
+    columns, history = table(copy / "height.csv"), of_folder(read_record(copy), 0.02)
+    assert columns["height"] == pytest.approx(history.positions[:, :, 2].mean(axis=1), rel=1e-8)
+    assert list(table(copy / "spins.csv")) == ["Time (ps)", "L", "one"]
+    assert entries["spins"]["values"][1]["value"] == 1.0
+    assert "mean height of the centres" in capsys.readouterr().out
+    assert cli.main(["analyse", str(copy), *trust, "--only", "height"]) == 0  # the same function once more
+
+
+def test_the_mean_of_ones_own_has_an_honest_error(own):
+    from test_analyse import history, noise_with_memory, system_of
+
+    system, found = system_of({"argon": 2}), []
+    for seed in range(50):
+        series = noise_with_memory(np.random.default_rng(seed), 1000, (1,), 1.0, 5.0, 1.0)[:, 0]
+        rigidmd.analysis(lambda_of(series))
+        told = registry.KNOWN["noise"].function(history(system, np.arange(1000.0), None)).value()
+        found.append((told.value, told.error, told.correlation_ps))
+    values, errors, times = np.array(found).T
+    assert np.mean(times) == pytest.approx(5.0, rel=0.2)
+    assert 0.6 < values.std() / np.sqrt(np.mean(errors**2)) < 1.6
+
+
+def lambda_of(series):
+    def noise(frames):
+        return series
+
+    return noise
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("return 1 / 0", "the analysis mine raised ZeroDivisionError: division by zero"),
+        ("return 1.0", "must give one number for each of the 51 frames, or a dictionary of such arrays; 'mine' has the shape ()"),
+        ("return frames.positions", "has the shape (51, 216, 3)"),
+        ("return {'a': frames.time, 'b': frames.time[1:]}", "'b' has the shape (50,)"),
+        ("return {}", "gave an empty dictionary"),
+        ("return frames.time * float('nan')", "'mine' is no finite number at frame 1"),
+        ("return ['x'] * len(frames)", "must give one number"),
+        ("return None", "must give one number"),
+        ("raise SystemExit(0)", "raised SystemExit"),
+    ],
+)  # fmt: skip
+def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys, own):
+    before = names(water)
+    (tmp_path / "own.py").write_text(f"import rigidmd\n@rigidmd.analysis\ndef mine(frames):\n    {body}\n")
+    assert words in said(capsys, water, "--trust", tmp_path / "own.py", "--only", "mine", "--from", "0.02ps")
+    assert names(water) == before
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = 1", "defines no analysis: put @rigidmd.analysis before a function of frames"),
+        ("raise ValueError('no')", "own.py raised ValueError: no"),
+        ("def (", "own.py raised SyntaxError"),
+        ("import sys; sys.exit(0)", "own.py raised SystemExit"),
+        ("import rigidmd\n@rigidmd.analysis\ndef rdf(frames): return frames.time", "own.py: rdf is an analysis that comes with"),
+        ("import rigidmd\nrigidmd.analysis(lambda frames: frames.time)", "an analysis has the name of its function"),
+    ],
+)  # fmt: skip
+def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys, own):
+    (tmp_path / "own.py").write_text(text)
+    assert words in said(capsys, water, "--trust", tmp_path / "own.py")
+
+
+def test_the_names_of_analyses_are_kept_for_them():
+    registry.chosen([])
+    assert {name for name, entry in registry.KNOWN.items() if not entry.own} == set(registry.ORDER)
+
+
+def test_a_pressure_tensor_needs_a_box():
+    asked = {"pressure_tensor_interval_ps": 0.01}
+    with pytest.raises(SceneError, match=r"output.pressure_tensor_interval_ps needs a periodic box"):
+        build(small_scene({"argon": 4}, None, output=asked))
+    for wrong in (-1, "often", True):
+        with pytest.raises(SceneError, match="pressure_tensor_interval_ps"):
+            small_scene({"argon": 4}, 25.0, output={"pressure_tensor_interval_ps": wrong})
