@@ -62,7 +62,9 @@ def dielectric(history: History) -> Finding:
             "or the liquid freezes or is polarised"
         )
     epsilon, slope = _of_fluctuation(y, around)
-    spread = float(error or np.nan) / float(size or np.nan) * y * float(slope)
+    # of the squares themselves, but not less than that of three Gaussian numbers with this correlation time
+    share = max(float(error or 0.0) / float(size or np.inf), np.sqrt(2 * correlation / (3 * history.span)))
+    spread = share * y * float(slope)
     surroundings = "tin foil" if np.isinf(around) else f"a permittivity of {around:g}"
     told = f"{surroundings} around, {forces.electrostatics}; correlation time of the dipole {correlation:.3g} ps"
     found.values.append(settled("dielectric constant", "1", float(epsilon), spread, history.span, correlation, told))

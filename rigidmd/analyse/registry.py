@@ -69,10 +69,11 @@ def chosen(names: list[str]) -> list[Analysis]:
     """The analyses of these names, or all. Raises OutputError."""
     from rigidmd.analyse import electric, flow, motion, structure, turning  # noqa: F401  (they register themselves)
 
+    known = sorted(KNOWN, key=place)
     for name in names:
         if name not in KNOWN:
-            raise OutputError(f"there is no analysis {name!r}{meant(name, KNOWN) or ';'} there are {', '.join(KNOWN)}")
-    return [KNOWN[name] for name in names] if names else sorted(KNOWN.values(), key=lambda entry: place(entry.name))
+            raise OutputError(f"there is no analysis {name!r}{meant(name, known) or ';'} there are {', '.join(known)}")
+    return [KNOWN[name] for name in names or known]
 
 
 def place(name: str) -> int:
