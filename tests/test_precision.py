@@ -501,6 +501,11 @@ def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypat
     assert told["runs"][2]["fault"].startswith("stopped at step")
     assert "pressure" not in told["quantities"]
     assert (folder / "averages.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "averages.html").read_text("utf-8")
+    assert page.count("<tr>") == 2 + 1 + 3  # heads, a method, runs
+    assert "density" in page
+    assert "at 400 fs: stopped at step" in page
+    assert "<svg" in page
     assert main(command) == 2  # nothing is overwritten
 
 

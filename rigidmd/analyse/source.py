@@ -24,10 +24,12 @@ FEW = 40
 DISTURBING = ("langevin", "andersen")
 
 
-def of_folder(record: Record, start: float | None = None, step: Callable[[int], object] = lambda n: None) -> History:
+def of_folder(
+    record: Record, start: float | None = None, step: Callable[[float], object] = lambda share: None
+) -> History:
     """The history of a run of molecules from its folder, from `start` (ps) on or where production begins.
 
-    step : called with a number of frames that are done. Raises OutputError.
+    step : called with the share that is done. Raises OutputError.
     """
     if record.is_body:
         raise OutputError(
@@ -77,7 +79,7 @@ def of_results(results: "Results", start: float | None = None) -> History:
         system.scene.output.positions == "wrapped",
     )
     columns = {name: results[name] for name in results.units}
-    return _history(system, columns, raw, results._tensor, start, [], lambda n: None)
+    return _history(system, columns, raw, results._tensor, start, [], lambda share: None)
 
 
 class _Raw:
@@ -94,7 +96,7 @@ def _history(
     tensor: np.ndarray | None,
     start: float | None,
     notes: list[str],
-    step: Callable[[int], object],
+    step: Callable[[float], object],
 ) -> History:
     stage, first, last = _last_stage(system, columns)
     if start is None:

@@ -1,4 +1,4 @@
-"""What `rigidmd precision --averages` found: a table, sentences, precision.csv and .json, averages.png."""
+"""What `rigidmd precision --averages` found: a table, sentences, precision.csv and .json, averages.png and .html."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ from rigidmd.measure.bias import SHARE, AverageRun, Averages, Quantity
 from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
 from rigidmd.output.report import signed
 
-FILES = ("precision.csv", "precision.json", "averages.png")
+FILES = ("precision.csv", "precision.json", "averages.png", "averages.html")
 
 
 def _unit(quantity: Quantity) -> str:
@@ -18,7 +18,7 @@ def _unit(quantity: Quantity) -> str:
     return quantity.bias_unit or quantity.unit
 
 
-def _scale(quantity: Quantity) -> str:
+def scale(quantity: Quantity) -> str:
     """Of what a share is told, in words."""
     if quantity.name == "U":
         return "kT per degree of freedom"
@@ -42,13 +42,15 @@ def row(found: Averages, run: AverageRun) -> list:
     return [*values, run.fault]
 
 
-def table_text(found: Averages) -> str:
-    """The table as a person reads it: biases with their errors."""
+def brief_headers(found: Averages) -> list[str]:
+    """Column titles of the table as a person reads it."""
     titles = ["method", "step (fs)", "forces/ps", "s/ns"]
-    for quantity in found.quantities:
-        unit = "kT" if quantity.name == "U" else _unit(quantity)
-        titles.append(f"{quantity.name} ({unit})")
-    lines = [titles]
+    return titles + [f"{q.name} ({'kT' if q.name == 'U' else _unit(q)})" for q in found.quantities]
+
+
+def brief_rows(found: Averages) -> list[list[str]]:
+    """Lines of that table: biases with their errors."""
+    lines = []
     for run in found.runs:
         seconds = "-" if run.seconds_per_ns is None else f"{run.seconds_per_ns:.3g}"
         cells = [run.method, f"{run.timestep:g}", f"{run.forces_per_ps:.4g}", "fails" if run.fault else seconds]
@@ -56,7 +58,13 @@ def table_text(found: Averages) -> str:
             bias = found.bias(run, quantity)
             cells.append(signed(*bias) if bias else "-")
         lines.append(cells)
-    widths = [max(len(line[k]) for line in lines) for k in range(len(titles))]
+    return lines
+
+
+def table_text(found: Averages) -> str:
+    """The table as a person reads it."""
+    lines = [brief_headers(found), *brief_rows(found)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     text = f"bias of averages over {found.sampled:g} ps of {found.stage} (U in kT per degree of freedom)\n"
     return text + "\n".join(
         "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
@@ -66,6 +74,11 @@ def table_text(found: Averages) -> str:
 
 def advice(found: Averages) -> list[str]:
     """Sentences: what biases are held against, at which step each is 1 %, what failed."""
+    return [*references(found), *_off_words(found), *faults(found)]
+
+
+def references(found: Averages) -> list[str]:
+    """Sentences: what biases are held against."""
     lines = []
     for quantity in found.quantities:
         fit = found.fit(quantity)
@@ -76,20 +89,41 @@ def advice(found: Averages) -> list[str]:
         lines.append(f"{quantity.name} at a step of zero: {told} {quantity.unit}, from {how}")
     if any(quantity.exact is not None for quantity in found.quantities):
         lines.append(f"temperatures are held against {found.temperature:g} K")
+    return lines
+
+
+def off(found: Averages, method: str, quantity: Quantity) -> str:
+    """The step at which a method's bias is 1 %, in words; empty where nothing tells it."""
+    at = found.off_at(method, quantity)
+    if at is None:
+        return ""
+    step, seen = at
+    return f"{step:.2g} fs" if seen else f"none seen, more than {step:.2g} fs"
+
+
+def methods_of(found: Averages) -> list[str]:
+    """Integrators with their thermostats."""
+    return list(dict.fromkeys(run.method for run in found.runs))
+
+
+def _off_words(found: Averages) -> list[str]:
+    lines = []
     for quantity in found.quantities:
-        steps = [
-            f"{method} {step:.2g} fs" if seen else f"{method} none seen, more than {step:.2g} fs"
-            for method in dict.fromkeys(run.method for run in found.runs)
-            if (at := found.off_at(method, quantity))
-            for step, seen in [at]
-        ]
+        steps = [f"{method} {told}" for method in methods_of(found) if (told := off(found, method, quantity))]
         if steps:
-            lines.append(f"{quantity.name} is off by {SHARE:.0%} of {_scale(quantity)} at: {'; '.join(steps)}")
-    return lines + [f"{run.method} at {run.timestep:g} fs: {run.fault}" for run in found.runs if run.fault]
+            lines.append(f"{quantity.name} is off by {SHARE:.0%} of {scale(quantity)} at: {'; '.join(steps)}")
+    return lines
+
+
+def faults(found: Averages) -> list[str]:
+    """Sentences: what failed."""
+    return [f"{run.method} at {run.timestep:g} fs: {run.fault}" for run in found.runs if run.fault]
 
 
 def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
     """All files; the paths written."""
+    from rigidmd.output.averages_page import averages_page
+
     with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(headers(found))
@@ -97,6 +131,8 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
     with whole_file(folder / FILES[1]) as temporary:
         temporary.write_text(json.dumps(as_data(found, command), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     draw(folder / FILES[2], found)
+    with whole_file(folder / FILES[3]) as temporary:
+        temporary.write_text(averages_page(found, command), encoding="utf-8")
     return [folder / name for name in FILES]
 
 
@@ -119,8 +155,7 @@ def _described(found: Averages, quantity: Quantity) -> dict:
     fit = found.fit(quantity)
     if fit is None:
         return {"unit": quantity.unit}
-    methods = dict.fromkeys(run.method for run in found.runs)
-    off = {method: at for method in methods if (at := found.off_at(method, quantity))}
+    steps = {method: at for method in methods_of(found) if (at := found.off_at(method, quantity))}
     return {
         "unit": quantity.unit,
         "bias_unit": _unit(quantity),
@@ -128,7 +163,7 @@ def _described(found: Averages, quantity: Quantity) -> dict:
         "reference_error": fit.limit_error,
         "longest_step_in_fit_fs": fit.longest,
         "bias_told_of": found.allowed(quantity),
-        "step_of_that_bias_fs": {method: {"step": step, "seen": seen} for method, (step, seen) in off.items()},
+        "step_of_that_bias_fs": {method: {"step": step, "seen": seen} for method, (step, seen) in steps.items()},
     }
 
 
@@ -151,37 +186,46 @@ def _told(found: Averages, run: AverageRun) -> dict:
 
 
 def draw(path: Path, found: Averages) -> None:
-    """Bias against the step, a panel a quantity, with error bars and the 1 % lines."""
+    """averages.png."""
+    figure = figure_of(found)
+    figure.suptitle(f"{found.name}: bias of averages over {found.sampled:g} ps", color=INK, x=0.01, ha="left",
+                    fontsize=11)  # fmt: skip
+    with whole_file(path) as temporary:
+        save_figure(figure, temporary, dpi=150)
+
+
+def figure_of(found: Averages):
+    """Bias against the step, a panel a quantity, with error bars and the band within 1 %."""
     from matplotlib.figure import Figure
 
     shown = [quantity for quantity in found.quantities if found.points(quantity)]
     columns = min(3, max(1, len(shown)))
     rows = max(1, -(-len(shown) // columns))
-    figure = Figure(figsize=(3.7 * columns, 2.9 * rows + 0.9), layout="constrained")
+    figure = Figure(figsize=(3.7 * columns, 3.0 * rows + 0.9), layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-    methods = list(dict.fromkeys(run.method for run in found.runs))
+    methods = methods_of(found)
     handles = {}
     for axis, quantity in zip(axes, shown, strict=False):
+        allowed = found.allowed(quantity)
+        axis.axhspan(-allowed, allowed, color=FAINT, alpha=0.15, lw=0)
         axis.axhline(0, color=INK, lw=0.7)
-        for side in (-1, 1):
-            axis.axhline(side * found.allowed(quantity), color=FAINT, lw=0.8, ls=":")
         for method, runs in groupby(found.runs, key=lambda run: run.method):
             at = [(run.timestep, *bias) for run in runs if (bias := found.bias(run, quantity))]
             if at:
                 steps, values, errors = zip(*at, strict=True)
                 style = curve_style(methods.index(method))
                 handles[method] = axis.errorbar(steps, values, errors, ms=3.5, lw=1.1, capsize=2, **style)
-        axis.set_title(f"{quantity.name}, {_unit(quantity)}", loc="left", fontsize=9, color=INK)
+        axis.set_title(f"{quantity.name}, {_unit(quantity)}", loc="left", fontsize=9, color=INK, pad=17)
+        axis.annotate(f"band: {SHARE:.0%} of {scale(quantity)}", (0, 1), (0, 4), xycoords="axes fraction",
+                      textcoords="offset points", fontsize=7, color=FAINT)  # fmt: skip
         axis.set_xlim(left=0)
+        axis.tick_params(colors=INK)
+        axis.spines[:].set_color(INK)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.annotate(f"{SHARE:.0%} of {_scale(quantity)}", (0.02, found.allowed(quantity)),
-                      xycoords=("axes fraction", "data"), fontsize=7, color=FAINT, ha="left", va="bottom")  # fmt: skip
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
     for axis in axes[max(0, len(shown) - columns) : len(shown)]:
-        axis.set_xlabel("time step, fs")
-    figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside lower left", ncols=2)
-    figure.suptitle(f"{found.name}: bias of averages over {found.sampled:g} ps", color=INK, x=0.01, ha="left",
-                    fontsize=11)  # fmt: skip
-    with whole_file(path) as temporary:
-        save_figure(figure, temporary, dpi=150)
+        axis.set_xlabel("time step, fs", color=INK)
+    figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside lower left", ncols=2,
+                  labelcolor=INK)  # fmt: skip
+    return figure

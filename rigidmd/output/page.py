@@ -2,6 +2,7 @@
 
 import html
 import io
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -48,7 +49,8 @@ class Raw(str):
 
 def _cell(value: object) -> str:
     text = plain(value)
-    return f'<td class="wrap">{text}</td>' if len(str(value)) > 40 else f"<td>{text}</td>"
+    seen = re.sub(r"<[^>]*>", "", text) if isinstance(value, Raw) else str(value)
+    return f'<td class="wrap">{text}</td>' if len(seen) > 40 else f"<td>{text}</td>"
 
 
 def plain(value: object) -> str:
