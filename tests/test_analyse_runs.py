@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import MDAnalysis
@@ -20,7 +21,7 @@ import rigidmd
 from rigidmd import Scene, Simulation, cli
 from rigidmd.analyse import registry
 from rigidmd.analyse.electric import total_dipole
-from rigidmd.analyse.source import of_folder
+from rigidmd.analyse.source import _last_stage, of_folder
 from rigidmd.assemble.system import build
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.output.record import read_record
@@ -515,3 +516,53 @@ def test_a_pressure_tensor_needs_a_box():
     for wrong in (-1, "often", True):
         with pytest.raises(SceneError, match="pressure_tensor_interval_ps"):
             small_scene({"argon": 4}, 25.0, output={"pressure_tensor_interval_ps": wrong})
+
+
+@pytest.fixture(scope="module")
+def text_run(tmp_path_factory):
+    """A run whose frames are text."""
+    folder = tmp_path_factory.mktemp("runs") / "text"
+    more = {"output.trajectory": "t.xyz", "stages.1.duration_ps": 0.04, "output.pressure_tensor_interval_ps": False}
+    Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT | more), folder).run()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda frames: [*frames[:9], [frames[9][0].replace("648", "647"), *frames[9][1:-1]], *frames[10:]], "frame 10 of 16 is not one of 648 sites"),
+        (lambda frames: [*frames[:9], [*frames[9][:2], "OW nan 0 0", *frames[9][3:]], *frames[10:]], "no finite number"),
+        (lambda frames: [*frames[:9], [*frames[9][:2], "OW 900.0 0 0", *frames[9][3:]], *frames[10:]], "frame 5: a site of molecule 1 is"),
+        (lambda frames: frames[:6], "from 0.02 ps on there is 1 of 6 frames; an analysis needs two at least"),
+        (lambda frames: [*frames[:9], *frames[10:]], "needs frames at equal times; here they are 0.004 to 0.008 ps apart"),
+    ],
+    ids=["number", "nan", "torn", "one", "uneven"],
+)  # fmt: skip
+def test_frames_that_are_spoilt_are_told(spoil, words, text_run, tmp_path, capsys):
+    folder = Path(shutil.copytree(text_run, tmp_path / "run"))
+    lines = (folder / "t.xyz").read_text().splitlines()
+    frames = [lines[k : k + 650] for k in range(0, len(lines), 650)]
+    (folder / "t.xyz").write_text("\n".join(line for frame in spoil(frames) for line in frame) + "\n")
+    assert words in said(capsys, folder, "--only", "msd", "--from", "0.02ps")
+
+
+def test_friction_on_each_molecule_is_told(water):
+    record = read_record(water)
+    assert "thermostat" not in " ".join(of_folder(record, 0.02).notes)
+    stages = tuple(s.model_copy(update={"ensemble": "nvt", "thermostat": "langevin"}) for s in record.scene.stages)
+    scene = record.molecules.scene.model_copy(update={"stages": stages})
+    columns = record.columns | {"stage_name": np.full(len(record.columns["time"]), "nvt")}
+    told = of_folder(replace(record, system=replace(record.molecules, scene=scene), columns=columns), 0.02).notes
+    assert "the thermostat langevin acts on each molecule" in " ".join(told)
+
+
+def test_stages_of_one_name_are_told_apart(water):
+    """Production is the last stage, also where an earlier one has its name."""
+    record = read_record(water)
+    first, second = record.scene.stages
+    scene = record.scene.model_copy(
+        update={"stages": tuple(s.model_copy(update={"name": "x"}) for s in (first, second))}
+    )
+    columns = record.columns | {"stage_name": np.full(len(record.columns["time"]), "x")}
+    stage, begin, end = _last_stage(replace(record.molecules, scene=scene), columns)
+    assert (stage.ensemble, begin, end) == ("nve", pytest.approx(0.02), pytest.approx(0.22))

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 MOST_NUMBERS = 150_000_000
 #: Samples of a stage without which its equilibration is not looked for.
 FEW = 40
+#: Thermostats that act on the motion of single molecules.
+DISTURBING = ("langevin", "andersen")
 
 
 def of_folder(
@@ -105,6 +107,12 @@ def _history(
         begin = start
         if begin < first:
             notes = [*notes, f"frames before {first:g} ps are of an earlier stage"]
+    if stage.thermostat_kind in DISTURBING:
+        notes = [
+            *notes,
+            f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and turning, and "
+            "changes spectra and viscosity; take nve or velocity_rescaling for those",
+        ]
     slack = 1e-6 * max(abs(last), 1.0)
     keep = np.flatnonzero((raw.time >= begin - slack) & (raw.time <= last + slack))
     keep = keep[np.diff(raw.time[keep], prepend=-np.inf) > 0]  # not the start of a stage after the end of another

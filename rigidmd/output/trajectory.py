@@ -170,6 +170,8 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
             try:
                 frame = reader[k]
             except (OSError, EOFError, ValueError):
+                if k + stride < count:  # what follows a frame is no rest of it
+                    raise OutputError(f"{path}: frame {k + 1} of {count} is not one of {sites} sites") from None
                 is_cut = True
                 break
             times.append(frame.time)
