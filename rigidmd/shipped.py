@@ -23,6 +23,7 @@ CHAPTERS = (
     "molecule",
     "ensembles",
     "looking",
+    "measuring",
     "extending",
     "manual",
     "benchmarks",

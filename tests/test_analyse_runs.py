@@ -272,7 +272,7 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
         "-b", "0.0199", "-xvg", "none", "-temp", "300", text="System\n")  # fmt: skip
     _, x, y, z, _ = xvg(topology / "Mtot.xvg")
     own = total_dipole(history) / DEBYE
-    assert np.allclose(np.array([x, y, z]).T, own, rtol=1e-6, atol=2e-4)
+    assert pytest.approx(own, abs=2e-4) == np.array([x, y, z]).T
     assert np.abs(own).max() > 10.0
 
 
@@ -321,7 +321,7 @@ def test_names_of_sites_are_suggested(water):
     with pytest.raises(OutputError, match=r"^there is no site 'Xe'; there are OW"):
         rdf(history, "Xe")
     for largest, width in ((20.0, 0.1), (-1.0, 0.1), (5.0, 0.0), (5.0, 6.0), (np.nan, 0.1), (5.0, np.nan)):
-        with pytest.raises(OutputError, match=r"is not possible: half the box is 9\.3"):
+        with pytest.raises(OutputError, match="is not possible: half the box is 9.3"):
             rdf(history, "OW", largest=largest, width=width)
     with pytest.raises(OutputError, match="there is no axis 'w'; name x, y or z"):
         registry.chosen(["density_profile"])[0].function(history, "w")

@@ -41,14 +41,7 @@ def analyse_folder(folder: Path, task: Task, step: Callable[[float, str], object
     """
     entries = chosen(task.names)
     step(0.0, "reading frames")
-    frames = 0
-
-    def read(count: int) -> None:
-        nonlocal frames
-        frames += count
-        step(READING * frames / (frames + 200), "reading frames")
-
-    history = of_folder(read_record(folder), task.start, read)
+    history = of_folder(read_record(folder), task.start, lambda share: step(READING * share, "reading frames"))
     findings, failed = [], {}
     for k, entry in enumerate(entries):
         step(READING + (1 - READING) * k / len(entries), entry.name)

@@ -298,13 +298,13 @@ def rebuilt(
     velocities: np.ndarray | None,
     cells: np.ndarray,
     wrapped: bool,
-    step: Callable[[int], object] = lambda frames: None,
+    step: Callable[[float], object] = lambda share: None,
 ) -> tuple[Bodies, list[str]]:
     """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
 
     sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
     wrapped : whether centres were put into the box; their paths are made continuous
-    step : called with 1 after each frame
+    step : called with the share that is done
     """
     fit, n, f = Rebuilt(system), len(system.model.species), len(sites)
     turning = n if len(system.state.rotation) else 0
@@ -318,7 +318,7 @@ def rebuilt(
         for array, values in zip((position, Q, velocity, L), found, strict=True):
             if array is not None:
                 array[k] = values
-        step(1)
+        step((k + 1) / f)
     notes = []
     if wrapped and np.isfinite(cells[0, 0, 0]) and f > 1:
         inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))

@@ -22,10 +22,12 @@ MOST_NUMBERS = 150_000_000
 FEW = 40
 
 
-def of_folder(record: Record, start: float | None = None, step: Callable[[int], object] = lambda n: None) -> History:
+def of_folder(
+    record: Record, start: float | None = None, step: Callable[[float], object] = lambda share: None
+) -> History:
     """The history of a run of molecules from its folder, from `start` (ps) on or where production begins.
 
-    step : called with a number of frames that are done. Raises OutputError.
+    step : called with the share that is done. Raises OutputError.
     """
     if record.is_body:
         raise OutputError(
@@ -74,7 +76,7 @@ def of_results(results: "Results", start: float | None = None) -> History:
         system.scene.output.positions == "wrapped",
     )
     columns = {name: results[name] for name in results.units}
-    return _history(system, columns, raw, results._tensor, start, [], lambda n: None)
+    return _history(system, columns, raw, results._tensor, start, [], lambda share: None)
 
 
 class _Raw:
@@ -91,7 +93,7 @@ def _history(
     tensor: np.ndarray | None,
     start: float | None,
     notes: list[str],
-    step: Callable[[int], object],
+    step: Callable[[float], object],
 ) -> History:
     stage, first, last = _last_stage(system, columns)
     if start is None:
