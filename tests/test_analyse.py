@@ -580,8 +580,8 @@ def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
         (tensor[:1], "needs the pressure tensor"),
         (tensor[:990], r"at least; there are 19.8 ps of it"),
         (tensor[np.r_[:500, 600:2000]], "at equal times"),
-        (tensor[::10], "0.2 ps apart are too far from each other"),
-        (tensor[::100], "2 ps apart are too far from each other"),
+        (tensor[::10], "0.2 ps apart are too far apart"),
+        (tensor[::100], "2 ps apart are too far apart"),
     ):
         with pytest.raises(OutputError, match=words):
             viscosity(history(system, time, None, box, tensor=lines))

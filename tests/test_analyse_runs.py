@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -103,7 +104,8 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     assert list(table(copy / "rdf.csv"))[:4] == ["r (A)", "g O-O", "g O-O error", "n O-O"]
     bonds = found["hydrogen_bonds"]["values"][0]
     assert 1.0 < bonds["value"] < 4.5
-    assert "D of spce: this run is" in text and "too short for a value" in text
+    for name in ("D of spce", "tau1 of spce, axis 2", "D_rot of spce, axis 1", "dielectric constant"):
+        assert re.search(rf"^  {name}: .* too short for a value$", text, re.MULTILINE), name
     # once more, of one analysis: the same bits, and the others stay
     kept = {name: (copy / name).read_bytes() for name in [*files, "analysis.json"] if not name.endswith(".png")}
     assert cli.main(["analyse", str(copy), "--only", "rdf, orientation", "--from", "0.02ps"]) == 0
@@ -128,6 +130,7 @@ def test_results_in_memory_and_from_the_folder_agree(water):
     history = of_folder(read_record(water), 0.02)
     for name, options, column in (
         ("rdf", {"first": "OW", "second": "HW", "width": 0.2}, "g OW-HW"),
+        ("structure_factor", {"name": "OW", "largest": 3.0}, "S OW"),
         ("msd", {}, "MSD spce (A^2)"),
         ("orientation", {}, "C2 spce axis 2"),
         ("spectrum", {}, "omega spce axis 1"),
@@ -272,7 +275,7 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
         "-b", "0.0199", "-xvg", "none", "-temp", "300", text="System\n")  # fmt: skip
     _, x, y, z, _ = xvg(topology / "Mtot.xvg")
     own = total_dipole(history) / DEBYE
-    assert pytest.approx(own, abs=2e-4) == np.array([x, y, z]).T
+    assert np.abs(np.array([x, y, z]).T - own).max() < 2e-4
     assert np.abs(own).max() > 10.0
 
 
@@ -321,7 +324,7 @@ def test_names_of_sites_are_suggested(water):
     with pytest.raises(OutputError, match=r"^there is no site 'Xe'; there are OW"):
         rdf(history, "Xe")
     for largest, width in ((20.0, 0.1), (-1.0, 0.1), (5.0, 0.0), (5.0, 6.0), (np.nan, 0.1), (5.0, np.nan)):
-        with pytest.raises(OutputError, match="is not possible: half the box is 9.3"):
+        with pytest.raises(OutputError, match=r"is not possible: half the box is 9\.3"):
             rdf(history, "OW", largest=largest, width=width)
     with pytest.raises(OutputError, match="there is no axis 'w'; name x, y or z"):
         registry.chosen(["density_profile"])[0].function(history, "w")

@@ -58,7 +58,9 @@ def stopped_at(steps: set[int]) -> Every:
 def contents(folder: Path) -> dict[str, bytes]:
     """The files of a run that have to be the same to the bit."""
     names = [
-        path.name for path in folder.iterdir() if path.name.startswith(("trajectory", "log", "topology", "motion"))
+        path.name
+        for path in folder.iterdir()
+        if path.name.startswith(("trajectory", "log", "topology", "motion", "pressure_tensor"))
     ]
     found = {name: (folder / name).read_bytes() for name in names}
     if (folder / "final.npz").exists():
@@ -88,8 +90,10 @@ def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
 
 
 def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
-    """Two stages, mixed precision, a box that moves, a ramp."""
-    same_after_stops(scene(NVT, NPT, NVE, precision="mixed"), [3, 61, 100, 133, 207], tmp_path)
+    """Two stages, mixed precision, a box that moves, a ramp, a pressure tensor of its own."""
+    output = WATER["output"] | {"pressure_tensor_interval_ps": 0.01}
+    same_after_stops(scene(NVT, NPT, NVE, precision="mixed", output=output), [3, 61, 100, 133, 207], tmp_path)
+    assert (tmp_path / "whole" / "pressure_tensor.csv").read_text().count("\n") == 32
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Correlation functions over all origins, by fast Fourier transforms."""
 
+from typing import Any
+
 import numpy as np
 from scipy import fft
 
@@ -11,13 +13,13 @@ def correlation(series: np.ndarray, lags: int) -> np.ndarray:
     """<x(0) x(t)> at the first `lags` lags, mean over origins and over all series (f, ...) together."""
     frames = len(series)
     flat = series.reshape(frames, -1)
-    size = fft.next_fast_len(frames + lags, real=True)
+    size = int(fft.next_fast_len(frames + lags, True) or 0)
     power = np.zeros(size // 2 + 1)
     chunk = max(1, AT_ONCE // size)
     for first in range(0, flat.shape[1], chunk):
-        found = fft.rfft(flat[:, first : first + chunk], size, axis=0)
+        found: Any = fft.rfft(flat[:, first : first + chunk], size, axis=0)
         power += np.einsum("fm,fm->f", found.real, found.real) + np.einsum("fm,fm->f", found.imag, found.imag)
-    return fft.irfft(power, size)[:lags] / (frames - np.arange(lags)) / flat.shape[1]
+    return np.asarray(fft.irfft(power, size))[:lags] / (frames - np.arange(lags)) / flat.shape[1]
 
 
 def squared_displacement(path: np.ndarray, lags: int) -> np.ndarray:

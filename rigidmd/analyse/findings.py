@@ -89,7 +89,9 @@ class Finding:
         raise KeyError(f"no value {name!r}; there are {', '.join(value.name for value in self.values)}")
 
     def __str__(self) -> str:
-        return "\n".join([f"{self.about}:", *(f"  {told}" for told in [*self.values, *self.notes])])
+        curves = [f"{', '.join(curve.columns)} against {curve.axis[0]}" for curve in self.curves]
+        lines = [*self.values, *([] if self.values else curves), *self.notes]
+        return "\n".join([f"{self.about}:", *(f"  {line}" for line in lines)])
 
     __repr__ = __str__
 

@@ -19,6 +19,8 @@ FEWEST, CLOSE = 8, 0.5
 #: The fit ends where the standard error of the mean integral is this fraction of it. With 0.15 the noise of the tail
 #: makes values 5 to 13% too large (400 ps, correlation times of 0.1 to 0.8 ps); with 0.05 fits of 0.4 ns end too early.
 DOUBT = 0.08
+#: Share of the integral that the second half of the fit may add: what an exponential adds with 2.2 of its times there.
+GROWS = 0.25
 #: Stretches drawn again, with repetition, for the error of the fit.
 DRAWS = 50
 
@@ -84,8 +86,9 @@ def viscosity(history: History) -> Finding:
         Curve("viscosity", axis, "viscosity (mPa s)", {title: mean[:end]}, errors),
         Curve("stress_correlation", axis, "correlation of stress", {"correlation": memory[:end]}, level=0.0),
     ]
-    if whole is None or len(drawn) < DRAWS // 2:
-        told = "the integral of the stress correlation does not settle: too short for a value"
+    grows = float(mean[end - 1] - mean[end // 2]) > GROWS * float(mean[end - 1])
+    if whole is None or grows or len(drawn) < DRAWS // 2:
+        told = f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps: too short for a value"
         found.values.append(Value("viscosity", "mPa s", None, None, None, told))
         return found
     forgets = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0
@@ -105,7 +108,7 @@ def viscosity(history: History) -> Finding:
 
 def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float | None:
     """Limit of a running integral by a fit of two exponentials; None where the fit fails."""
-    top, longest = float(np.max(values)), float(time[-1])
+    top, longest = float(np.max(values)), float(time[-1]) / 2  # times that were not seen to decay are noise
     if not top > 0:
         return None
 

@@ -76,7 +76,7 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
         return np.array([_slope(time, seen), _slope(time[half:], seen[half:]) - _slope(time[:half], seen[:half])]) / 6
 
     values, errors = over_blocks(history, slopes)
-    found = Finding("diffusion", "diffusion coefficients")
+    found = Finding("diffusion", "diffusion coefficients", curves=[_so_far(history, interval, lags)])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
     edge = _cubic_edge(history)
     eta = viscosity_of(history) if viscosity_mPa_s is None else None
@@ -109,6 +109,17 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
     if edge is None and history.has_box:
         found.notes.append("no correction for the size of the box: that of Yeh and Hummer is for cubic boxes")
     return found
+
+
+def _so_far(history: History, interval: float, lags: int) -> Curve:
+    """MSD/6t of each species, which tends to D."""
+    time = interval * np.arange(1, lags)
+    values, errors = over_blocks(history, lambda part: _displacements(part, lags)[1:] / (6 * NM2_PER_S * time[:, None]))
+    curve = Curve("diffusion", ("Time (ps)", time), "MSD/6t (1e-9 m²/s)", {})
+    for k, kind in enumerate(history.moving):
+        title = f"MSD/6t {kind.name} (1e-9 m^2/s)"
+        curve.columns[title], curve.errors[title] = values[:, k], errors[:, k]
+    return curve
 
 
 def _slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:

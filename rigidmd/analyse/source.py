@@ -33,7 +33,8 @@ def of_folder(
         raise OutputError(
             f"{record.folder} is the run of a single body, and analyses are of molecules; `rigidmd report` shows it"
         )
-    system, output = record.molecules, record.scene.output
+    system = record.molecules
+    output = system.scene.output
     if not output.trajectory:
         raise OutputError(f"{record.folder}: this run wrote no trajectory (output.trajectory = false) to analyse")
     path = record.folder / output.trajectory

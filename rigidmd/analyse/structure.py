@@ -4,7 +4,7 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from rigidmd.analyse.findings import BLOCKS, Curve, Finding, Value, over_blocks
+from rigidmd.analyse.findings import BLOCKS, Curve, Finding, Value, correlation_time, over_blocks
 from rigidmd.analyse.history import History, Kind
 from rigidmd.analyse.registry import built_in
 from rigidmd.errors import OutputError
@@ -67,7 +67,8 @@ def rdf(
         curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
         if len(parts) > 1:
             curve.errors[title] = np.std(parts, axis=0, ddof=1) / np.sqrt(len(parts))
-        found.values += _peaks(f"{a}-{b}", r, curve.columns[title], parts, shells, density)
+        gap = thinned.span / max(1, len(thinned) - 1)
+        found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, gap)
     if len(thinned) < len(history):
         found.notes.append(f"of {len(thinned)} of {len(history)} frames, evenly spaced")
     return found
@@ -111,37 +112,35 @@ def _g(history: History, frame: int, a: str, b: str, width: float, bins: int, sh
 
 
 def _peaks(
-    name: str, r: np.ndarray, g: np.ndarray, parts: list[np.ndarray], shells: np.ndarray, density: float
+    name: str, r: np.ndarray, frames: np.ndarray, parts: list[np.ndarray], filled: np.ndarray, gap: float
 ) -> list[Value]:
-    """Place and height of the first peak, and neighbours up to the first minimum, if there is a peak."""
+    """Place and height of the first peak, and neighbours up to the first minimum, if there is a peak.
+
+    frames (f, bins) : g(r) of each, `gap` ps apart; parts : means of blocks; filled (bins,) : neighbours where g is 1
+    """
+
+    def valley(g: np.ndarray) -> int:
+        top = _first_top(g)
+        return top + int(np.argmin(g[top : top + max(3, int(0.9 * top))]))
 
     def seen(g: np.ndarray) -> np.ndarray:
         top = _first_top(g)
         low, middle, high = g[top - 1 : top + 2]
         bend = low - 2 * middle + high
         shift = 0.5 * (low - high) / bend if bend < 0 else 0.0
-        rest = g[top : top + max(3, int(0.9 * top))]
-        valley = top + int(np.argmin(rest))
-        return np.array(
-            [
-                r[top] + shift * (r[1] - r[0]),
-                middle - 0.25 * (low - high) * shift,
-                np.sum((g * shells)[:valley]) * density,
-            ]
-        )
+        place, height = r[top] + shift * (r[1] - r[0]), middle - 0.25 * (low - high) * shift
+        return np.array([place, height, np.sum((g * filled)[: valley(g)])])
 
+    g = frames.mean(axis=0)
     if g.max() < 1.05 or not 0 < _first_top(g) < len(g) - 3:
         return []
     whole = seen(g)
     usable = [seen(part) for part in parts if part.max() > 1.05 and 0 < _first_top(part) < len(g) - 3]
     error = np.std(usable, axis=0, ddof=1) / np.sqrt(len(usable)) if len(usable) > 1 else [None] * 3
-    titles = (
-        ("g {}: first peak", "Å"),
-        ("g {}: height of that peak", "1"),
-        ("g {}: neighbours up to the first minimum", "1"),
-    )
+    tau = correlation_time((frames * filled)[:, : valley(g)].sum(axis=1), gap) if len(frames) > 2 else None
+    titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
     return [
-        Value(title.format(name), unit, float(value), None if e is None else float(e))
+        Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
         for (title, unit), value, e in zip(titles, whole, error, strict=True)
     ]
 
@@ -192,11 +191,9 @@ def structure_factor(history: History, name: str = "", largest: float = LARGEST_
         curve.errors[title] = np.std(parts, axis=0, ddof=1) / np.sqrt(len(parts))
         top = int(np.argmax(curve.columns[title]))
         height, error = float(curve.columns[title][top]), float(curve.errors[title][top])
-        found.values += [
-            Value(
-                "highest peak of S(k)", "1", height, error, note=f"at {length[top]:.2f} 1/Å, bins of {WAVE_WIDTH} 1/Å"
-            )
-        ]
+        told = f"at {length[top]:.2f} 1/Å, bins of {WAVE_WIDTH} 1/Å"
+        tau = correlation_time(values[:, top], thinned.span / (len(thinned) - 1))
+        found.values.append(Value("highest peak of S(k)", "1", height, error, tau, told))
     if len(thinned) < len(history):
         found.notes.append(
             f"of {len(thinned)} of {len(history)} frames, and up to {WAVES} wave vectors in each of {bins} bins"
@@ -276,7 +273,8 @@ def hydrogen_bonds(history: History, distance: float = BOND, angle: float = BOND
     curve = Curve("hydrogen_bonds", ("hydrogen bonds", np.arange(most)), "share of molecules", {"share": share})
     told = [f"of {len(thinned)} of {len(history)} frames"] if len(thinned) < len(history) else []
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
-    found = Value("hydrogen bonds of a molecule", "1", value, error if len(each) > 2 else None, note=about)
+    tau = correlation_time(each, thinned.span / (len(thinned) - 1))
+    found = Value("hydrogen bonds of a molecule", "1", value, error if len(each) > 2 else None, tau, about)
     return Finding("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], told)
 
 

@@ -1,5 +1,7 @@
 """How molecules turn and shake: orientational correlation, rotational diffusion, spectra; from Q, L and V."""
 
+from typing import Any
+
 import numpy as np
 from scipy import signal
 
@@ -13,6 +15,8 @@ from rigidmd.mechanics.inertia import rotational_freedom
 
 #: Correlation below which the integral of a correlation function ends; what follows is an exponential.
 TAIL = 0.05
+#: Correlation at the longest lag above which there is no value: too much of the integral would be that exponential.
+HIGH = 0.2
 #: rad: largest turn between two frames, root mean square, at which turns about the body's axes can be added up.
 LARGEST_TURN = 0.7
 #: Correlation of a velocity over one interval of frames below which these are too far apart for a spectrum.
@@ -63,7 +67,7 @@ def orientation(history: History) -> Finding:
                 curve.columns[title], curve.errors[title] = values[l, :-1], errors[l, :-1]
                 tau, error, left = float(values[l, -1]), float(errors[l, -1]), float(values[l, -2])
                 name = f"tau{l + 1} of {kind.name}, axis {axis + 1}"
-                if left > 0.5:
+                if left > HIGH:
                     told = f"C{l + 1} is still {left:.2f} after {time[-1]:.3g} ps: too short for a value"
                     found.values.append(Value(name, "ps", None, None, None, told))
                 else:
@@ -201,6 +205,7 @@ def _density_of_states(values: np.ndarray, interval: float, size: int, weight: f
     total, n = 0.0, values.shape[1]
     for first in range(0, n, 256):
         part = values[:, first : first + 256].reshape(len(values), -1)
-        _, density = signal.welch(part, 1 / interval, "hann", size, detrend=False, axis=0)
+        no: Any = False  # which the types of SciPy do not know
+        _, density = signal.welch(part, 1 / interval, "hann", size, detrend=no, axis=0)
         total = total + density.sum(axis=1)
     return weight * np.asarray(total) * PER_CM / n

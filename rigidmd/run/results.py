@@ -125,7 +125,7 @@ class Results:
             )
         return trajectory.in_memory(self.system, self._frames)
 
-    def analyse(self, name: str, start: float | None = None, **options: Any) -> "Finding":
+    def analyse(self, name: str, /, start: float | None = None, **options: Any) -> "Finding":
         """The analysis of this name, one's own (`rigidmd.analysis`) or one that comes with rigidmd, as a `Finding`.
 
         start : ps, where frames begin to count; default: where the run is found to be equilibrated. Other options are
