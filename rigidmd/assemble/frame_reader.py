@@ -2,7 +2,8 @@
 
 The C code that reads these formats crashes on damaged files, and such a crash must not end a run. TARGET, an .npz, gets
 `fault`, or position (n, 3) in Å and, where the file has them, velocity (n, 3) in Å/ps and cell (3, 3) in Å. FRAME is 1
-for the first and -1 for the last. ATOMS is the number of atoms that there must be.
+for the first and -1 for the last; with 0 all frames of an .xtc are tried, and TARGET gets their `count`. ATOMS is the
+number of atoms that there must be.
 """
 
 import sys
@@ -16,6 +17,8 @@ NM = 10.0  # Å
 
 def read(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
     """The arrays of a frame. Raises whatever the readers do."""
+    if frame == 0:
+        return _tried(path)
     return {".xtc": _gromacs, ".trr": _gromacs}.get(Path(path).suffix.lower(), _others)(path, frame, atoms)
 
 
@@ -35,6 +38,20 @@ def _gromacs(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
         if found.box.any():
             arrays["cell"] = found.box * NM
     return arrays
+
+
+def _tried(path: str) -> dict[str, np.ndarray]:
+    """How many frames of an .xtc can be read."""
+    from MDAnalysis.lib.formats.libmdaxdr import XTCFile
+
+    count = 0
+    with XTCFile(path) as file:
+        try:
+            for _ in file:
+                count += 1
+        except OSError:  # it ends within a frame
+            pass
+    return {"count": np.array(count)}
 
 
 def _others(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:

@@ -27,12 +27,12 @@ def read_trajectory(path: Path, frame: int | None, named: Callable[[], Atoms] | 
     if named is None:
         return _read_gsd(path, frame)
     atoms = named()
-    found = _arrays(path, frame, len(atoms.names))
+    found = read_apart(path, frame, len(atoms.names))
     return atoms._replace(position=found["position"], velocity=found.get("velocity"), cell=found.get("cell"))
 
 
-def _arrays(path: Path, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """What `frame_reader` finds. Raises StructureError."""
+def read_apart(path: Path, frame: int, atoms: int) -> dict[str, np.ndarray]:
+    """What `frame_reader` finds, as a program of its own, which a damaged file may crash. Raises StructureError."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "frame.npz"
         command = [sys.executable, "-P", str(PROGRAM), str(path), str(frame), str(atoms), str(target)]

@@ -26,8 +26,9 @@ from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.gsd_format import GsdReader
 from rigidmd.assemble.system import System
+from rigidmd.assemble.trajectory_formats import read_apart
 from rigidmd.core.state import State
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, StructureError
 from rigidmd.output.connections import charges, connections
 from rigidmd.output.frame import Frame
 
@@ -147,6 +148,11 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
     Raises OutputError if the file cannot be read, or holds another number of sites.
     """
     fault = ""
+    if path.suffix == ".xtc":  # a damaged one crashes the library beneath its reader
+        try:
+            read_apart(path, 0, sites)
+        except StructureError as error:
+            raise OutputError(str(error)) from None
     with _quiet():
         try:
             return _frames(path, sites, most)
