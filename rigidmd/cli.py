@@ -357,8 +357,8 @@ def _run(options: argparse.Namespace) -> int:
     if results.interrupted:
         print(f"  `rigidmd resume {shlex.quote(str(folder))}` goes on with it")
     else:
-        where = shlex.quote(str(folder))
-        print(f"  `rigidmd view {where}` shows its film on a page, `rigidmd analyse {where}` measures it")
+        more = "report` the page alone" if scene.is_body else f"analyse {shlex.quote(str(folder))}` measures it"
+        print(f"  `rigidmd view {shlex.quote(str(folder))}` shows its film on a page, `rigidmd {more}")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0

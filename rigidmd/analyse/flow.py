@@ -92,17 +92,8 @@ def viscosity(history: History) -> Finding:
         found.values.append(Value("viscosity", "mPa s", None, None, None, told))
         return found
     forgets = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0
-    found.values.append(
-        settled(
-            "viscosity",
-            "mPa s",
-            whole,
-            float(np.std(drawn)),
-            float(gaps.sum()),
-            forgets,
-            f"fitted up to {time[end - 1]:.3g} ps",
-        )
-    )
+    told = f"fitted up to {time[end - 1]:.3g} ps"
+    found.values.append(settled("viscosity", "mPa s", whole, float(np.std(drawn)), float(gaps.sum()), forgets, told))
     return found
 
 

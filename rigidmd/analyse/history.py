@@ -46,6 +46,7 @@ class History:
     positions (f, n, 3) centres of mass, lab frame; Q (f, n, 3, 3) body to lab, principal axes
     velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where no frame has them
     columns : samples of the same stretch by their names in `results[...]`
+    tensor : (l, 7) lines of pressure_tensor.csv, ps and bar, of the same stretch; None where the run kept none
     interval : time between frames, ps; None if they are not evenly spaced
     notes : what was mended
     """

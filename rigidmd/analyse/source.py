@@ -1,7 +1,7 @@
 """Where histories come from: the folder of a run, or results in memory; and where production begins."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -82,11 +82,15 @@ def of_results(results: "Results", start: float | None = None) -> History:
     return _history(system, columns, raw, results._tensor, start, [], lambda share: None)
 
 
-class _Raw:
-    """Frames as they were written."""
+class _Raw(NamedTuple):
+    """Frames as they were written: times (f,), sites and velocities (f, s, 3), cells (f, 3, 3); whether centres were
+    put into the box."""
 
-    def __init__(self, time, sites, velocities, cells, wrapped: bool):
-        self.time, self.sites, self.velocities, self.cells, self.wrapped = time, sites, velocities, cells, wrapped
+    time: np.ndarray
+    sites: np.ndarray
+    velocities: np.ndarray | None
+    cells: np.ndarray
+    wrapped: bool
 
 
 def _history(
