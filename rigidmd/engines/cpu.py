@@ -79,7 +79,8 @@ class Engine:
         self.load: Load | None = None
         self._probe: Probe | None = None
         self._heat = heat_room()
-        self._loading: Loading | None = None
+        self._loadings: dict[str, Loading] = {}
+        self._seen: Load | None = None
         self._room: BoxRoom | None = None
         self._stale = True
         self._moved: State | None = None
@@ -134,13 +135,14 @@ class Engine:
         kind = (type(model.rotor), type(bath))
         if kind not in self._codes:
             self._codes[kind] = code_of(model, bath)
-        loader = self._loading_of(workspaces).bind(workspaces, state, load, probe and probe.load)
+        loader = self._loading_for("steps", workspaces).bind(workspaces, state, load, probe and probe.load)
         return advance(model, self._codes[kind], state, load, loader, *rest)
 
-    def _loading_of(self, workspaces: tuple[NamedTuple, ...]) -> Loading:
-        if self._loading is None:
-            self._loading = Loading(workspaces, isinstance(self.model, Model))
-        return self._loading
+    def _loading_for(self, use: str, workspaces: tuple[NamedTuple, ...]) -> Loading:
+        """The terms behind a loader, one for steps and one for looks, each bound to a load of its own."""
+        if use not in self._loadings:
+            self._loadings[use] = Loading(workspaces, isinstance(self.model, Model))
+        return self._loadings[use]
 
     def model_for(self, scheme: Scheme) -> Model | Body:
         """The model with the rotor that a scheme needs; only asymmetric bodies turn differently with an exact one."""
@@ -152,8 +154,12 @@ class Engine:
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
         workspaces = self._prepare(state)
-        load, tallies = no_load(state), {}
-        loading = self._loading_of(workspaces)
+        if self._seen is None or len(self._seen.force) != len(state.velocity):
+            self._seen = no_load(state)
+        load, tallies = self._seen, {}
+        for array in load:
+            array[:] = 0.0
+        loading = self._loading_for("looks", workspaces)
         loader = loading.bind(workspaces, state, load)
         for k, name in enumerate(self.names):
             while status := tally_one(loader, k):
@@ -161,7 +167,7 @@ class Engine:
                 loader = loading.bind(workspaces, state, load)
             tally = loader.tally.copy()
             tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
-        return load, tallies
+        return Load(load.force.copy(), load.torque_body.copy()), tallies
 
     def snapshot(self) -> State:
         """A copy of the state that was last moved."""

@@ -173,19 +173,27 @@ class Loading:
         self.loader = loader_for(len(workspaces), called and drives)
         self._codes = [term_code(own, self.loader, called) for own in workspaces]
         self._rooms = [np.zeros(64) for _ in workspaces]
+        self._kept: tuple = ()
         for k, code in enumerate(self._codes):
             self.loader.plain[k] = code.address("plain") if called else 0
             if self.loader.rate is not None:
                 self.loader.rate[k] = code.address("rate")
 
     def bind(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None) -> Loader:
-        """The loader of these workspaces, of the same types as the first, for a state and its loads."""
-        self._kept = (workspaces, state, load, other)
+        """The loader of these workspaces, of the same types as the first, for a state and its loads.
+
+        Numba takes milliseconds to find the types of so many arrays; nothing is done where they are those of last time.
+        """
+        kept = (*workspaces, *state, *load, *(other or load))
+        if len(kept) == len(self._kept) and all(now is then for now, then in zip(kept, self._kept, strict=True)):
+            return self.loader
+        self._kept = ()
         for k, (own, code) in enumerate(zip(workspaces, self._codes, strict=True)):
             content = (self.loader, k, code, own, state, load, other or load)
             while (needed := _lay_down(*content, self._rooms[k])) > len(self._rooms[k]):
                 self._rooms[k] = np.zeros(needed)
             self.loader.content[k] = self._rooms[k].ctypes.data
+        self._kept = kept
         return self.loader
 
 
