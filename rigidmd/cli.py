@@ -331,10 +331,11 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from rigidmd.scene import BodyScene
+
     scene = _read_scene(options)
     if options.threads is not None:
         from rigidmd.errors import SceneError
-        from rigidmd.scene import BodyScene
 
         if isinstance(scene, BodyScene):
             raise SceneError(scene.source, ["--threads is for molecules; a single body uses one thread"])
@@ -354,11 +355,12 @@ def _run(options: argparse.Namespace) -> int:
     results = simulation.run(progress=True)
     print(simulation.conclusion(results))
     print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
+    where = shlex.quote(str(folder))
     if results.interrupted:
-        print(f"  `rigidmd resume {shlex.quote(str(folder))}` goes on with it")
+        print(f"  `rigidmd resume {where}` goes on with it")
     else:
-        more = "report` the page alone" if scene.is_body else f"analyse {shlex.quote(str(folder))}` measures it"
-        print(f"  `rigidmd view {shlex.quote(str(folder))}` shows its film on a page, `rigidmd {more}")
+        more = "report` the page alone" if isinstance(scene, BodyScene) else f"analyse {where}` measures it"
+        print(f"  `rigidmd view {where}` shows its film on a page, `rigidmd {more}")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0
