@@ -85,7 +85,7 @@ def _owners(known: dict[str, Any], folder: Path) -> dict[str, str]:
 
 
 def _described(curve: Curve) -> dict[str, Any]:
-    return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level}
+    return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level, "bars": curve.bars}
 
 
 def _text(curve: Curve) -> str:
@@ -145,7 +145,16 @@ def _read_curve(folder: Path, told: dict[str, Any]) -> Curve:
     columns = {title: table[title] for title in head[1:] if title.removesuffix(" error") not in set(head) - {title}}
     errors = {title.removesuffix(" error"): table[title] for title in head[1:] if title not in columns}
     log = (bool(told["log"][0]), bool(told["log"][1]))
-    return Curve(str(told["file"]), (axis, table[axis]), str(told["label"]), columns, errors, log, told["level"])
+    return Curve(
+        str(told["file"]),
+        (axis, table[axis]),
+        str(told["label"]),
+        columns,
+        errors,
+        log,
+        told["level"],
+        bool(told["bars"]),
+    )
 
 
 def drawn(curve: Curve):
@@ -159,10 +168,9 @@ def drawn(curve: Curve):
     seen = x > 0 if curve.log[0] else np.ones(len(x), bool)
     if curve.level is not None:
         axis.axhline(curve.level, color=FAINT, lw=0.7)
-    bars = np.issubdtype(x.dtype, np.integer) or (len(x) < 12 and bool((x == np.round(x)).all()))
     for color, title in zip(COLORS, shown, strict=False):
         values = curve.columns[title]
-        if bars:
+        if curve.bars:
             axis.bar(x, values, color=color, width=0.7)
             continue
         axis.plot(*thin_series(x[seen], values[seen]), color=color, lw=1.0, label=title)
@@ -178,7 +186,7 @@ def drawn(curve: Curve):
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=8, colors=INK)
     axis.spines[:].set_color(INK)
-    if len(shown) > 1 and not bars:
+    if len(shown) > 1 and not curve.bars:
         figure.legend(
             *axis.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=7,
             handlelength=1.4, labelcolor=INK,

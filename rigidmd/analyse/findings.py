@@ -47,6 +47,7 @@ class Curve:
     columns, errors : header -> values (p,); errors under the same headers, where there are any
     log : whether axes are logarithmic: of x, of y
     level : a level to draw, such as 1 of g(r)
+    bars : whether the axis counts, so that bars are drawn
     """
 
     file: str
@@ -56,13 +57,14 @@ class Curve:
     errors: dict[str, np.ndarray] = field(default_factory=dict)
     log: tuple[bool, bool] = (False, False)
     level: float | None = None
+    bars: bool = False
 
 
 @dataclass(eq=False)
 class Finding:
     """What an analysis found: values, curves, notes.
 
-    finding["g OW-OW"] is a column of its curves, finding.value("D of SPC/E") a value.
+    finding["g OW-OW"] is a column of its curves, finding.value("D of spce") a value.
     """
 
     name: str
@@ -122,8 +124,8 @@ def settled(
 
 
 def blocks(history: History, count: int = BLOCKS) -> list[History]:
-    """A history in parts of equal length; the first frames are left out where it does not divide. Fewer, and none at
-    last, where a part would have less than two frames."""
+    """A history in parts of equal length, without the first frames where it does not divide; none where a part would
+    have less than two frames."""
     size = len(history) // count
     if size < 2:
         return []

@@ -12,6 +12,7 @@ from rigidmd.errors import OutputError
 from rigidmd.molecules import Molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN
+from rigidmd.validation import meant
 
 #: Two intervals between frames that differ by less than this fraction are equal.
 EVEN = 1e-3
@@ -141,37 +142,27 @@ class History:
                 at.append((centre[:, :, None] + arms).reshape(len(centre), -1, 3))
                 molecules.append(np.repeat(kind.index, len(chosen)))
         if not at:
-            from rigidmd.validation import meant
-
             known = names_of(self.system)
             raise OutputError(f"there is no site {name!r}{meant(name, known) or ';'} there are {', '.join(known)}")
         return np.concatenate(at, axis=1), np.concatenate(molecules)
 
     def part(self, first: int, end: int) -> "History":
         """Some of its frames, as a history. The samples stay those of the whole."""
-        span = slice(first, end)
-        return replace(
-            self,
-            time=self.time[span],
-            cell=self.cell[span],
-            positions=self.positions[span],
-            Q=self.Q[span],
-            velocities=None if self.velocities is None else self.velocities[span],
-            L=None if self.L is None else self.L[span],
-        )
+        return self._of(slice(first, end))
 
     def thinned(self, most: int) -> "History":
         """At most so many of its frames, evenly spaced."""
-        stride = max(1, -(-len(self) // most))
-        chosen = np.arange(0, len(self), stride)
+        return self._of(slice(None, None, max(1, -(-len(self) // most))))
+
+    def _of(self, frames: slice) -> "History":
         return replace(
             self,
-            time=self.time[chosen],
-            cell=self.cell[chosen],
-            positions=self.positions[chosen],
-            Q=self.Q[chosen],
-            velocities=None if self.velocities is None else self.velocities[chosen],
-            L=None if self.L is None else self.L[chosen],
+            time=self.time[frames],
+            cell=self.cell[frames],
+            positions=self.positions[frames],
+            Q=self.Q[frames],
+            velocities=None if self.velocities is None else self.velocities[frames],
+            L=None if self.L is None else self.L[frames],
         )
 
 

@@ -270,7 +270,9 @@ def hydrogen_bonds(history: History, distance: float = BOND, angle: float = BOND
     value, error = mean(each)
     most = int(bonds.max()) + 1
     share = np.array([np.mean(bonds == k) for k in range(most)])
-    curve = Curve("hydrogen_bonds", ("hydrogen bonds", np.arange(most)), "share of molecules", {"share": share})
+    curve = Curve(
+        "hydrogen_bonds", ("hydrogen bonds", np.arange(most)), "share of molecules", {"share": share}, bars=True
+    )
     told = [f"of {len(thinned)} of {len(history)} frames"] if len(thinned) < len(history) else []
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time(each, thinned.span / (len(thinned) - 1))
