@@ -12,14 +12,43 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rigidmd.analyse.registry import analysis
-    from rigidmd.run import Every, Moment, Results, Simulation
+    from rigidmd.dynamics.own import compiled_force, compiled_thermostat
+    from rigidmd.looking.live import LivePlot
+    from rigidmd.own.force import Force
+    from rigidmd.own.pair_law import PairLaw, pair_law
+    from rigidmd.own.trust import trust
+    from rigidmd.run import Every, Moment, Observer, Results, Simulation
     from rigidmd.scene import BodyScene, MolecularScene, Scene
 
     __version__: str
 
-__all__ = ["BodyScene", "Every", "MolecularScene", "Moment", "Results", "Scene", "Simulation", "analysis"]
+__all__ = [
+    "BodyScene",
+    "Every",
+    "Force",
+    "LivePlot",
+    "MolecularScene",
+    "Moment",
+    "Observer",
+    "PairLaw",
+    "Results",
+    "Scene",
+    "Simulation",
+    "analysis",
+    "compiled_force",
+    "compiled_thermostat",
+    "pair_law",
+    "trust",
+]
 
-_HOMES = {name: "scene" if name.endswith("Scene") else "run" for name in __all__} | {"analysis": "analyse.registry"}
+#: The module in which each of them is.
+_HOMES = (
+    dict.fromkeys(("BodyScene", "MolecularScene", "Scene"), "scene")
+    | dict.fromkeys(("Every", "Moment", "Observer", "Results", "Simulation"), "run")
+    | dict.fromkeys(("compiled_force", "compiled_thermostat"), "dynamics.own")
+    | dict.fromkeys(("PairLaw", "pair_law"), "own.pair_law")
+    | {"Force": "own.force", "LivePlot": "looking.live", "analysis": "analyse.registry", "trust": "own.trust"}
+)
 
 
 def __getattr__(name: str) -> object:

@@ -94,10 +94,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    _command(commands, "examples", _examples, "list the scenes that rigidmd ships", "rigidmd examples")
-    new = _command(commands, "new", _new, "copy a shipped scene as a starting point", "rigidmd new water -o mine.toml")
-    new.add_argument("name", metavar="NAME", help="which scene; `rigidmd examples` lists them")
-    new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml)")
+    _command(
+        commands, "examples", _examples, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples"
+    )
+    new = _command(
+        commands,
+        "new",
+        _new,
+        "copy a shipped scene, notebook or script to start from",
+        "rigidmd new water -o mine.toml",
+    )
+    new.add_argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them")
+    new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)")
     new.add_argument("--force", action="store_true", help="replace that file")
 
     run = _command(commands, "run", _run, "run a scene", "rigidmd run systems/water.toml -o runs/water")
@@ -118,6 +126,7 @@ def _parser() -> argparse.ArgumentParser:
         "rigidmd resume runs/water --until 200ps",
     )
     resume.add_argument("folder", metavar="DIR", help="folder of the run")
+    _trusting(resume)
     _going_on(resume)
     resume.set_defaults(overrides=[], force=False, resume=True)
 
@@ -214,12 +223,25 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         "models",
         _models,
-        "list the molecular models that rigidmd ships, or show or draw one",
-        "rigidmd models tip4p2005 --draw -o water.svg",
+        "list the molecular models that rigidmd ships, show or draw one, or write one of your own",
+        "rigidmd models tip4p2005 --draw -o water.svg\n"
+        "  rigidmd models --from dye.xyz --parameters table.toml -o dye.toml",
     )
     models.add_argument("model", nargs="?", metavar="NAME", help="model to show, or a .toml file with your own")
     models.add_argument("--draw", action="store_true", help="draw it to NAME.png")
-    models.add_argument("-o", "--output", metavar="FILE", help="picture file: .png, .svg or .pdf")
+    models.add_argument(
+        "--from", dest="geometry", metavar="FILE",
+        help="write a model of your own: a structure file with one molecule, of any format that a scene takes",
+    )  # fmt: skip
+    models.add_argument(
+        "--parameters", metavar="TABLE",
+        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element",
+    )  # fmt: skip
+    models.add_argument("--name", metavar="NAME", dest="own_name", help="with --from: name of the model")
+    models.add_argument(
+        "-o", "--output", metavar="FILE",
+        help="picture file: .png, .svg or .pdf; with --from the model's (default: that of the structure, .toml)",
+    )  # fmt: skip
     models.add_argument("--force", action="store_true", help="replace that file")
     _command(
         commands,
@@ -266,6 +288,18 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         help="override a key of the scene by its dotted path (list entries count from 0); KEY= without a value "
         "removes the key; may be repeated",
     )
+    _trusting(parser)
+
+
+def _trusting(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--trust",
+        action="append",
+        default=[],
+        metavar="FILE.py",
+        help="let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and can do whatever "
+        "you can; may be repeated",
+    )
 
 
 def _going_on(parser: argparse.ArgumentParser) -> None:
@@ -293,20 +327,30 @@ def _walltime(text: str) -> float:
 def _read_scene(options: argparse.Namespace, **more):
     from rigidmd.scene import Scene, parse_override
 
+    if options.trust:
+        from rigidmd.own.trust import trust
+
+        for path in options.trust:
+            trust(path)
     overrides = dict(parse_override(text) for text in options.overrides)
     return Scene.read(options.scene, overrides | more)
 
 
 def _examples(options: argparse.Namespace) -> int:
-    from rigidmd.shipped import examples
+    from rigidmd.shipped import examples, notebooks, scripts
 
-    found = examples()
-    width = max(len(example.name) for example in found)
-    for title, is_body in (("molecules", False), ("one body", True)):
+    scenes = examples()
+    kinds = {
+        "molecules": [example for example in scenes if not example.is_body],
+        "one body": [example for example in scenes if example.is_body],
+        "notebooks": notebooks(),
+        "scripts, which extend it": scripts(),
+    }
+    width = max(len(example.name) for example in scenes)
+    for title, found in kinds.items():
         print(f"{title}:")
         for example in found:
-            if example.is_body == is_body:
-                print(f"  {example.name:<{width}}  {example.about}")
+            print(f"  {example.name:<{width}}  {example.about}")
         print()
     print("`rigidmd new NAME` copies one into the working directory")
     return 0
@@ -316,7 +360,7 @@ def _new(options: argparse.Namespace) -> int:
     from rigidmd.shipped import copy_example, find_example, series_of
 
     example = find_example(options.name)
-    path = Path(options.output or f"{example.name}.toml")
+    path = Path(options.output or f"{example.name}{example.path.suffix}")
     written = copy_example(example, path, options.force)
     if example.name != options.name:
         print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
@@ -324,6 +368,13 @@ def _new(options: argparse.Namespace) -> int:
     if beside := [str(file) for file in written[1:]]:
         print(f"files that it reads, copied beside it: {', '.join(beside)}")
     print("next:")
+    if example.kind == "script":
+        print(f"  python {shlex.quote(str(path))}    runs it; `rigidmd help extending` explains it")
+        return 0
+    if example.kind == "notebook":
+        print("  open it in Jupyter, VS Code or any program for notebooks: pip install 'rigidmd[notebook]' jupyterlab")
+        print(f"  jupyter lab {shlex.quote(str(path))}")
+        return 0
     print(f"  rigidmd check {shlex.quote(str(path))}    describes the run without running it")
     print(f"  rigidmd run {shlex.quote(str(path))}      runs it; results go to {Path('runs') / path.stem}")
     print("its comment says what to look at; `rigidmd help manual` explains every table")
@@ -555,6 +606,11 @@ def _models(options: argparse.Namespace) -> int:
     from rigidmd.molecules import available_models, load_model, read_molecule
     from rigidmd.output.molecule_report import models_table, molecule_text
 
+    if options.geometry is not None:
+        return _own_model(options)
+    if options.parameters is not None or options.own_name is not None:
+        given = "--parameters" if options.parameters is not None else "--name"
+        raise MoleculeError("models", [f"{given} belongs to --from FILE, which writes a model of your own"])
     draws = options.draw or options.output is not None
     if options.model is None:
         if draws:
@@ -572,6 +628,32 @@ def _models(options: argparse.Namespace) -> int:
     path = Path(options.output or f"{Path(options.model).stem}.png")
     draw_molecule(path, found, options.force)
     print(f"{found.name} is drawn in {path}")
+    return 0
+
+
+def _own_model(options: argparse.Namespace) -> int:
+    """`models --from`."""
+    from rigidmd.assemble.own_model import own_model
+    from rigidmd.errors import MoleculeError
+    from rigidmd.output.model_file import write_model
+    from rigidmd.output.target import check_target
+
+    if options.model is not None:
+        faults = [f"--from writes a model of your own: leave out {options.model}, or name the model by --name"]
+        raise MoleculeError("models", faults)
+    geometry, parameters = Path(options.geometry), Path(options.parameters) if options.parameters else None
+    path = Path(options.output or f"{geometry.stem}.toml")
+    if options.draw:
+        raise MoleculeError("models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"])
+    made = own_model(geometry, parameters, options.own_name)
+    check_target(path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])])
+    write_model(path, made.file)
+    print(f"{path}: {made.molecule.name}, {made.molecule.words}; {made.file.source}")
+    for note in made.notes:
+        _warn(note)
+    print("next:")
+    print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")
+    print(f'a scene takes it by a line of its [[molecules]]: file = "{path.name}"')
     return 0
 
 

@@ -74,3 +74,8 @@ class SimulationError(RigidMDError):
 
 class SettingError(RigidMDError):
     """A setting of the machine that cannot be used, such as an environment variable."""
+
+
+def told(error: BaseException) -> str:
+    """An error of a user's code in one line: its type and what it says."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -35,6 +35,7 @@ MOST_SITES = 5000
 SAME_PLACE = 1e-6
 #: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
 OFF_AXIS = 1e-4
+MOST_PARAMETERS = 100  # of one site
 
 
 #: Keys of a site of which both or none are given.
@@ -66,6 +67,8 @@ class Site(Section):
     """Lennard-Jones well depth; 1 kcal is 4.184 kJ"""
     epsilon_K: NonNegative | None = None
     """Lennard-Jones well depth over Boltzmann's constant"""
+    parameters: dict[str, Number] = Field(default={}, max_length=MOST_PARAMETERS)
+    """Numbers for pair laws of one's own, by their names"""
 
     @model_validator(mode="after")
     def _lennard_jones_is_whole(self):
@@ -140,6 +143,7 @@ class Molecule:
     group: str = "other"
     note: str = ""
     mixing: Mixing | None = None
+    parameters: tuple[dict[str, float], ...] = ()  # of each site, for pair laws of users
 
     @property
     def marks(self) -> tuple[float, ...]:
@@ -208,6 +212,8 @@ class Molecule:
             }
             if self.epsilon[i] > 0:
                 entry |= {"sigma_A": float(self.sigma[i]), "epsilon_kJ_mol": float(self.epsilon[i] / KJ_PER_MOL)}
+            if self.parameters[i]:
+                entry["parameters"] = dict(self.parameters[i])
             entries.append(entry)
         return entries
 
@@ -272,6 +278,7 @@ def molecule(
         mass=float(frame.mass),
         inertia=frame.inertia,
         kind=frame.kind,
+        parameters=tuple(s.parameters for s in sites),
     )
 
 
@@ -308,9 +315,22 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
             keys = [key for key in ("mass_u", "charge_e") if getattr(site, key) is None]
             keys += ["element"] if site.element == "X" else []
             keys += LENNARD_JONES if site.sigma_A is None else []
+            keys += [] if site.parameters else ["parameters"]
             site = site.model_copy(update={key: getattr(entry, key) for key in keys})
         filled.append(site)
     return tuple(filled)
+
+
+def named_sites(species: list[Molecule], name: str) -> list[np.ndarray]:
+    """Which sites of each species a name means: those of this name, or else of this element; SPECIES.NAME of one."""
+    owner, _, own = name.rpartition(".")
+    for of_molecule in ("site_names", "elements"):
+        found = [
+            np.array([owner in ("", m.name) and other == own for other in getattr(m, of_molecule)]) for m in species
+        ]
+        if any(of.any() for of in found):
+            break
+    return found
 
 
 def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
@@ -353,13 +373,19 @@ def read_molecule(path: Path) -> Molecule:
 
 def read_parameters(path: Path) -> tuple[Site, ...]:
     """The entries of a table of parameters. Raises MoleculeError."""
-    entries = _read(path, ParameterFile).sites
+    return read_table(path).sites
+
+
+def read_table(path: Path) -> ParameterFile:
+    """A table of parameters. Raises MoleculeError."""
+    table = _read(path, ParameterFile)
+    entries = table.sites
     names = [s.name for s in entries]
     faults = [f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
     faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in entries if s.position_A is not None]
     if faults:
         raise MoleculeError(str(path), faults)
-    return entries
+    return table
 
 
 Table = TypeVar("Table", bound=Section)

@@ -1,6 +1,7 @@
-"""Shipped with the package: example scenes and the chapters of the documentation."""
+"""Shipped with the package: example scenes, notebooks, scripts and the chapters of the documentation."""
 
 import difflib
+import json
 import re
 import shutil
 import tomllib
@@ -15,6 +16,9 @@ PACKAGE = Path(__file__).parent
 #: In a wheel the scenes are inside the package; in a checkout or an editable install they are beside it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
+NOTEBOOK, SCRIPT = ".ipynb", ".py"
+#: What an example is, by the ending of its file.
+KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
 
 #: In the order of the list.
 CHAPTERS = (
@@ -23,7 +27,9 @@ CHAPTERS = (
     "molecule",
     "ensembles",
     "looking",
+    "notebook",
     "measuring",
+    "ase",
     "extending",
     "manual",
     "benchmarks",
@@ -33,12 +39,17 @@ CHAPTERS = (
 
 
 class Example(NamedTuple):
-    """A shipped scene."""
+    """A shipped scene, notebook or script."""
 
     name: str
     path: Path
-    about: str  # the first line of its comment
-    is_body: bool
+    about: str  # the first line of its comment, or of its text
+    is_body: bool = False
+
+    @property
+    def kind(self) -> str:
+        """scene, notebook or script."""
+        return KINDS[self.path.suffix]
 
 
 def examples() -> list[Example]:
@@ -51,14 +62,31 @@ def examples() -> list[Example]:
     return sorted(found, key=_in_series)
 
 
+def notebooks() -> list[Example]:
+    """The shipped notebooks, sorted by name."""
+    found = []
+    for path in sorted((SYSTEMS / "notebooks").glob(f"*{NOTEBOOK}")):
+        first = json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"]
+        found.append(Example(path.stem, path, "".join(first).partition("\n")[0].removeprefix("# ")))
+    return found
+
+
+def scripts() -> list[Example]:
+    """The shipped scripts, each an extension, sorted by name."""
+    return [
+        Example(path.stem, path, path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# "))
+        for path in sorted((SYSTEMS / "scripts").glob(f"*{SCRIPT}"))
+    ]
+
+
 def _in_series(example: Example) -> list:
     """Sort key in which numbers within a name count as numbers."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
 
 
 def find_example(name: str) -> Example:
-    """The scene of this name, or the first of a numbered series of this name. Raises Faults."""
-    known = {example.name: example for example in examples()}
+    """The example of this name, or the first scene of a numbered series of this name. Raises Faults."""
+    known = {example.name: example for example in [*examples(), *notebooks(), *scripts()]}
     if name in known:
         return known[name]
     if series := series_of(name):
@@ -76,13 +104,10 @@ def series_of(name: str) -> list[str]:
 
 
 def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
-    """Copy a scene to `path` and the files that it reads beside it. Returns the paths written. Raises OutputError."""
-    from rigidmd.scene import Scene
-
-    if path.suffix != ".toml":
-        raise OutputError(f"{path} must end in .toml: name a file for the scene with -o")
-    scene = Scene.read(example.path)
-    inputs = {path.parent / file.relative_to(example.path.parent): file for file in scene.inputs.values()}
+    """Copy an example to `path` and the files that it reads beside it; the paths written. Raises OutputError."""
+    if path.suffix != example.path.suffix:
+        raise OutputError(f"{path} must end in {example.path.suffix}: name a file for the {example.kind} with -o")
+    inputs = _inputs(example, path.parent) if example.kind == "scene" else {}
     for target in (path, *inputs):
         kept = target in inputs and target.is_file() and target.read_bytes() == inputs[target].read_bytes()
         if target.is_dir():
@@ -97,6 +122,14 @@ def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
         except OSError as error:
             raise OutputError(f"{target} cannot be written: {error.strerror}") from None
     return [path, *inputs]
+
+
+def _inputs(example: Example, folder: Path) -> dict[Path, Path]:
+    """Where a copied scene in a folder looks for the files that it reads, and where they are."""
+    from rigidmd.scene import Scene
+
+    scene = Scene.read(example.path)
+    return {folder / file.relative_to(example.path.parent): file for file in scene.inputs.values()}
 
 
 def contents() -> dict[str, str]:

@@ -208,6 +208,9 @@ def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsy
             header = next(csv.reader(file))
         part = section("Columns of log.csv" if path.name == "log.csv" else "Columns of motion.csv")
         named = set(re.findall(r"`([^`]+)`", part))
+        scene = tomllib.loads((path.parent / "scene.toml").read_text())
+        own = {f"{entry['name']} (kJ/mole)" for entry in scene.get("forces", {}).get("custom", ())}
+        header = ["NAME (kJ/mole)" if column in own else column for column in header]
         assert {_first_of_its_kind(column) for column in header} <= named
 
 
@@ -284,6 +287,8 @@ def _toml(value) -> str:
             return str(value).lower()
         case str():
             return f'"{value}"'
+        case dict():
+            return f"{{{', '.join(f'{key} = {_toml(own)}' for key, own in value.items())}}}"
         case tuple():
             return f"[{', '.join(map(_toml, value))}]"
     return f"{value:g}"

@@ -48,6 +48,14 @@ truncation = "shift"
 sites = ["O", "Ar"]
 sigma_A = 3.3
 epsilon_kJ_mol = 0.5
+[[forces.custom]]
+name = "soft"
+energy = "A*exp(-B*r) - C/r**6"
+parameters = { AR = { A = 1e5, B = 3.7, C = 6e3 }, O = { A = 2e5, B = 3.9, C = 3e3 } }
+mixing = { B = "arithmetic" }
+[[forces.custom.pairs]]
+sites = ["O", "H"]
+parameters = { A = 1e4, B = 4.0, C = 0.0 }
 [start]
 temperature_K = 300.0
 [[stages]]

@@ -132,7 +132,7 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
     assert centre.max() < frames.cells.max() + 0.01
 
 
-@pytest.mark.parametrize("ending", [".trr", ".gsd", ".dcd", ".nc", ".xyz", ".pdb"])
+@pytest.mark.parametrize("ending", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
 def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
     more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.1.duration_ps": 0.01}
     results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()

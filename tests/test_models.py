@@ -10,7 +10,7 @@ from conftest import small_scene
 from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError
-from rigidmd.molecules import GROUPS, MODELS, available_models, load_model, with_masses
+from rigidmd.molecules import GROUPS, MODELS, available_models, load_model, read_molecule, with_masses
 from rigidmd.output.molecule_report import bonds, models_table
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -590,3 +590,99 @@ def test_the_schema_knows_the_new_keys(capsys):
 def test_a_model_that_is_not_there():
     with pytest.raises(MoleculeError, match="there is no model 'ice'"):
         load_model("ice")
+
+
+# a model from a structure and a table
+
+
+def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, capsys, monkeypatch):
+    monkeypatch.chdir(own)
+    (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", "charge_e = 0.115\nparameters = { A = 0.1 }"))
+    assert main(["models", "--from", "benzene.xyz", "--parameters", "aromatic.toml", "--name", "ring"]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("benzene.toml: ring, symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole; geometry of")
+    assert 'file = "benzene.toml"' in out
+    assert "no atom uses N" in err
+    scene = OWN.replace('file = "benzene.xyz"\nparameters = "aromatic.toml"', 'file = "benzene.toml"')
+    (own / "new.toml").write_text(scene)
+    before, after = (build(Scene.read(own / name)).species[0] for name in ("own.toml", "new.toml"))
+    for what in ("masses", "positions_body", "charges", "sigma", "epsilon", "inertia"):
+        assert getattr(before, what).tobytes() == getattr(after, what).tobytes(), what
+    assert after.parameters == before.parameters == 6 * ({},) + 6 * ({"A": 0.1},)
+    assert (after.name, after.site_names, after.elements) == ("ring", before.site_names, before.elements)
+    assert main(["models", "benzene.toml"]) == 0
+    assert "78.1140 u, neutral" in capsys.readouterr().out
+
+
+def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, capsys, monkeypatch):
+    monkeypatch.chdir(own)
+    (own / "heavy water.xyz").write_text("4\n\nO 0 0 0\nD 0.96 0 0\nD -0.24 0.93 0\nM 0.1 0.1 0\n")
+    assert main(["models", "--from", "heavy water.xyz"]) == 0
+    out, err = capsys.readouterr()
+    assert "'heavy water.toml'" in out
+    assert "no interactions yet" in err
+    text = (own / "heavy water.toml").read_text()
+    assert text.startswith("# Sites have masses only")
+    assert "charge_e = -0.1" in text
+    assert 'name = "M"\nmass_u = 0.0\nposition_A = [0.1, 0.1, 0.0]' in text
+    found = read_molecule(own / "heavy water.toml")
+    assert found.mass == pytest.approx(15.999 + 2 * 2.0141, abs=1e-3)
+    assert not found.charges.any()
+
+
+def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):
+    monkeypatch.chdir(own)
+    lines = [f"ATOM  {k:>5} {name:<4} LIG A   1    {x:8.3f}   0.000   0.000  1.00  0.00          {name[0]:>2}"
+             for k, (name, x) in enumerate((("C1", 0.0), ("H1", 1.09)), 1)]  # fmt: skip
+    (own / "lig.pdb").write_text(
+        "CRYST1   30.000   30.000   30.000  90.00  90.00  90.00\n" + "\n".join(lines) + "\nEND\n"
+    )
+    assert main(["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml"]) == 0
+    assert "its cell is left out" in capsys.readouterr().err
+    assert read_molecule(own / "x.toml").residue_names == ("LIG",)
+    for charge, said in (("0.1151", "+0.0001 e, nearly but not exactly 0"), ("0.6", "+0.485 e, not a whole number")):
+        (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", f"charge_e = {charge}"))
+        again = ["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml", "--force"]
+        assert main(again) == 0
+        assert said in capsys.readouterr().err
+
+
+CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--from", "none.xyz"], "none.xyz: there is no such file"),
+        (["--from", "."], ".: is a folder"),
+        (["--from", "own.toml", "-o", "x.toml"], "its format is unknown to ASE"),
+        (["--from", "two.xyz"], "holds 2 structures one after another: keep one"),
+        (["--from", "pair.xyz"], "pair.xyz: holds 2 molecules N2: keep one"),
+        (["--from", "cut.xyz"], "joined through the sides of its cell"),
+        (["--from", "benzene.xyz", "--parameters", "none.toml"], "none.toml: there is no such file"),
+        (["--from", "benzene.xyz", "--parameters", "poor.toml"], "atom H: no entry of the table has this name"),
+        (["--from", "benzene.xyz", "--name", ""], "name: is ''"),
+        (["--from", "benzene.xyz", "-o", "x.png"], "x.png: the name of this model ends in .toml"),
+        (["--from", "benzene.xyz", "-o", "no/x.toml"], "there is no folder no"),
+        (["--from", "benzene.xyz", "-o", "own.toml"], "own.toml exists; --force replaces it"),
+        (["--from", "benzene.xyz", "--parameters", "aromatic.toml", "-o", "aromatic.toml", "--force"],
+         "aromatic.toml is what this model is made of"),
+        (["--from", "benzene.xyz", "--draw"], "draw it afterwards: rigidmd models benzene.toml --draw"),
+        (["spce", "--from", "benzene.xyz"], "leave out spce"),
+        (["spce", "--parameters", "aromatic.toml"], "--parameters belongs to --from FILE"),
+        (["--name", "x"], "--name belongs to --from FILE"),
+    ],
+)  # fmt: skip
+def test_models_that_cannot_be_made(arguments, expected, own, capsys, monkeypatch):
+    monkeypatch.chdir(own)
+    benzene, pair = (own / "benzene.xyz").read_text(), "N 0 0 0\nN 1.1 0 0\nN 0 0 6\nN 1.1 0 6\n"
+    files = {"two.xyz": 2 * benzene, "pair.xyz": f"4\n\n{pair}", "cut.xyz": CUT,
+             "poor.toml": TABLE.replace('name = "H"', 'name = "F"')}  # fmt: skip
+    for name, text in files.items():
+        (own / name).write_text(text)
+    before = {path.name: path.read_bytes() for path in own.iterdir()}
+    assert main(["models", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert expected in err
+    assert {path.name: path.read_bytes() for path in own.iterdir()} == before

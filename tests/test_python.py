@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import subprocess
 import sys
 
@@ -169,33 +170,11 @@ def test_values_show_what_they_are(tmp_path):
     assert "<td>nvt ... nve</td>" in shown
 
 
-NOTEBOOK = """
-import sys, types
-class Shell: kernel = object()
-sys.modules["IPython"] = types.SimpleNamespace(get_ipython=Shell)
-sys.modules["ipykernel.zmqshell"] = types.ModuleType("ipykernel.zmqshell")
-import rigidmd
-simulation = rigidmd.Simulation(rigidmd.Scene.read(sys.argv[1], {"run.duration_s": 0.05}))
-simulation.run(**eval(sys.argv[2]))
-"""
-
-
-@pytest.mark.parametrize(
-    ("options", "seen"), [("{}", True), ("{'progress': True}", True), ("{'progress': False}", False)]
-)
-def test_a_notebook_shows_the_bar(options, seen):
-    """As a kernel without ipywidgets sees it: a bar of text, and no warning."""
-    done = subprocess.run([sys.executable, "-c", NOTEBOOK, str(TOP), options], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert ("0.0/0.1 s" in done.stderr) == seen
-    assert "arning" not in done.stderr
-
-
 SCRIPT = """import rigidmd
 
 scene = rigidmd.Scene.read("systems/water.toml", {"stages.0.duration_ps": 1.0})
 watch = rigidmd.Every(1.0, lambda moment: print(moment.time, moment.observation.temperature))
-simulation = rigidmd.Simulation(scene, "runs/water", observers=[watch])
+simulation = rigidmd.Simulation(scene, "runs/water", observers=[watch, rigidmd.LivePlot("drift")])
 results = simulation.run(progress=True)
 print(rigidmd.__version__, results["energy"].mean(), results.units["energy"], results.summary["stages"])
 print(results.universe().trajectory, results.to_dataframe(), results.state.position.shape, results.files[0].name)
@@ -209,6 +188,11 @@ HOVER = {
     'results["energy"]': "ndarray[",
     "results.universe()": "Universe",
     "results.state": "State",
+    "results.plot()": "Figure",
+    "results.view()": "StructureWidget | Film",
+    "results.atoms()": "Atoms",
+    "results.atoms(slice(3))": "list[Atoms]",
+    'rigidmd.Scene.from_atoms(results.atoms(), ["spce"], seed=3)': "MolecularScene",
 }
 
 
@@ -225,9 +209,18 @@ def pyright(project):
 
 
 def findings_in_script(folder, text):
-    """What pyright says of a script: (severity, line, message) of each finding."""
-    (folder / "script.py").write_text(text)
-    (folder / "pyrightconfig.json").write_text(json.dumps({"include": ["script.py"], "extraPaths": [str(ROOT)]}))
+    """What pyright says of a script, the tutorial and the chapter about it: (severity, line, message) of each finding."""
+    cells = json.loads((ROOT / "systems" / "notebooks" / "tutorial.ipynb").read_text())["cells"]
+    chapter = (ROOT / "rigidmd" / "docs" / "notebook.md").read_text()
+    files = {
+        "script.py": text,
+        "tutorial.py": "\n".join("".join(part["source"]) for part in cells if part["cell_type"] == "code"),
+        "chapter.py": "".join(re.findall(r"```python\n(.*?)```", chapter, re.DOTALL)),
+    }
+    for name, source in files.items():
+        (folder / name).write_text(source)
+    shown = {"reportUnusedExpression": "none"}  # the last line of a cell
+    (folder / "pyrightconfig.json").write_text(json.dumps({"include": list(files), "extraPaths": [str(ROOT)]} | shown))
     found = pyright(folder)["generalDiagnostics"]
     return [(entry["severity"], entry["range"]["start"]["line"], entry["message"]) for entry in found]
 

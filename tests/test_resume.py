@@ -117,7 +117,16 @@ def test_every_ensemble_goes_on_to_the_same_bits(stages, precision, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["trajectory.trr", "trajectory.gsd", "trajectory.dcd", "trajectory.nc", "trajectory.xyz", "trajectory.pdb"]
+    "name",
+    [
+        "trajectory.trr",
+        "trajectory.gsd",
+        "trajectory.traj",
+        "trajectory.dcd",
+        "trajectory.nc",
+        "trajectory.xyz",
+        "trajectory.pdb",
+    ],
 )
 def test_every_format_goes_on(name, tmp_path):
     same_after_stops(scene(NVT, output=WATER["output"] | {"trajectory": name}), [31, 80], tmp_path)

@@ -16,6 +16,7 @@ ROOMS = [
     ("engines",),
     ("molecules",),
     ("scene",),
+    ("own",),
     ("assemble",),
     ("measure",),
     ("output",),
@@ -24,6 +25,7 @@ ROOMS = [
     ("run",),
     ("study",),
     ("looking",),
+    ("ase",),
     ("cli", "__main__"),
 ]
 RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
@@ -31,29 +33,41 @@ RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 LIBRARIES = {
     "ase": {
         "assemble/atoms.py", "assemble/ase_formats.py", "assemble/own_formats.py", "assemble/structure_files.py",
-        "assemble/matching.py", "assemble/cells.py",
+        "assemble/matching.py", "assemble/cells.py", "assemble/own_model.py", "assemble/from_atoms.py", "assemble/to_atoms.py", "assemble/traj_format.py",
+        "output/traj_file.py", "run/atoms.py", "ase.py",
     },
-    "MDAnalysis": {"assemble/frame_reader.py", "output/trajectory.py", "output/trajectory_file.py"},
+    "MDAnalysis": {
+        "assemble/frame_reader.py", "output/readers.py", "output/trajectory.py", "output/trajectory_file.py",
+    },
     "gsd": {"assemble/gsd_format.py", "output/gsd_file.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
+    "sympy": {"forces/laws/formulas.py"},
     "matplotlib": {
-        "output/figure.py", "output/page.py", "output/report.py", "output/body_figures.py", "output/precision_report.py",
+        "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
         "looking/film.py", "analyse/files.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py"},
+    "IPython": {"output/progress.py"},
+    "chemiscope": {"looking/inline.py"},
     "numba": {
         "forces/pairs/counts.py",
         "compile/cache.py", "compile/code.py", "compile/kernels.py", "compile/lane_types.py", "compile/lanes.py",
-        "compile/machine.py",
+        "compile/machine.py", "compile/lane_math.py", "compile/own.py",
         "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",
         "run/molecules.py",  # number of threads
     },
 }  # fmt: skip
 
-# Inside of a function: a value tells what would be made of it.
-LAZY = {("scene/molecules.py", "rigidmd.assemble.system"), ("scene/body.py", "rigidmd.assemble.body")}
+# Inside of a function: a value tells what would be made of it, and shows itself in a notebook.
+LAZY = {
+    ("scene/molecules.py", "rigidmd.assemble.system"), ("scene/molecules.py", "rigidmd.assemble.to_atoms"),
+    ("scene/body.py", "rigidmd.assemble.body"), ("scene/base.py", "rigidmd.assemble.from_atoms"),
+    ("scene/base.py", "rigidmd.looking.notebook"), ("run/loop.py", "rigidmd.looking.notebook"),
+    ("run/results.py", "rigidmd.looking.notebook"), ("run/results.py", "rigidmd.looking.columns"),
+    ("run/results.py", "rigidmd.looking.inline"),
+}  # fmt: skip
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -86,7 +86,7 @@ def test_the_final_state_starts_another_run(tmp_path):
     assert system.space == first.system.space
 
 
-@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.gsd", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
+@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.gsd", "t.traj", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
 @pytest.mark.parametrize("topology", ["topology.gro", "topology.pdb"])
 def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp_path):
     lengths, angles = [20.0, 21.0, 22.0], [80.0, 100.0, 75.0]
@@ -111,7 +111,7 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
         assert frame.dt == 0.01
         if name != "t.xyz":
             assert frame.dimensions == pytest.approx([*lengths, *angles], abs=2e-3)
-        assert frame.has_velocities == (name in ("t.trr", "t.gsd", "t.nc"))
+        assert frame.has_velocities == (name in ("t.trr", "t.gsd", "t.traj", "t.nc"))
         if frame.has_velocities:
             assert frame.velocities == pytest.approx(velocities, abs=1e-3)
     text = (tmp_path / "out" / name).read_bytes()
@@ -127,7 +127,7 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
     assert (trajectory.dt, trajectory.totaltime, trajectory[3].time) == (0.01, 0.04, seen[3][0])
     copy = universe.copy().trajectory
     assert [frame.time for frame in copy[::2]] == [moment for moment, _, _ in seen[::2]]
-    if name[1:] not in (".xyz", ".pdb", ".gsd"):  # what MDAnalysis reads from the file alone
+    if name[1:] not in (".xyz", ".pdb", ".gsd", ".traj"):  # what MDAnalysis reads from the file alone
         alone = mda.Universe(str(tmp_path / "out" / topology), str(tmp_path / "out" / name)).trajectory
         assert [frame.time for frame in alone] == pytest.approx([moment for moment, _, _ in seen], abs=1e-5)
     assert list(universe.atoms.names[:4]) == ["OW", "HW1", "HW2", "MW"]
@@ -528,7 +528,8 @@ def test_off_a_terminal_lines_say_how_far_it_is(monkeypatch, capsys):
     stages = [{"duration_ps": 0.02}]
     simulation = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, wait)])
     simulation.run(progress=True)
-    lines = capsys.readouterr().err.splitlines()
+    compiling, *lines = capsys.readouterr().err.splitlines()
+    assert compiling.startswith("  compiling")
     # of ten steps at 20 s each (one more before them): a line every 40 s
     assert lines[0] == "  0.004 of 0.02 ps, 0.0001 ps/s, 02:40 left"
     assert len(lines) == 5

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: ASE's unit of velocity, sqrt(eV/u), in Å/ps.
 ASE_VELOCITY = 98.22694788464063
+#: Arrays in which ASE keeps names of atoms and their residues, as of .pdb; extended XYZ may have them as columns.
+NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS = "atomtypes", "residuenames", "residuenumbers"
 #: Columns of velocities in extended XYZ that ASE does not convert, as programs differ in their units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
@@ -152,8 +154,21 @@ def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         first += len(atoms)
         named = len(own) == len(atoms) and None not in own
         names, elements = map(list, zip(*own, strict=True)) if named else (None, None)
-        frames.append(partial(from_ase, path, atoms, names, elements))
+        if NAMES in atoms.arrays:
+            names = [str(name) for name in atoms.arrays[NAMES]]
+        masses = atoms.get_masses() if atoms.has("masses") else None
+        frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms), masses))
     return frames
+
+
+def _residues(atoms) -> list[tuple] | None:
+    """Residues in the arrays that ASE has for them; None without."""
+    if not {RESIDUE_NAMES, RESIDUE_NUMBERS} <= set(atoms.arrays):
+        return None
+    numbers = atoms.arrays[RESIDUE_NUMBERS]
+    if numbers.dtype.kind != "i":
+        return None
+    return [(int(n), str(name)) for n, name in zip(numbers, atoms.arrays[RESIDUE_NAMES], strict=True)]
 
 
 def _species_column(properties: str) -> int | None:

@@ -18,13 +18,17 @@ from rigidmd.forces.pairs.space import cell_of
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.own import name_of
 from rigidmd.validation import settled
 
 
-def describe(scene: MolecularScene | BodyScene) -> str:
-    """How a scene would run, in words. Raises what building its system raises."""
+def describe(scene: MolecularScene | BodyScene, bare: bool = False) -> str:
+    """How a scene would run, in words. Raises what building its system raises.
+
+    bare : leave out what users add, see `build`
+    """
     if isinstance(scene, MolecularScene):
-        return _molecules(build(scene))
+        return _molecules(build(scene, bare))
     text = _body(build_body(scene))
     if scene.run.is_open:
         text += "\nthe integrator is chosen before the run, and its step, at most this one"
@@ -92,12 +96,14 @@ def _molecules(system: System) -> str:
         lines.append("  no box")
     lines += [f"  {note}" for note in system.notes]
     lines.append("\ncompiled in:")
-    words = fields_in_words(scene, system.terms)
+    words = fields_in_words(scene, system.terms) | system.own
     for name, term in system.terms.items():
         lines.append(f"  {name.replace('_', ' ')}: {words.get(name) or _term(system, name, term)}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
-    for what in ("thermostat", "barostat"):
+    if system.thermostat is not None:
+        lines.append(f"  thermostat: {name_of(system.thermostat)}, from Python, in every stage")
+    for what in ("thermostat", "barostat")[system.thermostat is not None :]:
         kinds = dict.fromkeys(getattr(stage, f"{what}_kind") for stage in scene.stages)
         lines += [f"  {what}: {kind.replace('_', ' ')}" for kind in kinds if kind]
     if any(stage.ensemble == "nph" for stage in scene.stages):
@@ -106,7 +112,7 @@ def _molecules(system: System) -> str:
     if (interval := system.removes_momentum_every) is not None:
         part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
         lines.append(f"  total momentum: taken out{part} every {interval:g} ps")
-    if system.external and len(kept) < 3:
+    if (system.external or system.own) and len(kept) < 3:
         lines.append(f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]

@@ -78,6 +78,17 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
     return by_bonds
 
 
+def again(position: np.ndarray, matched: Matched, species: list[Molecule], cell: np.ndarray | None) -> Matched:
+    """The same molecules where their atoms are now, position (a, 3), whatever their deviation."""
+    centre, rotation = np.zeros_like(matched.centre), np.zeros_like(matched.rotation)
+    deviation, square = np.zeros_like(matched.deviation), np.zeros_like(matched.square)
+    for k in np.unique(matched.species):
+        own = np.flatnonzero(matched.species == k)
+        points = _whole(position[np.array([matched.atoms[m] for m in own])], cell)
+        centre[own], rotation[own], deviation[own], square[own] = _fit(points, species[k])
+    return matched._replace(centre=centre, rotation=rotation, deviation=deviation, square=square)
+
+
 def _labels(molecule: Molecule) -> list[str]:
     """Label of each site: its element, or else its name. Atoms of one label are interchangeable."""
     return [e if e != "X" else name for e, name in zip(molecule.elements, molecule.site_names, strict=True)]

@@ -27,7 +27,7 @@ from rigidmd.forces.waves.errors import (
 from rigidmd.forces.waves.vectors import AS_GIVEN
 from rigidmd.molecules import Molecule
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.forces import Forces
+from rigidmd.scene.forces import Forces, usual_start
 from rigidmd.scene.molecules import WITH_VELOCITIES, Output
 
 CUTOFF = 9.0  # Å, in a periodic box
@@ -156,7 +156,7 @@ def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list
         faults.append("forces.tail_correction needs a periodic box: without one there is no liquid beyond the cut-off")
     faults += _electrostatic_faults(forces, space, cutoff)
     if start is None and cutoff < inf and "switch" in forces.truncation:
-        start = 0.6 * cutoff if forces.truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
+        start = usual_start(forces.truncation, cutoff)
     return {"cutoff_A": given, "switch_start_A": start}, faults
 
 

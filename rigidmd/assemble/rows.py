@@ -23,7 +23,10 @@ def row(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
     scene, stage = system.scene, system.scene.stages[k]
     found = stage.scheme
-    if stage.has_thermostat:
+    if (own := system.thermostat) is not None:
+        bath = own.for_stage(system, k) if hasattr(own, "for_stage") else own
+        found = found.with_bath(bath, halved=getattr(bath, "halved", True))
+    elif stage.has_thermostat:
         found = found.with_bath(bath_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
     elif not stage.has_barostat and any(other.thermostat_kind == "velocity_rescaling" for other in scene.stages):
         # a stage without a thermostat among others with one has one that rests: all then run the same machine code
@@ -33,7 +36,7 @@ def row(system: System, k: int) -> Scheme:
         found = found.with_box(box_of(system, k), stage.moves_every)
     elif stage.ensemble == "nph":
         found = found.with_piston(box_of(system, k))
-    if stage.keeps_momentum and (interval := system.removes_momentum_every) is not None:
+    if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         found = found.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
     return found
 
@@ -69,7 +72,7 @@ def box_of(system: System, k: int) -> NamedTuple:
         return VolumeMoves(
             _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), beyond, key
         )
-    x, y, z = map(float, system.model.keeps_momentum & stage.keeps_momentum)
+    x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
     rate = compressibility / stage.barostat_time
     return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], (x, y, z), beyond, key)
 

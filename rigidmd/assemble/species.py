@@ -1,5 +1,7 @@
 """The species of a scene: their rigid templates, and which molecules are frozen."""
 
+from pathlib import Path
+
 import numpy as np
 
 from rigidmd.assemble.structure_files import read_geometry
@@ -44,8 +46,11 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
         found = read_molecule(scene.path(entry.file))
     else:
         table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters))
-        sites = entry.sites if entry.file is None else _sites_from_file(scene, entry, table)
-        found = molecule(entry.label, with_parameters(settled(sites), table))
+        if entry.file is None:
+            sites = with_parameters(settled(entry.sites), table)
+        else:
+            sites = _sites_from_file(scene, entry, table)
+        found = molecule(entry.label, sites)
     if entry.masses_u is not None:
         found = with_masses(found, entry.masses_u)
     changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
@@ -53,17 +58,22 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
 
 
 def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
-    """Sites: positions from the file, parameters from the scene or the table, by atom name or else by element."""
-    path = scene.path(settled(entry.file))
-    own = entry.sites or ()
+    where = "sites or of parameters" if entry.parameters is not None else "sites"
+    return sites_of_geometry(scene.path(settled(entry.file)), entry.sites or (), table, where)
+
+
+def sites_of_geometry(path: Path, own: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
+    """Sites: positions from a file, parameters from entries of one's own or a table, by atom name or else by element.
+
+    where : what entries are called in messages. Raises StructureError with all faults.
+    """
     faults = []
     sites = []
     used = set()
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
         match, shared = find_site(own, name, element), find_site(table, name, element)
         if match is None and shared is None:
-            where = " or of parameters" if entry.parameters is not None else ""
-            faults.append(f"atom {name}: no entry of sites{where} has this name or is called {element}")
+            faults.append(f"atom {name}: no entry of {where} has this name or is called {element}")
             continue
         used.add(match.name if match else "")
         entries = [s for s in (match, shared) if s is not None]
@@ -73,8 +83,8 @@ def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site,
         sites.append(match.model_copy(update=known) if match else Site(**known))
     faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]
     if faults:
-        raise StructureError(str(path), faults)
-    return tuple(sites)
+        raise StructureError(str(path), list(dict.fromkeys(faults)))
+    return with_parameters(tuple(sites), table)
 
 
 def frozen_apart(

@@ -1,5 +1,7 @@
 """The start of a scene of molecules: positions, orientations and momenta."""
 
+from pathlib import Path
+
 import numpy as np
 
 from rigidmd.assemble.cells import cell_fault
@@ -21,21 +23,25 @@ from rigidmd.validation import settled
 def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
     """Positions and orientations from the structure file, or else on a lattice. Raises SceneError, StructureError."""
     if scene.structure is not None:
-        path = scene.path(scene.structure.file)
-        start = scene.structure
+        start, held = scene.structure, scene.held.get("structure.file")
+        path = scene.path(start.file) if held is None else Path(start.file)
         if scene.box.cell is not None and (fault := cell_fault(scene.box.cell)):
             raise SceneError(scene.source, [f"box: {fault}"])
-        found = read_structure(
-            path,
-            species,
-            scene.box.cell,
-            scene.box.periodic,
-            start.tolerance,
-            start.frame,
-            start.repeat,
-            start.atom_types,
-            None if scene.topology is None else scene.path(scene.topology),
-        )
+        try:
+            found = read_structure(
+                path,
+                species,
+                scene.box.cell,
+                scene.box.periodic,
+                start.tolerance,
+                start.frame,
+                start.repeat,
+                start.atom_types,
+                None if scene.topology is None else scene.path(scene.topology),
+                held,
+            )
+        except StructureError as error:
+            raise StructureError(scene.structure_source, error.faults) from None
         faults = []
         for k, entry in enumerate(scene.molecules):
             present = int((found.species == k).sum())
@@ -45,7 +51,7 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
             told = "".join(f"; {note}" for note in found.notes if "velocit" in note)
             faults.append(f"holds no velocities for all atoms{told}. Leave out structure.velocities = true")
         if faults:
-            raise StructureError(str(path), faults)
+            raise StructureError(scene.structure_source, faults)
         return found
     counts = [settled(entry.count) for entry in scene.molecules]
     of_sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))

@@ -64,11 +64,12 @@ def read_structure(
     repeat: tuple[int, int, int] = (1, 1, 1),
     atom_types: dict[str, str] | None = None,
     topology: Path | None = None,
+    held: bytes | None = None,
 ) -> Arrangement:
     """The molecules of a structure file. Raises StructureError.
 
     wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types,
-    topology: see Scene.structure.
+    topology: see Scene.structure. held: the content, where there is no file.
     """
     if path.suffix == ".npz":
         if frame is not None:
@@ -77,7 +78,7 @@ def read_structure(
         if periodic and wanted is None:
             _check_box(path, found.cell, [])
     else:
-        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types, topology)
+        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types, topology, held)
     notes = list(found.notes)
     if not periodic:
         cell = None
@@ -146,10 +147,10 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
 
 
 def _read_molecules(
-    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology
+    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology, held
 ) -> Arrangement:
     _check_types(path, atom_types or {}, species)
-    atoms = read_atoms(path, frame, atom_types, topology)
+    atoms = read_atoms(path, frame, atom_types, topology, held)
     notes = list(atoms.notes)
     if atoms.cell is not None:
         handed = np.linalg.det(atoms.cell)

@@ -19,6 +19,7 @@ FARTHEST = 1e9  # Å, of an atom from the origin
 HEAVIEST = 1e30  # u
 FOR_BYTE = 20  # bytes of memory for each of a file: lines and words as text, numbers
 NO_VOLUME = 1e-9  # of a cell, relative to the cube of its longest edge
+ASE_TRAJECTORY = ".traj"
 READERS = {
     ".gro": read_gro,
     ".arc": read_arc,
@@ -32,14 +33,19 @@ READERS = {
 
 
 def read_atoms(
-    path: Path, frame: int | None = None, atom_types: dict[str, str] | None = None, topology: Path | None = None
+    path: Path,
+    frame: int | None = None,
+    atom_types: dict[str, str] | None = None,
+    topology: Path | None = None,
+    held: bytes | None = None,
 ) -> Atoms:
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
     frame: 1 for the first, -1 for the last; None where there must be only one, and for the last of a trajectory.
     atom_types: names of the types in a LAMMPS data file. topology: a file with the names that a trajectory lacks.
+    held: the content, where there is no file; `path` is then its name.
     """
-    if fault := file_fault(path):
+    if held is None and (fault := file_fault(path)):
         raise StructureError(str(path), [fault])
     suffix = path.suffix.lower()
     if suffix in NAMELESS and topology is None:
@@ -50,10 +56,10 @@ def read_atoms(
     if suffix in TRAJECTORIES:
         atoms = read_trajectory(path, frame, None if topology is None else partial(read_atoms, topology))
     else:
-        size = path.stat().st_size
+        size = path.stat().st_size if held is None else len(held)
         if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
             raise StructureError(str(path), [f"not enough memory: {fault}"])
-        atoms = _choose(path, _frames(path, atom_types), frame)()
+        atoms = _choose(path, _frames(path, atom_types, held), frame)()
     if len(atoms.position) == 0:
         raise StructureError(str(path), ["holds no atoms"])
     for what, values in (("position", atoms.position), ("velocity", atoms.velocity), ("cell", atoms.cell)):
@@ -103,6 +109,8 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
 
 
 def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) -> Callable[[], Atoms]:
+    if frame is None and path.suffix.lower() == ASE_TRAJECTORY:
+        frame = -1
     if frame is None:
         if len(frames) > 1:
             raise StructureError(
@@ -122,11 +130,18 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
     return frames[frame - 1 if frame > 0 else frame]
 
 
-def _frames(path: Path, atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
+def _masses(atoms, suffix: str) -> np.ndarray | None:
+    """The masses in ASE's own trajectories, where they are not its standard ones."""
+    return atoms.get_masses() if suffix == ASE_TRAJECTORY and atoms.has("masses") else None
+
+
+def _frames(path: Path, atom_types: dict[str, str] | None, held: bytes | None) -> list[Callable[[], Atoms]]:
     """One function for each structure of a file, which reads it."""
     suffix = path.suffix.lower()
     if suffix not in READERS and suffix not in LAMMPS_DATA:
-        return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, path)]
+        found = read_by_ase(path, path)
+        return [partial(from_ase, path, atoms, masses=_masses(atoms, suffix)) for atoms in found]
     # Titles may be in any encoding; all data are ASCII.
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    content = path.read_bytes() if held is None else held
+    lines = content.decode("utf-8", errors="replace").splitlines()
     return read_lammps(path, lines, atom_types) if suffix in LAMMPS_DATA else READERS[suffix](path, lines)

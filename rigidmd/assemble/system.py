@@ -1,9 +1,9 @@
 """The system of a scene of molecules: species, model, start, terms. Faults are collected and raised together."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,13 +19,14 @@ from rigidmd.assemble.terms import interactions, left_out
 from rigidmd.core.state import State, state_of
 from rigidmd.core.state_file import Saved
 from rigidmd.dynamics.advance import Model
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu import Engine, Precision
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.forces.laws.lennard_jones import Tail
+from rigidmd.forces.laws.lennard_jones import Tail, sum_of
 from rigidmd.forces.pairs.space import Space, space_of, wrap
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
 from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.own import not_given
 from rigidmd.units import GRAM_PER_CM3
 
 
@@ -59,6 +60,9 @@ class System:
     left_out: list[str]
     force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: list[str] = field(default_factory=list)
+    told: dict[str, Callable] = field(default_factory=dict)  # what Python computes: name of a term -> what is asked
+    thermostat: Any = None  # of the user's own, in place of that of every stage
+    own: dict[str, str] = field(default_factory=dict)  # terms of the user's own by name, in words
 
     @property
     def density(self) -> float:
@@ -86,9 +90,15 @@ class System:
         """Time between removals of the total momentum, ps; None for never."""
         return self.scene.run.remove_momentum_interval_ps or None
 
+    def keeps_momentum_in(self, k: int) -> bool:
+        """Whether the thermostat of stage k leaves the total momentum as it is."""
+        if self.thermostat is not None:
+            return not getattr(self.thermostat, "changes_momentum", False)
+        return self.scene.stages[k].keeps_momentum
+
     def freedom_in(self, k: int) -> Freedom:
         """Degrees of freedom in stage k: with the total momentum where its thermostat changes that."""
-        if self.scene.stages[k].keeps_momentum:
+        if self.keeps_momentum_in(k):
             return self.freedom
         return self.freedom._replace(translation=3 * int(mobile(self.model).sum()))
 
@@ -112,7 +122,11 @@ class System:
 
     def engine(self) -> Engine:
         """A new engine for this system, in the precision of the scene."""
-        return Engine(self.model, self.terms, self.scene.precision, self.scene.forces.skin_A)
+        return self.engine_of(self.terms, self.scene.precision)
+
+    def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> Engine:
+        """A new engine for some terms of this system."""
+        return Engine(self.model, terms, precision, self.scene.forces.skin_A, self.told)
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values for all sites (s,), from `of`, which gives those of one molecule."""
@@ -142,8 +156,11 @@ class System:
         return np.einsum("sij,sj->si", state.rotation[self.sites.molecule], self.sites.offset_body)
 
 
-def build(scene: MolecularScene) -> System:
-    """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found."""
+def build(scene: MolecularScene, bare: bool = False) -> System:
+    """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found.
+
+    bare : leave out what users add, their code too; for looking at a run that has ended
+    """
     species = species_of(scene)
     arrangement = arrange(scene, species)
     space, number = space_of(arrangement.cell), residue_numbers(arrangement)
@@ -182,6 +199,12 @@ def build(scene: MolecularScene) -> System:
         force_error=acting.force_error,
         notes=[*acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )
+    if not bare:
+        if scene.from_python != scene.own.names:
+            raise SceneError(scene.source, [not_given(scene.from_python, scene.own.names)])
+        if scene.forces.custom or scene.from_python:
+            system = with_own(system)
+            scene, model = system.scene, system.model
     if tied := system.tied_to_places:
         words = ", ".join(name.replace("_", " ") for name in tied)
         faults = [
@@ -206,11 +229,32 @@ def build(scene: MolecularScene) -> System:
         system.notes.extend(f"{scene.structure.file}: {note}" for note in arrangement.notes)
         if faults := overlaps(system):
             if not scene.stages[0].is_minimisation:
-                raise StructureError(str(scene.path(scene.structure.file)), faults)
+                raise StructureError(scene.structure_source, faults)
             system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation moves them apart")
     else:
         system.notes.extend(f"box: {note}" for note in arrangement.notes)
     return system
+
+
+def with_own(system: System) -> System:
+    """The system with what users add. Raises SceneError with every fault."""
+    from rigidmd.own.binding import own_terms
+
+    added = own_terms(system)
+    model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.moves)
+    return replace(
+        system,
+        scene=resolve_momentum(system.scene, model.keeps_momentum),
+        # those that Python computes come first: until they are told, nothing else need be computed
+        terms={name: added.terms[name] for name in added.told} | system.terms | added.terms,
+        model=model,
+        freedom=freedom_of(model),
+        told=added.told,
+        thermostat=added.thermostat,
+        tail=sum_of([*([system.tail] if system.tail is not None else []), *added.tails]),
+        own=added.words,
+        notes=[*system.notes, *added.notes],
+    )
 
 
 def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:

@@ -11,10 +11,10 @@ from rigidmd.dynamics.advance import Model
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.lennard_jones import LennardJones, Tail, lennard_jones, tail
 from rigidmd.forces.pairs.loop import pair_forces
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, sites_of
+from rigidmd.forces.pairs.sites import groups, sites_of
 from rigidmd.forces.pairs.space import Space
 from rigidmd.mechanics.rotor import NoRotor
-from rigidmd.molecules import Molecule
+from rigidmd.molecules import Molecule, named_sites
 from rigidmd.scene import MolecularScene
 from rigidmd.units import KJ_PER_MOL
 
@@ -35,13 +35,6 @@ def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.nda
     return sites_of(index, [m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
 
 
-def _groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
-    """Group of each site (s,); sites of one group do not interact. A molecule is one; all frozen molecules are one."""
-    if not frozen.any():
-        return sites.molecule
-    return np.where(frozen[sites.molecule], len(frozen), sites.molecule).astype(np.int32)
-
-
 def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
     """For each species (pairs, 2, sites): whether the first or second name of an entry of forces.pairs means the site.
 
@@ -51,14 +44,10 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
     faults = []
     for n, entry in enumerate(scene.forces.pairs):
         for side, text in enumerate(entry.sites):
-            owner, _, name = text.rpartition(".")
-            of = [k for k, m in enumerate(species) if owner in ("", m.name)]
-            for names in ("site_names", "elements"):
-                for k in of:
-                    found[k][n, side] = [own == name for own in getattr(species[k], names)]
-                if any(found[k][n, side].any() for k in of):
-                    break
-            else:
+            meant = named_sites(species, text)
+            for k, of in enumerate(meant):
+                found[k][n, side] = of
+            if not any(of.any() for of in meant):
                 known = dict.fromkeys(f"{m.name}.{own}" for m in species for own in m.site_names)
                 faults.append(f"forces.pairs.{n}.sites: no site is {text!r}; there are {', '.join(known)}")
     if faults:
@@ -83,17 +72,17 @@ def interactions(
     frozen = (model.inverse_mass == 0)[index]
     named = _named_pairs(scene, species)
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
-    if any(len(c) for c in chosen):
+    if scene.forces.lennard_jones and any(len(c) for c in chosen):
         law = _lennard_jones(scene, species, index, named, chosen)
         sites = _taking_part(species, index, chosen)
-        found.terms["lennard_jones"] = pair_forces(law, sites, _groups(sites, frozen))
+        found.terms["lennard_jones"] = pair_forces(law, sites, groups(sites, frozen))
         if scene.forces.tail_correction:
             found = found._replace(tail=tail(law))
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
         return found
     sites = _taking_part(species, index, chosen)
-    charged = Charged(species, index, frozen, chosen, sites, _groups(sites, frozen))
+    charged = Charged(species, index, frozen, chosen, sites, groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(
         found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error, added.notes
@@ -136,7 +125,7 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> 
     """What is not compiled for this scene, and why."""
     out = []
     if "lennard_jones" not in terms:
-        out.append("Lennard-Jones: no site has it")
+        out.append("Lennard-Jones: " + ("no site has it" if scene.forces.lennard_jones else "lennard_jones is false"))
     if not any(name.startswith("coulomb") for name in terms):
         out.append(
             "charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one")

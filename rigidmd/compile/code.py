@@ -24,6 +24,11 @@ class Parcel(types.Type):
         self.content = content
         super().__init__(f"parcel({content})")
 
+    @property
+    def key(self):
+        """The type of the content: its name is that of any other class of the same name."""
+        return self.content
+
 
 @register_model(Parcel)
 class _ParcelModel(models.PrimitiveModel):
@@ -105,6 +110,11 @@ class CodeType(types.Type):
         self.parcels = parcels
         # a digest, because this name becomes part of the name of every function compiled for it
         super().__init__(f"code({hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]})")
+
+    @property
+    def key(self):
+        """The tasks."""
+        return self.parcels
 
     def place(self, name: str, parcel: Parcel) -> int:
         """Index of a task's address. Raises TypingError if there is no such task, or not for this type of parcel."""

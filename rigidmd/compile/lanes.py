@@ -5,7 +5,8 @@ from and stored to contiguous arrays. The number of lanes follows from the machi
 AVX-512, 8 with AVX2, otherwise 4; half as many float64. `lane_types` has the types and operators, this file the
 functions.
 
-Functions that appear in formulas also take scalars, so that one formula serves pair loops and single numbers.
+Functions that appear in formulas also take scalars, so that one formula serves pair loops and single numbers; so do
+those of Python's `math`, see `lane_math`.
 """
 
 from math import prod, sqrt
@@ -16,7 +17,12 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from rigidmd.compile import PAIR_FLAGS, SIMD_BITS, implements
+from rigidmd.compile import (
+    PAIR_FLAGS,
+    SIMD_BITS,
+    implements,
+    lane_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
+)
 from rigidmd.compile.lane_types import COUNT, FLAGS, Lanes, Mask, filled
 
 
@@ -381,6 +387,58 @@ def polynomial(typing, coefficients, x):
         return found
 
     return x(coefficients, x), emit
+
+
+@intrinsic
+def cubic_at(typing, coefficients, t):
+    """(value, derivative) at t of cubic polynomials, number k of which is valid from t = k to k + 1.
+
+    coefficients (4 n,) : four for each, of x = t - k in ascending order. Before 0 the first goes on in a straight line,
+    beyond the end the last one goes on. t is a float64 or a vector
+    """
+    lanes = t if isinstance(t, Lanes) else Lanes(types.float64, 1)
+    pair = types.UniTuple(t, 2)
+
+    def emit(context, builder, signature, arguments):
+        there = context.make_array(coefficients)(context, builder, arguments[0])
+        vector, whole = context.get_value_type(lanes), ir.VectorType(ir.IntType(64), lanes.count)
+        value = arguments[1] if isinstance(t, Lanes) else builder.bitcast(arguments[1], vector)
+        last = builder.sub(builder.sdiv(builder.extract_value(there.shape, 0), ir.IntType(64)(4)), ir.IntType(64)(1))
+        zero = ir.Constant(vector, [0.0] * lanes.count)
+        begins = builder.fcmp_ordered("<", value, zero)
+        step = builder.fptosi(builder.select(begins, zero, value), whole)
+        parts = [ir.Constant(vector, ir.Undefined)] * 4
+        starts = zero
+        for k in range(lanes.count):
+            place = ir.IntType(32)(k)
+            index = builder.extract_element(step, place)
+            index = builder.select(builder.icmp_signed("<", index, last), index, last)
+            index = builder.select(builder.icmp_signed(">", index, ir.IntType(64)(0)), index, ir.IntType(64)(0))
+            starts = builder.insert_element(starts, builder.sitofp(index, vector.element), place)
+            address = builder.gep(there.data, [builder.mul(index, ir.IntType(64)(4))])
+            for c in range(4):
+                number = builder.load(builder.gep(address, [ir.IntType(64)(c)]))
+                if number.type != vector.element:
+                    number = builder.fptrunc(number, vector.element)
+                parts[c] = builder.insert_element(parts[c], number, place)
+        x = builder.fsub(value, starts, flags=FLAGS)
+        curved = [builder.select(begins, zero, part) for part in parts[2:]]
+
+        def sum_of(*terms):
+            total = terms[-1]
+            for term in terms[-2::-1]:
+                total = builder.fadd(term, builder.fmul(total, x, flags=FLAGS), flags=FLAGS)
+            return total
+
+        def times(k, part):
+            return builder.fmul(ir.Constant(vector, [float(k)] * lanes.count), part, flags=FLAGS)
+
+        found = sum_of(*parts[:2], *curved), sum_of(parts[1], times(2, curved[0]), times(3, curved[1]))
+        if not isinstance(t, Lanes):
+            found = [builder.extract_element(own, ir.IntType(32)(0)) for own in found]
+        return context.make_tuple(builder, pair, found)
+
+    return pair(coefficients, t), emit
 
 
 @intrinsic

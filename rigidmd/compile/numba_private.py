@@ -26,21 +26,46 @@ from numba.core.ccallback import CFunc
 from numba.core.registry import CPUDispatcher
 
 from rigidmd.compile.cache import cache_folder, shared_folder
+from rigidmd.core.own_code import BY_CONTENT
 from rigidmd.errors import RigidMDWarning
 
 
 class Index(IndexDataCacheFile):
     """Index of a cache: compiled functions by the types of their arguments.
 
-    An index with a type from a module that cannot be imported, for example a user's own term, counts as empty, so that
-    other programs can still use the cache. The files of machine code have random names: Numba numbers them, and two
-    processes that compiled at the same time for different types wrote to the same file, after which every run crashed.
-    Every file begins with a checksum; one that is damaged counts as absent, and its code is compiled again. What a
-    folder for all users has is read from there, see `cache.shared_folder`.
+    Code for types from outside the package has an index of its own, because no index can be read where one of its types
+    cannot be imported. Such code is kept only if the module of the type is named by its contents (`core.own_code`): of
+    another module nothing tells that it has changed, and old code would go on running.
+    The files of machine code have random names: Numba numbers them, and two processes that compiled at the same time
+    for different types wrote to the same file, after which every run crashed. Every file begins with a checksum; one
+    that is damaged counts as absent, and its code is compiled again. What a folder for all users has is read from
+    there, see `cache.shared_folder`.
     """
 
     def load(self, key):
         """A compiled function; None if there is none."""
+        own = self._apart(key)
+        return None if own is None else own._load(key)
+
+    def save(self, key, data):
+        """Keep a compiled function."""
+        own = self._apart(key)
+        if own is not None:
+            super(Index, own).save(key, data)
+
+    def _apart(self, key) -> "Index | None":
+        """The index for the types of a key; None if it is not kept."""
+        modules = sorted(set(_foreign(getattr(key[0], "args", key[0]))))
+        if not modules:
+            return self
+        if not all(name.startswith(BY_CONTENT) for name in modules):
+            return None
+        there = copy.copy(self)
+        digest = hashlib.sha256(" ".join(modules).encode()).hexdigest()[:16]
+        there._index_path = f"{self._index_path}.{digest}"
+        return there
+
+    def _load(self, key):
         found = super().load(key)
         shared = shared_folder()
         if found is None and shared is not None:
@@ -82,6 +107,21 @@ class Index(IndexDataCacheFile):
             say_once(fault)
             raise OSError(fault)
         return pickle.loads(data[size:])
+
+
+def _foreign(kind) -> Iterator[str]:
+    """Modules outside the package that the named tuples in a Numba type come from."""
+    if isinstance(kind, tuple):
+        inner = kind
+    elif isinstance(kind, types.BaseTuple):
+        inner = kind.types
+        module = getattr(getattr(kind, "instance_class", tuple), "__module__", "builtins")
+        if module.split(".")[0] not in ("rigidmd", "builtins"):
+            yield module
+    else:  # of `compile.code`: a parcel, or the tasks of a `Code`
+        inner = (*getattr(kind, "parcels", ()), *([kind.content] if hasattr(kind, "content") else ()))
+    for part in inner:
+        yield from _foreign(part)
 
 
 @functools.cache

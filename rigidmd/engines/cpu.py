@@ -2,10 +2,11 @@
 kernels, and handles their status codes."""
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 
+from rigidmd.compile.own import CompileError
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import (
     ASK,
@@ -27,7 +28,6 @@ from rigidmd.dynamics.boxes import BoxRoom, NoBox, Piston, box_room
 from rigidmd.dynamics.gradient import Probe, probe_for
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
-from rigidmd.forces.body.fields import Asked, answer
 from rigidmd.forces.external.walls import Behind, LennardJonesWalls
 from rigidmd.forces.terms import (
     Loading,
@@ -42,11 +42,21 @@ from rigidmd.forces.terms import (
 )
 from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
 
+__all__ = ["BehindWallError", "CompileError", "Engine", "NotFiniteError", "Precision", "keep_time"]
+
 Precision = Literal["double", "mixed"]
 #: Owners of arrays in the memory of an engine, besides its terms, and the arrays of each.
 LOAD, BOX = "load", "box"
 REMEMBERED = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
 DTYPES = {"double": np.float64, "mixed": np.float32}
+
+
+class Asks(Protocol):
+    """A workspace of what Python computes."""
+
+    def answer(self, function: Callable, state: State) -> None:
+        """Let a function fill it in for a state."""
+        ...
 
 
 class Engine:
@@ -58,7 +68,8 @@ class Engine:
     terms : name -> term, in the order in which forces are added
     precision : arithmetic between sites; "mixed": pairs in single precision, sums and motion in double
     skin : extra radius of neighbour lists, Å; speed only
-    applied : functions of (time, state) that terms of type `Told` stand for: name -> function
+    applied : the functions that terms of type `Told` (of a body) and `ToldForces` stand for: name -> function, as their
+        workspaces call it
     """
 
     def __init__(
@@ -67,7 +78,7 @@ class Engine:
         terms: dict[str, NamedTuple],
         precision: Precision = "double",
         skin: float = 1.6,
-        applied: dict[str, Callable[[float, State], tuple]] | None = None,
+        applied: dict[str, Callable] | None = None,
     ):
         self.model = model
         self.terms = terms
@@ -230,8 +241,8 @@ class Engine:
             raise BehindWallError(next(behind for behind in found if behind is not None))
         elif status == ASK:
             for name, workspace in zip(self.names, workspaces, strict=False):
-                if isinstance(workspace, Asked):
-                    answer(workspace, self._applied[name], state)
+                if name in self._applied:
+                    cast(Asks, workspace).answer(self._applied[name], state)
         return workspaces
 
 

@@ -65,6 +65,18 @@ def add_forces(term, state, load, tally):
     raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")
 
 
+def worse(status, other):
+    """The worse of two status codes; the other may be None, which is OK."""
+    raise TypeError("compiled code only")
+
+
+@implements(worse, inline=True)
+def _worse(status, other):
+    if other is types.none:
+        return lambda status, other: status
+    return lambda status, other: max(status, other)
+
+
 def power(term, state, velocity, omega):
     """Power of a term whose class has `drives = True`; 0 for any other term, because its energy includes its work.
 
@@ -143,13 +155,13 @@ def term_code(term: NamedTuple, loader: Loader, called: bool) -> Code:
 @task()
 def _add_plain(parcel, block):
     term, state, load, other, _, status, _ = opened(parcel)
-    status[0] = max(status[0], add_forces(term, state, other if block == OTHER else load, None))
+    status[0] = worse(status[0], add_forces(term, state, other if block == OTHER else load, None))
 
 
 @task()
 def _add_tallied(parcel, block):
     term, state, load, _, tally, status, _ = opened(parcel)
-    status[0] = max(status[0], add_forces(term, state, load, tally))
+    status[0] = worse(status[0], add_forces(term, state, load, tally))
 
 
 @task()
@@ -234,7 +246,9 @@ def _load_now(terms, state, load, which):
         for k in range(len(terms.content)):
             address = terms.tallied[k] if which == TALLIED else terms.plain[k]
             jump_to(address, terms.content[k], which)
-        return terms.status[0]
+            if terms.status[0] != OK:  # asked again, all terms begin again: no need to go on
+                return terms.status[0]
+        return OK
 
     return load_by_address
 
@@ -257,7 +271,7 @@ def load_bodies(terms, state, load, tally):
     load.torque_body[:] = 0.0
     status = OK
     for term in literal_unroll(terms):
-        status = max(status, add_forces(term, state, load, tally))
+        status = worse(status, add_forces(term, state, load, tally))
     return status
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.system import Sites
+from rigidmd.assemble.system import Sites, System
 from rigidmd.errors import OutputError
 from rigidmd.looking.view import data_part, own, packed, script, stage
 from rigidmd.output.connections import connections
@@ -45,12 +45,17 @@ def frames_of(record: Record, most: int) -> Frames:
         raise OutputError(f"{record.folder}: its trajectory {output.trajectory} is not there")
     found = read_frames(path, len(sites.molecule), most)
     _check_shapes(path, sites, found.positions[0])
-    if found.cells is None:
-        return found
-    centre = np.stack([_centres(frame, sites.molecule) for frame in found.positions])
-    inside = np.linalg.solve(np.swapaxes(found.cells, 1, 2), np.swapaxes(centre, 1, 2))  # cells as columns
-    shift = np.swapaxes(np.swapaxes(found.cells, 1, 2) @ np.floor(inside), 1, 2)
-    return found._replace(positions=found.positions - shift[:, sites.molecule].astype(np.float32))
+    return inside(found, sites)
+
+
+def inside(frames: Frames, sites: Sites) -> Frames:
+    """The frames with each molecule, which is whole, inside the box."""
+    if frames.cells is None:
+        return frames
+    centre = np.stack([_centres(frame, sites.molecule) for frame in frames.positions])
+    share = np.linalg.solve(np.swapaxes(frames.cells, 1, 2), np.swapaxes(centre, 1, 2))  # cells as columns
+    shift = np.swapaxes(np.swapaxes(frames.cells, 1, 2) @ np.floor(share), 1, 2)
+    return frames._replace(positions=frames.positions - shift[:, sites.molecule].astype(np.float32))
 
 
 def _check_shapes(path: Path, sites: Sites, frame: np.ndarray) -> None:
@@ -79,6 +84,14 @@ def thinned(frames: Frames) -> list[str]:
     return told
 
 
+def massive_bonds(system: System) -> list[list[int]]:
+    """Bonds for chemiscope, [i, j, 1], in numbers of the sites with mass."""
+    massive = np.flatnonzero(system.sites.mass > 0)
+    number = np.full(len(system.sites.mass), -1)
+    number[massive] = np.arange(len(massive))
+    return [[int(i), int(j), 1] for i, j in number[connections(system)]]
+
+
 def page_part(record: Record) -> tuple[list[str], list[str]]:
     """The film as HTML, and what was thinned out. Raises OutputError."""
     code = library()
@@ -91,8 +104,6 @@ def page_part(record: Record) -> tuple[list[str], list[str]]:
         told.append("Sites without mass are not drawn.")
     low, high = positions.min(), positions.max()
     scale = max(float(high - low), 1e-9) / (2 * STEPS)
-    new = np.full(len(sites.mass), -1)
-    new[massive] = np.arange(len(massive))
     data = {
         "time": packed(frames.time, "<f8"),
         "positions": packed(np.round((positions - low) / scale - STEPS), "<i2"),
@@ -100,7 +111,7 @@ def page_part(record: Record) -> tuple[list[str], list[str]]:
         "scale": scale,
         "steps": STEPS,
         "elements": [str(element) for element in sites.element[massive]],
-        "bonds": [[int(i), int(j), 1] for i, j in new[connections(record.molecules)]],
+        "bonds": massive_bonds(record.molecules),
         "cells": None if frames.cells is None else packed(frames.cells.reshape(-1, 9), "<f4"),
         "name": record.scene.name,
     }

@@ -198,7 +198,7 @@ MARGINS = ((0.5, GOOD, "safe"), (1.0, DOUBTFUL, "near the limit"), (float("inf")
 
 def _told(record: Record) -> tuple[str, list[str]]:
     """What `rigidmd check` says: of the run, and what is left out."""
-    lines = describe(record.scene).splitlines()
+    lines = describe(record.scene, bare=True).splitlines()
     if "left out:" not in lines:
         return "\n".join(lines), []
     start = lines.index("left out:")
@@ -210,9 +210,10 @@ def _files(record: Record) -> str:
     output, rows = record.scene.output, []
     about = ABOUT | {output.topology: "names and first positions, for viewers"}
     if output.trajectory:
-        alone = output.trajectory.endswith(".gsd")
-        viewer = f"ovito {output.trajectory}" if alone else f"vmd {output.topology} {output.trajectory}"
-        about[output.trajectory] = f"positions{' and rotations' if alone else ''} over time: {viewer}"
+        viewers = {".gsd": "ovito", ".traj": "ase gui"}
+        viewer = viewers.get(Path(output.trajectory).suffix, f"vmd {output.topology}")
+        turns = " and rotations" if output.trajectory.endswith(".gsd") else ""
+        about[output.trajectory] = f"positions{turns} over time: {viewer} {output.trajectory}"
     for path in sorted(record.folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue

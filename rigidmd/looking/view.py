@@ -28,7 +28,7 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
     record = read_record(folder)
     if record.is_body:
         drawn = body_film(record)
-        film, told = _body(record, drawn), drawn.told
+        film, told = body_part(record, drawn), drawn.told
     else:
         from rigidmd.looking.molecule_film import page_part
 
@@ -70,7 +70,8 @@ def stage(picture: str, beneath: str, record: Record, told: list[str]) -> str:
     return f'<div class="film">{left}{plots.draw(record)}</div>'
 
 
-def _body(record: Record, film: BodyFilm) -> list[str]:
+def body_part(record: Record, film: BodyFilm) -> list[str]:
+    """The film of a body as HTML."""
     flat = partial(packed, kind="<f4")
     data = {
         "time": packed(film.time, "<f8"),

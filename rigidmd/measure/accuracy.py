@@ -9,7 +9,6 @@ from scipy.special import erf
 from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.pairs.loop import PairForces, PairWorkspace
@@ -96,7 +95,7 @@ def rounding(system: System, state: State) -> tuple[float, float] | None:
     scene = system.scene
     if scene.precision == "double":
         return None
-    exact = Engine(system.model, system.terms, "double", scene.forces.skin_A).evaluate(state)[0]
+    exact = system.engine_of(system.terms, "double").evaluate(state)[0]
     found = system.engine().evaluate(state)[0]
     errors = []
     for a, b in zip(found, exact, strict=True):
@@ -113,7 +112,7 @@ def _real_part(system: System) -> PairForces:
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     """Coulomb forces on charged sites (s, 3) without pairs inside molecules, and the Coulomb energy."""
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
-    engine = Engine(system.model, charged, system.scene.precision, system.scene.forces.skin_A)
+    engine = system.engine_of(charged, system.scene.precision)
     _, tallies = engine.evaluate(state)
     real, force = _real_part(system), np.zeros((len(system.sites.molecule), 3))
     for workspace in engine.workspaces.values():
@@ -122,12 +121,12 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     position = np.empty_like(force)
     place_sites(real.sites, state, position)
     law = cast(ScreenedCoulomb, real.law)
-    force = force + _inside(law.charge, position, real.sites.first, law.alpha)
+    force = force + forces_inside(law.charge, position, real.sites.first, law.alpha)
     constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
     return force, sum(tally.energy for tally in tallies.values()) + constants
 
 
-def _inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, alpha: float) -> np.ndarray:
+def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, alpha: float) -> np.ndarray:
     """Forces (s, 3) that cancel those of the reciprocal part between sites of one molecule."""
     force = np.zeros_like(position)
     count = np.diff(first)

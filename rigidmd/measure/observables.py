@@ -119,7 +119,7 @@ def observe(
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
     volume, beyond = state.volume, 0.0
     if system.tail is not None:
-        components["lennard_jones_tail"] = system.tail.energy(volume)
+        components["tail" if system.own else "lennard_jones_tail"] = system.tail.energy(volume)
         beyond = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     model = system.model

@@ -53,11 +53,21 @@ class Sample(NamedTuple):
         float, Column("", "kJ/mol", "energy less heat, work and what removals of momentum have put in")
     ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
+    own: tuple[float, ...] = ()  # energies of the user's own forces, kJ/mol
+
+    def value(self, name: str, own: Sequence[str]) -> float | int | str:
+        """The value of a column; `own` are the names of the user's own forces."""
+        return self.own[own.index(name)] if name in own else getattr(self, name)
 
 
 COLUMNS: dict[str, Column] = {
-    name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items()
+    name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items() if name != "own"
 }
+
+
+def own_columns(own: Sequence[str]) -> dict[str, Column]:
+    """The columns of the user's own forces."""
+    return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in own}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
@@ -68,35 +78,40 @@ class Samples:
     """The rows of a run, in order."""
 
     rows: list[Sample] = field(default_factory=list)
+    own: tuple[str, ...] = ()  # names of the user's own forces, whose energies are columns too
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def __getitem__(self, column: str) -> np.ndarray:
         """A column as an array (rows,), by the name of a field of `Sample`, in the unit of the log."""
-        if column not in COLUMNS:
-            raise KeyError(f"no column {column!r}; there are {', '.join(COLUMNS)}")
-        return np.array([getattr(row, column) for row in self.rows])
+        if column not in self.described:
+            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
+        return np.array([row.value(column, self.own) for row in self.rows])
 
     def table(self) -> np.ndarray:
         """All numbers (rows, columns) as float64, which holds every one of them; for `of_table`."""
-        return np.array([[float(getattr(row, name)) for name in NUMBERS] for row in self.rows]).reshape(
-            -1, len(NUMBERS)
+        numbers = [*NUMBERS, *self.own]
+        return np.array([[float(row.value(name, self.own)) for name in numbers] for row in self.rows]).reshape(
+            -1, len(numbers)
         )
 
     @classmethod
-    def of_table(cls, table: np.ndarray, stages: Sequence[str]) -> "Samples":
-        """The rows of a table; `stages` are the names of all stages. Raises ValueError if it is no such table."""
-        if table.ndim != 2 or table.shape[1] != len(NUMBERS):
+    def of_table(cls, table: np.ndarray, stages: Sequence[str], own: tuple[str, ...] = ()) -> "Samples":
+        """The rows of a table; `stages` are the names of all stages, `own` those of the user's own forces.
+
+        Raises ValueError if it is no such table.
+        """
+        if table.ndim != 2 or table.shape[1] != len(NUMBERS) + len(own):
             raise ValueError(f"samples have the shape {table.shape}")
         rows = []
         for values in table.tolist():
-            row = dict(zip(NUMBERS, values, strict=True))
+            row = dict(zip(NUMBERS, values[: len(NUMBERS)], strict=True))
             row |= {name: int(row[name]) for name in ("step", "stage")}
-            rows.append(Sample(**row, stage_name=stages[int(row["stage"])]))
-        return cls(rows)
+            rows.append(Sample(**row, stage_name=stages[int(row["stage"])], own=tuple(values[len(NUMBERS) :])))
+        return cls(rows, own)
 
     @property
     def described(self) -> dict[str, Column]:
         """Name -> column."""
-        return COLUMNS
+        return COLUMNS | own_columns(self.own)

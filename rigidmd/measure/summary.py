@@ -85,6 +85,7 @@ def summarise(
         "momentum_u_A_ps": momentum,
         "momentum_relative": _relative_momentum(system, state, momentum),
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
+        "own_forces": dict(system.own),
         "momentum_removed": _removed(system, state),
         "stages": stages,
         "notes": [

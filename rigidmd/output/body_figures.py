@@ -1,11 +1,15 @@
 """Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of the invariants."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle, save_figure, thin_series
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
@@ -17,8 +21,21 @@ UP = np.array([0.0, 0.0, 1.0])
 MOST_POINTS, FLOOR = 10_000, 1e-17
 
 
-def draw_motion(
-    folder: Path,
+def draw_motion(folder: Path, figures: dict[str, "Figure"]) -> list[Path]:
+    """Write figures as PNG and SVG, with the same bytes for the same run. Returns the paths. Raises OutputError."""
+    from matplotlib import rc_context
+
+    written = []
+    for stem, figure in figures.items():
+        with rc_context({"svg.hashsalt": stem}):
+            for ending, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
+                written.append(folder / f"{stem}.{ending}")
+                with whole_file(written[-1]) as temporary:
+                    save_figure(figure, temporary, **options)
+    return written
+
+
+def motion_figures(
     name: str,
     columns: dict[str, np.ndarray],
     axis_body: np.ndarray,
@@ -26,8 +43,8 @@ def draw_motion(
     invariants: list[str],
     gravity: np.ndarray | None,
     flies: bool,
-) -> list[Path]:
-    """Draw the figures that these columns allow, as PNG and SVG. Returns the paths. Raises OutputError.
+) -> dict[str, "Figure"]:
+    """The figures of FIGURES that these columns allow, under a title with the name of the run.
 
     inertia : of a body whose omega stays on the ellipsoids of energy and momentum; flies : of one that is pinned, the
     path of the axis tells that of the centre of mass
@@ -47,27 +64,17 @@ def draw_motion(
         if flies:
             figures["path"] = _path_figure(columns, down)
         figures["invariants"] = _invariants_figure(columns, invariants)
-    return [path for stem, figure in figures.items() if figure for path in _write(folder, stem, name, figure)]
-
-
-def _write(folder: Path, stem: str, name: str, figure) -> list[Path]:
-    """Write one figure as PNG and SVG, with the same bytes for the same run."""
-    from matplotlib import rc_context
-
-    figure.suptitle(f"{name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
-    png, svg = folder / f"{stem}.png", folder / f"{stem}.svg"
-    with rc_context({"svg.hashsalt": stem}):
-        for path, options in ((png, {"dpi": 150}), (svg, {"dpi": 100, "metadata": {"Date": None}})):
-            with whole_file(path) as temporary:
-                save_figure(figure, temporary, **options)
-    return [png, svg]
+    figures = {stem: figure for stem, figure in figures.items() if figure is not None}
+    for figure in figures.values():
+        figure.suptitle(f"{name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
+    return figures
 
 
 def _new_figure(title: str, width: float, height: float):
-    """An empty figure; writing completes its title with the name of the run."""
-    from matplotlib.figure import Figure
+    """An empty figure; `motion_figures` completes its title with the name of the run."""
+    from rigidmd.output.picture import Picture  # Matplotlib is slow to import
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Picture(figsize=(width, height), layout="constrained")
     figure.suptitle(title)
     return figure
 

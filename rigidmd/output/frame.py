@@ -14,3 +14,8 @@ class Frame(NamedTuple):
     cell: np.ndarray | None = None
     velocities: np.ndarray | None = None
     rotation: np.ndarray | None = None
+
+    @property
+    def sites(self) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+        """Positions, velocities and cell."""
+        return self.positions, self.velocities, self.cell

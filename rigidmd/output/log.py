@@ -17,9 +17,10 @@ from rigidmd.measure.samples import Sample
 TENSOR = tuple(name for name in samples.COLUMNS if name.startswith("pressure_") and len(name) == len("pressure_xx"))
 
 
-def columns(tensor: bool = True) -> dict[str, str]:
-    """Name of each column -> its header; with or without the pressure tensor."""
-    written = {name: column.header for name, column in samples.COLUMNS.items() if column.header}
+def columns(tensor: bool = True, own: Sequence[str] = ()) -> dict[str, str]:
+    """Name of each column -> its header; with or without the pressure tensor; own : the user's own forces."""
+    described = samples.COLUMNS | samples.own_columns(own)
+    written = {name: column.header for name, column in described.items() if column.header}
     return written if tensor else {name: header for name, header in written.items() if name not in TENSOR}
 
 
@@ -27,10 +28,11 @@ class Log:
     """Writes samples to a CSV file, numbers with all significant digits; missing values are empty. Raises OutputError.
 
     kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
+    own : names of the user's own forces
     """
 
-    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None):
-        self._columns = columns(tensor)
+    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None, own: Sequence[str] = ()):
+        self._columns, self._own = columns(tensor, own), own
         self._file = AppendedFile(path, kept)
         if kept is None:
             self._append(list(self._columns.values()))
@@ -42,7 +44,8 @@ class Log:
 
     def write(self, sample: Sample) -> None:
         """Add a line."""
-        row = [getattr(sample._replace(time=round(sample.time, 9)), name) for name in self._columns]
+        rounded = sample._replace(time=round(sample.time, 9))
+        row = [rounded.value(name, self._own) for name in self._columns]
         self._append([None if isinstance(x, float) and isnan(x) else x for x in row])
 
     def close(self) -> None:

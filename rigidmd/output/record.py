@@ -78,7 +78,7 @@ def read_record(folder: Path) -> Record:
         system = build_body(scene)
         columns = _motion(folder, system, missing)
     else:
-        system = build(scene)
+        system = build(scene, bare=True)
         columns = _log(folder)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(f"{folder}: the run wrote no samples yet; `rigidmd resume {folder}` goes on with it")

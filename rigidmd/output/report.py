@@ -4,14 +4,18 @@ import json
 from collections.abc import Sequence
 from math import floor, log10
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, thin_series
 from rigidmd.scene.stage import Stage
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 POSITIONS = {
@@ -38,8 +42,8 @@ def summary_text(summary: dict) -> str:
         f"{summary['degrees_of_freedom_rotation']} rotation)"
     ]
     for stage in summary["stages"]:
-        lines += ["", _stage_title(stage)]
-        lines += [f"  {name:<16}{value}" for name, value in _stage_rows(stage)]
+        lines += ["", stage_title(stage)]
+        lines += [f"  {name:<16}{value}" for name, value in stage_rows(stage)]
     lines += ["", f"  {'orthogonality':<16}|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"]
     lines.append(
         f"  {'momentum':<16}|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, "
@@ -59,7 +63,21 @@ def summary_text(summary: dict) -> str:
 
 def body_summary_text(summary: dict) -> str:
     """The summary of a single body's run as text."""
+    lines = [f"\n{body_title(summary)}", *(f"  {name:<16}{value}" for name, value in body_rows(summary))]
+    lines += [f"\n  note: {note}" for note in summary["notes"]]
+    if summary["interrupted"]:
+        lines += ["", "  interrupted: these are the results so far"]
+    return "\n".join(lines)
+
+
+def body_title(summary: dict) -> str:
+    """Steps and speed of a single body's run."""
     speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
+    return f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"
+
+
+def body_rows(summary: dict) -> list[tuple[str, str]]:
+    """Name and value of what a single body's run found."""
     rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
     if summary["work_J"]:
         rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
@@ -71,15 +89,11 @@ def body_summary_text(summary: dict) -> str:
         rows.append((f"{name} error", f"at most {error:.1e} of {of}"))
     if summary["largest_orthogonality_error"] is not None:
         rows.append(("orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"))
-    lines = [f"\n{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"]
-    lines += [f"  {name:<16}{value}" for name, value in rows]
-    lines += [f"\n  note: {note}" for note in summary["notes"]]
-    if summary["interrupted"]:
-        lines += ["", "  interrupted: these are the results so far"]
-    return "\n".join(lines)
+    return rows
 
 
-def _stage_title(stage: dict) -> str:
+def stage_title(stage: dict) -> str:
+    """Steps and speed of a stage, or how its minimisation ended."""
     if found := stage["minimum"]:
         ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
         relief = f" and {found['relief_steps']} of relief" if found["relief_steps"] else ""
@@ -106,7 +120,8 @@ def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
     return rows
 
 
-def _stage_rows(stage: dict) -> list[tuple[str, str]]:
+def stage_rows(stage: dict) -> list[tuple[str, str]]:
+    """Name and value of what a stage found; a row without a name belongs to the one before it."""
     if stage["minimum"]:
         return _minimum_rows(stage, stage["minimum"])
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
@@ -162,18 +177,24 @@ def drawn(stages: Sequence[Stage], samples: Samples) -> np.ndarray:
 
 
 def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> None:
-    """energy.png: the drift of the last stage on its own scale; energies and temperatures of the whole run."""
-    from matplotlib.figure import Figure
+    """energy.png."""
+    with whole_file(path) as temporary:
+        save_figure(energy_figure(system, samples, summary), temporary, dpi=150)
+
+
+def energy_figure(system: System, samples: Samples, summary: dict) -> "Figure":
+    """The drift of the last stage on its own scale; energies and temperatures of the whole run."""
+    from rigidmd.output.picture import Picture  # Matplotlib is slow to import
 
     stages = system.scene.stages
     n = len(system.model.species)
     shown = drawn(stages, samples)
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
-    figure = Figure(figsize=(8, 7), layout="constrained")
+    figure = Picture(figsize=(8, 7), layout="constrained")
     drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
     own = stage == stage[-1]
-    drift.plot(time[own], column["drift"][own] / n, color=COOL, lw=0.9)
+    drift.plot(*thin_series(time[own], column["drift"][own] / n), color=COOL, lw=0.9)
     last = summary["stages"][stage[-1]]
     if own.sum() > 2 and last["drift_kJ_mol_ns_per_molecule"] is not None:
         gradient, error = last["drift_kJ_mol_ns_per_molecule"], last["drift_error_kJ_mol_ns_per_molecule"]
@@ -183,21 +204,22 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
             f"{last['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule",
             loc="left", fontsize=9, color=WARM,
         )  # fmt: skip
-    drift.set_ylabel("conserved energy relative to the\nstart of the stage (kJ/mol per molecule)")
-    parts.plot(time, (column["potential"] - column["potential"][-1]) / n, color=COOL, lw=0.9, label="potential")
-    parts.plot(time, (column["kinetic"] - column["kinetic"][-1]) / n, color=WARM, lw=0.9, label="kinetic")
-    parts.set_ylabel("energies relative to their\nlast values (kJ/mol per molecule)")
+    drift.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
+    for name, color in (("potential", COOL), ("kinetic", WARM)):
+        parts.plot(*thin_series(time, (column[name] - column[name][-1]) / n), color=color, lw=0.9, label=name)
+    parts.set_ylabel("energies less\ntheir last values\n(kJ/mol per molecule)")
     for name, color, label in (
         ("temperature_translation", COOL, "translation"),
         ("temperature_rotation", WARM, "rotation"),
     ):
         if np.isfinite(column[name]).all():
-            temperature.plot(time, column[name], color=color, lw=0.9, label=label)
+            temperature.plot(*thin_series(time, column[name]), color=color, lw=0.9, label=label)
     temperature.set_ylabel("temperature (K)")
     temperature.set_xlabel("time (ps)")
     for axis in (drift, parts, temperature):
         axis.spines[["top", "right"]].set_visible(False)
         axis.margins(x=0)
+        axis.yaxis.label.set_fontsize(9)
     for axis in (parts, temperature):
         for k in np.unique(stage):
             start = time[stage == k][0]
@@ -209,5 +231,4 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
         if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
     figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
-    with whole_file(path) as temporary:
-        save_figure(figure, temporary, dpi=150)
+    return figure

@@ -5,25 +5,15 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator
-from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
-from MDAnalysis.coordinates.base import ProtoReader, ReaderBase
 from MDAnalysis.coordinates.core import reader as open_reader
-from MDAnalysis.coordinates.DCD import DCDReader
-from MDAnalysis.coordinates.memory import MemoryReader
-from MDAnalysis.coordinates.PDB import PDBReader
-from MDAnalysis.coordinates.TRJ import NCDFReader
-from MDAnalysis.coordinates.TRR import TRRReader
-from MDAnalysis.coordinates.XTC import XTCReader
-from MDAnalysis.coordinates.XYZ import XYZReader
 from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
 from rigidmd.assemble.body import BodySystem
-from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.gsd_format import GsdReader
 from rigidmd.assemble.system import System
 from rigidmd.assemble.trajectory_formats import read_apart
@@ -31,6 +21,7 @@ from rigidmd.core.state import State
 from rigidmd.errors import OutputError, StructureError
 from rigidmd.output.connections import charges, connections
 from rigidmd.output.frame import Frame
+from rigidmd.output.readers import FORMATS, TIMED, TimedFrames, dimensions
 
 #: Lines that tell the cell and the time of a frame in formats of text.
 BETWEEN_FRAMES = {
@@ -81,13 +72,6 @@ def set_frame(
     frame.data["step"] = step
 
 
-def dimensions(cell: np.ndarray) -> list[float] | None:
-    """A cell (3, 3) in MDAnalysis' form; None without a box."""
-    if cell[0, 0] == inf:
-        return None
-    return [*np.linalg.norm(cell, axis=1), *angles_deg(cell)]
-
-
 def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
     """A Universe that holds frames in memory, each with its own time and box."""
     u = universe(system, system.state)
@@ -98,7 +82,7 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
         else np.array([dimensions(frame.cell) for frame in frames if frame.cell is not None])
     )
     velocities = np.array([frame.velocities for frame in frames])
-    u.trajectory = _TimedFrames(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
+    u.trajectory = TimedFrames(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
     return u
 
 
@@ -240,112 +224,3 @@ def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tupl
     pairs = self_capped_distance(at.astype(np.float32), distance, box=box, return_distances=False)
     ways = (at[pairs[:, 1]] - at[pairs[:, 0]]).astype(np.float32)
     return pairs, ways if box is None else minimize_vectors(ways, box)
-
-
-class SitesOfGSD(ReaderBase):
-    """The sites of a .gsd file in the order of the scene, molecules whole, where the box begins at the origin.
-
-    MDAnalysis' own reader returns central particles too, and positions in the box.
-    """
-
-    units = {"time": "ps", "length": "Angstrom", "velocity": "Angstrom/ps"}  # noqa: RUF012  (MDAnalysis has it so)
-
-    def __init__(self, filename, **options):
-        super().__init__(filename, **options)
-        self._reopen()
-        self.ts = self._Timestep(self.n_atoms, **self._ts_kwargs)
-        self._read_frame(0)
-
-    @property
-    def n_frames(self) -> int:
-        """Frames of the file."""
-        return self._file.count
-
-    def _reopen(self):
-        self.close()
-        self._file = GsdReader(Path(str(self.filename)))
-        self.n_atoms = len(self._file.read(0).sites)
-        self._frame = -1
-
-    def close(self):
-        """Close the file."""
-        if hasattr(self, "_file"):
-            self._file.close()
-
-    def _read_frame(self, i):
-        if not 0 <= i < self.n_frames:
-            raise OSError(f"there is no frame {i}")
-        found = self._file.read(i)
-        if len(found.sites) != self.n_atoms:
-            raise ValueError(f"frame {i + 1} has another number of sites")
-        self._frame = self.ts.frame = i
-        self.ts.positions = found.position[found.sites]
-        if (velocities := found.site_velocities()) is not None:
-            self.ts.velocities = velocities
-        self.ts.dimensions = None if found.cell is None else dimensions(found.cell)
-        self.ts.time = found.time
-        self.ts.data["step"] = found.step
-        return self.ts
-
-    def _read_next_timestep(self, ts=None):
-        return self._read_frame(self._frame + 1)
-
-
-class _Timed(ProtoReader):
-    """Makes a reader return the times of the run (ps), evenly spaced or not, whatever its file holds."""
-
-    def __init__(self, *source, times: list[float], **options):
-        self._times = times
-        # two frames at one time: before and after a minimisation
-        self._dt = float(next((gap for gap in np.diff(times) if gap > 0), 0.0))
-        super().__init__(*source, **options | {"times": times})  # readers give all their options to copies
-        self._timed(self.ts)
-
-    @property
-    def totaltime(self) -> float:
-        """From the first frame to the last, ps."""
-        return self._times[-1] - self._times[0]
-
-    def _timed(self, frame):
-        frame.time = self._times[frame.frame]
-        frame.dt = self._dt
-        return frame
-
-    def _read_frame(self, i):
-        return self._timed(super()._read_frame(i))
-
-    def _read_next_timestep(self, ts=None):
-        # every reader implements it
-        return self._timed(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
-
-
-class _TimedFrames(_Timed, MemoryReader): ...
-
-
-class _TimedXTC(_Timed, XTCReader): ...
-
-
-class _TimedTRR(_Timed, TRRReader): ...
-
-
-class _TimedDCD(_Timed, DCDReader): ...
-
-
-class _TimedNCDF(_Timed, NCDFReader): ...
-
-
-class _TimedGSD(_Timed, SitesOfGSD): ...
-
-
-class _TimedXYZ(_Timed, XYZReader): ...
-
-
-class _TimedPDB(_Timed, PDBReader): ...
-
-
-TIMED = {
-    ".xtc": _TimedXTC, ".trr": _TimedTRR, ".gsd": _TimedGSD, ".dcd": _TimedDCD, ".nc": _TimedNCDF, ".xyz": _TimedXYZ,
-    ".pdb": _TimedPDB,
-}  # fmt: skip
-#: What MDAnalysis calls a format, or the reader itself, where it is not the ending.
-FORMATS = {".nc": "NCDF", ".gsd": SitesOfGSD}

@@ -19,6 +19,7 @@ from rigidmd.core.files import AppendedFile, whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.output.gsd_file import GsdFile
+from rigidmd.output.traj_file import TrajFile
 from rigidmd.output.trajectory import dimensions, set_frame, universe
 
 #: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
@@ -32,12 +33,12 @@ def open_trajectory(
     velocities: bool,
     wrapped: bool,
     kept: Sequence[int] | None = None,
-) -> "TrajectoryFile | GsdFile":
+) -> "TrajectoryFile | GsdFile | TrajFile":
     """The file that frames go to, which the ending chooses; for the arguments see `TrajectoryFile`."""
-    if path.suffix == ".gsd":
+    if (kind := {".gsd": GsdFile, ".traj": TrajFile}.get(path.suffix)) is not None:
         if not isinstance(system, System):
-            raise TypeError("a .gsd file is of molecules")
-        return GsdFile(path, system, velocities, wrapped, kept)
+            raise TypeError(f"a {path.suffix} file is of molecules")
+        return kind(path, system, velocities, wrapped, kept)
     return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
 
 

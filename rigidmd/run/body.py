@@ -9,7 +9,7 @@ from typing import Any, Unpack
 from rigidmd.assemble.body import BodySystem, Pose, build_body
 from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.cpu import Engine
-from rigidmd.errors import SimulationError
+from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure.body_summary import summarise_body
 from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.stable_step import body_rate, stable_angle
@@ -18,13 +18,15 @@ from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.report import body_summary_text
 from rigidmd.output.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
-from rigidmd.run.loop import Costs, Options, Simulation, Stretch
+from rigidmd.run.loop import Simulation
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.options import Options
 from rigidmd.run.provenance import plain
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import check_same_scene, state_from
 from rigidmd.run.signals import interruptible
+from rigidmd.run.stretches import Costs, Stretch
 from rigidmd.scene import BodyScene
 from rigidmd.validation import settled
 
@@ -52,6 +54,11 @@ class BodySimulation(Simulation):
         applied: Mapping[str, Callable[[Pose], tuple]] | None = None,
         **options: Unpack[Options],
     ):
+        if of_molecules := [key for key in ("forces", "thermostat") if key in options]:
+            raise SceneError(
+                scene.source,
+                [f"{' and '.join(of_molecules)}: for molecules; a single body takes applied={{name: function}}"],
+            )
         super().__init__(scene, folder, force, **options)
         self._choice = None
         applied = dict(applied or {})

@@ -5,20 +5,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.forces.body.frame import Inertial
-from rigidmd.measure.motion import Motion, Snapshot, drawn_axis, motion
+from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
-from rigidmd.mechanics.rotor import SplitRotor
 from rigidmd.output.body_figures import FIGURES, draw_motion
 from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.folder import MOTION, MOTION_NPZ
 from rigidmd.output.motion_file import write_csv, write_npz
+from rigidmd.output.run_figures import body_figures
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
 from rigidmd.validation import settled
 
 if TYPE_CHECKING:
-    from rigidmd.assemble.body import BodySystem
     from rigidmd.run.body import BodySimulation
     from rigidmd.run.results import Results
 
@@ -113,27 +111,5 @@ class Figures(Observer):
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
         """Draw them if there are enough samples."""
-        system, samples = run.system, results.samples
-        if not isinstance(samples, Motion) or len(samples) <= 2:
-            return
-        columns = dict(samples.columns)
-        if system.turns:  # omega along the principal axes, where it lies on ellipsoids
-            omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
-            columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
-        gravity = run.scene.gravity and run.scene.gravity.acceleration_m_s2
-        results.files += draw_motion(
-            run.path(""),
-            run.scene.name,
-            columns=columns,
-            axis_body=drawn_axis(system),
-            inertia=system.inertia if _keeps_its_ellipsoids(system, samples) else None,
-            invariants=samples.invariants,
-            gravity=None if gravity is None else np.array(gravity),
-            flies=system.flies,
-        )
-
-
-def _keeps_its_ellipsoids(system: "BodySystem", samples: Motion) -> bool:
-    """Whether the inertia is constant, the frame does not turn, and |L| is conserved: no torque acts."""
-    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
-    return steady and "L_size" in samples.invariants
+        if isinstance(results.samples, Motion):
+            results.files += draw_motion(run.path(""), body_figures(run.system, results.samples))

@@ -9,7 +9,6 @@ from rigidmd.assemble.momenta import mobile
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.boxes import COMPONENTS, COUPLINGS
-from rigidmd.engines.cpu import Engine
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR
@@ -52,7 +51,7 @@ class Enthalpy:
 
     def __init__(self, system: System, stage: Stage, state: State):
         model, self._system = system.model, system
-        self.engine = Engine(model, system.terms, "double", system.scene.forces.skin_A)
+        self.engine = system.engine_of(system.terms, "double")
         self.free = mobile(model)
         turning = len(state.rotation)
         self.turns = (model.inertia > 0)[model.species][:turning]

@@ -6,14 +6,13 @@ import sys
 import time as clock
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from html import escape
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack, cast, overload
+from typing import TYPE_CHECKING, Any, Unpack, cast, overload
 
 import numpy as np
 
-from rigidmd.core.schemes import SCHEMES, Scheme, Solver
+from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines import Engine
 from rigidmd.engines.cpu import NotFiniteError
@@ -30,19 +29,21 @@ from rigidmd.output.folder import (
     make_folder,
     never_began,
 )
-from rigidmd.output.progress import progress_of
+from rigidmd.output.progress import Spot, announce, is_shown, progress_of
 from rigidmd.output.report import write_summary
 from rigidmd.run.keeper import PIECE, Keeper
 from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Every, Observer
+from rigidmd.run.observers import Observer
+from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
 from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import changed_since, fitting
 from rigidmd.run.signals import handled, interruptible
+from rigidmd.run.stretches import Costs, Place, Stretch
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
-    from rigidmd.assemble.body import BodySystem, Pose
+    from rigidmd.assemble.body import BodySystem
     from rigidmd.assemble.system import System
     from rigidmd.run.body import BodySimulation
     from rigidmd.run.molecules import MolecularSimulation
@@ -67,50 +68,6 @@ def _as_warning(sentence: str) -> None:
     warnings.warn(sentence, RigidMDWarning, stacklevel=level)
 
 
-class Stretch(NamedTuple):
-    """A stretch of equal steps, or an action that takes no time."""
-
-    row: Scheme | Solver
-    dt: float  # ps, or s for a single body
-    steps: int
-    counted: int = 0  # steps before it from which observers count their intervals
-    act: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
-
-
-class Place(NamedTuple):
-    """Where in its stretches a run is."""
-
-    stretch: int = 0
-    first: int = 0  # steps before the stretch
-    time: float = 0.0  # of the stretches before, ps or s
-    computing: Sequence[float] = ()  # seconds of the stretches before
-    seconds: float = 0.0  # of computing in this one
-
-
-class Costs(NamedTuple):
-    """Times of a run, in seconds."""
-
-    preparing: float  # compiling, relief of overlaps
-    wall: float  # stretches with observers and output
-    computing: Sequence[float]  # the steps of each stretch
-
-
-class Options(TypedDict, total=False):
-    """Keywords of a `Simulation`."""
-
-    observers: Every | Sequence[Every]
-    say: Callable[[str], object]
-    warn: Callable[[str], object]
-    resume: bool
-    walltime: float | None
-
-
-class BodyOptions(Options, total=False):
-    """Keywords of a `BodySimulation`."""
-
-    applied: "Mapping[str, Callable[[Pose], tuple]] | None"
-
-
 class Simulation(Base):
     """A scene, ready to run. The call returns a `MolecularSimulation` or a `BodySimulation`, according to the scene.
 
@@ -119,11 +76,14 @@ class Simulation(Base):
     scene : the scene
     folder : folder for the files; None writes nothing and keeps the frames in memory
     force : replace an earlier run in that folder
-    observers : `Every` objects of your own, called between steps
-    say : called with a sentence before something that takes a moment (compiling, relieving)
+    observers : your own, called between steps: `Every`, `LivePlot`, any `Observer`
+    say : called with a sentence before something that takes a moment (compiling, relieving). Default: it is shown where
+        progress is
     warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's `warnings`
     resume : go on from the last checkpoint in the folder, to the same bits; begin if the folder is empty or absent
     walltime : seconds from now after which the run has to have ended; it stops shortly before, with a checkpoint
+    forces : for molecules, forces of your own: see `MolecularSimulation`
+    thermostat : for molecules, a thermostat of your own
     applied : for a single body, forces from Python functions: see `BodySimulation`
     """
 
@@ -131,7 +91,11 @@ class Simulation(Base):
 
     @overload
     def __new__(
-        cls, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, **options: Unpack[Options]
+        cls,
+        scene: MolecularScene,
+        folder: str | Path | None = None,
+        force: bool = False,
+        **options: Unpack[MolecularOptions],
     ) -> "MolecularSimulation": ...
     @overload
     def __new__(
@@ -139,7 +103,7 @@ class Simulation(Base):
     ) -> "BodySimulation": ...
     @overload
     def __new__(
-        cls, scene: Scene, folder: str | Path | None = None, force: bool = False, **options: Unpack[BodyOptions]
+        cls, scene: Scene, folder: str | Path | None = None, force: bool = False, **options: Unpack[AnyOptions]
     ) -> "MolecularSimulation | BodySimulation": ...
     def __new__(cls, scene: Scene, *arguments: Any, **options: Any) -> Any:
         if cls is not Simulation:
@@ -154,8 +118,8 @@ class Simulation(Base):
         folder: str | Path | None = None,
         force: bool = False,
         *,
-        observers: Every | Sequence[Every] = (),
-        say: Callable[[str], object] = lambda sentence: None,
+        observers: Observer | Sequence[Observer] = (),
+        say: Callable[[str], object] | None = None,
         warn: Callable[[str], object] = _as_warning,
         resume: bool = False,
         walltime: float | None = None,
@@ -163,8 +127,14 @@ class Simulation(Base):
         self.scene = scene
         self.folder = None if folder is None else Path(folder)
         self._force = force
-        self._observers = [observers] if isinstance(observers, Every) else list(observers)
-        self._say = say
+        self._observers = [observers] if isinstance(observers, Observer) else list(observers)
+        if strange := [one for one in self._observers if not isinstance(one, Observer)]:
+            raise TypeError(
+                f"{strange[0]!r:.60} is no observer; of a function make one: rigidmd.Every(interval, function)"
+            )
+        self._own_say = say
+        self._progress: bool | None = None
+        self._spot = Spot()
         self._warn = warn
         self._warnings: list[str] = []
         self._interrupted = False
@@ -178,7 +148,9 @@ class Simulation(Base):
         return f"<{type(self).__name__} {self._told}>"
 
     def _repr_html_(self) -> str:
-        return escape(self._told)
+        from rigidmd.looking.notebook import simulation_html
+
+        return simulation_html(self)
 
     def path(self, file: str) -> Path:
         """A file in the folder of the run. Raises ValueError if it has none."""
@@ -202,6 +174,7 @@ class Simulation(Base):
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
         with contextlib.ExitStack() as stack:
             kept, stays = None, False
+            self._progress, self._spot = progress, Spot()
             if self.folder is not None:
                 stack.callback((lock := FolderLock(self.folder)).release)
                 lock.take()
@@ -337,6 +310,13 @@ class Simulation(Base):
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""
 
+    def _say(self, sentence: str) -> None:
+        """Announce something that takes a moment."""
+        if self._own_say is not None:
+            self._own_say(sentence)
+        elif is_shown(self._progress):
+            announce(sentence, self._spot)
+
     def note(self, warning: str) -> None:
         """Issue a warning; the summary repeats it."""
         self._warnings.append(warning)
@@ -374,7 +354,7 @@ class Simulation(Base):
             self._warn(f"{fault}. The checkpoint before it is used")
         return kept, True
 
-    def _checkpoint(self, observers: list[Observer], place: "Place") -> None:
+    def _checkpoint(self, observers: list[Observer], place: Place) -> None:
         """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
         if not self._keeper.keeps or (memory := self.engine.memory()) is None:
             return
@@ -396,7 +376,7 @@ class Simulation(Base):
         durations = self._durations()
         self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
         whole = sum(durations)
-        with progress_of(whole, self.time_unit, progress if whole > 0 else False) as advanced:
+        with progress_of(whole, self.time_unit, progress if whole > 0 else False, self._spot) as advanced:
             for k in range(place.stretch, len(durations)):
                 if resumed := kept is not None and k == kept.told["place"]["stretch"]:
                     self.stretch = stretch = self._reenter(k)
@@ -451,7 +431,7 @@ class Simulation(Base):
                     break
         return place.computing
 
-    def _moment(self, place: "Place", done: int) -> Moment:
+    def _moment(self, place: Place, done: int) -> Moment:
         """The moment after so many steps of the present stretch."""
         return Moment(self, place.first + done, place.time + done * self.stretch.dt, place.stretch)
 

@@ -38,7 +38,7 @@ class LogFile(Observer):
 
     def begin(self, run: "MolecularSimulation") -> None:
         """Open it."""
-        self._log = Log(run.path(LOG), self._tensor)
+        self._log = Log(run.path(LOG), self._tensor, own=tuple(run.system.own))
 
     def memory(self) -> Checkpoint:
         """Its size."""
@@ -46,7 +46,7 @@ class LogFile(Observer):
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
         """Open it where the checkpoint left it."""
-        self._log = Log(run.path(LOG), self._tensor, kept.told["kept"])
+        self._log = Log(run.path(LOG), self._tensor, kept.told["kept"], tuple(run.system.own))
 
     def see(self, moment: Moment) -> None:
         """A line."""
@@ -125,7 +125,7 @@ class Sampler(Observer):
 
     def __init__(self, run: "MolecularSimulation", interval: float, check: watch.StepCheck):
         self.interval = interval
-        self.samples = Samples()
+        self.samples = Samples(own=tuple(run.system.own))
         self.last_good: Good | None = None
         self._run, self._check = run, check
         self._begins: dict[int, int] = {}  # stage -> row of the sample at which it began
@@ -161,7 +161,8 @@ class Sampler(Observer):
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
         """Restore them. The state of the checkpoint is the last good one."""
-        self.samples = Samples.of_table(kept.arrays["samples"], [stage.label for stage in run.scene.stages])
+        stages = [stage.label for stage in run.scene.stages]
+        self.samples = Samples.of_table(kept.arrays["samples"], stages, tuple(run.system.own))
         self._begins = {int(stage): int(row) for stage, row in kept.told["begins"]}
         self._check.thermal = kept.told["thermal"]
         self.last_good = Good(int(run.state.step[NOW]), float(run.state.time[NOW]), run.state.copy())

@@ -1,9 +1,10 @@
 """Runs of molecules: relief of overlaps, stages of all ensembles, samples."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import nan
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numba
 import numpy as np
@@ -12,6 +13,7 @@ from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
+from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
@@ -20,7 +22,8 @@ from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.meanings import meanings
 from rigidmd.measure.minimum import Minimum, minimum_in_words
 from rigidmd.measure.observables import Observation, observe
-from rigidmd.measure.samples import Sample, Samples
+from rigidmd.measure.own_forces import check_forces
+from rigidmd.measure.samples import COLUMNS, Sample, Samples
 from rigidmd.measure.shadow import choose_for_averages
 from rigidmd.measure.stable_step import is_worth_it, stable_angle, stiffest
 from rigidmd.measure.subjects import choose_for_molecules
@@ -29,23 +32,36 @@ from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.progress import progress_of
 from rigidmd.output.report import summary_text
 from rigidmd.output.scene_file import input_names, write_scene
-from rigidmd.run.loop import Costs, Options, Simulation, Stretch
+from rigidmd.own.binding import told_plainly
+from rigidmd.run.loop import Simulation
 from rigidmd.run.minimise import minimise
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.options import Options
 from rigidmd.run.provenance import plain
 from rigidmd.run.relief import Relief, relieve
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import check_same_scene, state_from
 from rigidmd.run.signals import interruptible
+from rigidmd.run.stretches import Costs, Stretch
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
 
+if TYPE_CHECKING:
+    import ase
+
 
 class MolecularSimulation(Simulation):
-    """A scene of molecules, ready to run."""
+    """A scene of molecules, ready to run. Besides the parameters of `Simulation`:
+
+    forces : forces of your own, besides those of the scene: `rigidmd.Force`, `rigidmd.pair_law`, terms of classes with
+        `rigidmd.compiled_force`, or objects whose method term(system) makes such a term. They are checked at the start:
+        force and torque against differences of the energy, the virial against a stretched box
+    thermostat : a thermostat of your own in place of that of every stage: a NamedTuple of a class with
+        `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
+    """
 
     time_unit = "ps"
 
@@ -54,10 +70,22 @@ class MolecularSimulation(Simulation):
     engine: Engine
 
     def __init__(
-        self, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, **options: Unpack[Options]
+        self,
+        scene: MolecularScene,
+        folder: str | Path | None = None,
+        force: bool = False,
+        *,
+        forces: Any = (),
+        thermostat: Any = None,
+        **options: Unpack[Options],
     ):
         super().__init__(scene, folder, force, **options)
-        self._built = build(scene)
+        given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
+        self._built = build(scene.with_own(given, thermostat))
+        if clash := [name for name in self._built.own if name in COLUMNS]:
+            raise SceneError(
+                scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
+            )
         # Numba defines the names of its config at import, out of sight of a type checker
         most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
         self.threads = min(scene.threads or most, most)
@@ -68,6 +96,10 @@ class MolecularSimulation(Simulation):
         begun = state_of(*state[:5])
         self._built = replace(self._built, state=begun, from_lattice=False)
         self._reset()
+
+    def atoms(self) -> "ase.Atoms":
+        """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. An observer may call it."""
+        return atoms_of(self.system, self.state, self.scene.output.positions == "wrapped")
 
     def start(self) -> Relief | None:
         """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
@@ -86,7 +118,8 @@ class MolecularSimulation(Simulation):
     def _prepare(self) -> None:
         """Compile, and relieve overlaps of a lattice."""
         self._say("compiling (kept on disk: the next run starts at once)")
-        _, tallies = self.engine.evaluate(self.state)
+        with told_plainly(self.system):
+            _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
             raise SceneError(
                 self.scene.source, ["the start has no finite energy: sites of different molecules coincide"]
@@ -112,10 +145,12 @@ class MolecularSimulation(Simulation):
                             "shorten timestep_fs of the first stage"
                         ],
                     )
-        for k, stage in enumerate(self.scene.stages):
-            if not (stage.is_open or stage.is_minimisation):
-                row = row_of_stage(self.system, k)
-                self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
+        check_forces(self.system, self.state)
+        with told_plainly(self.system):
+            for k, stage in enumerate(self.scene.stages):
+                if not (stage.is_open or stage.is_minimisation):
+                    row = row_of_stage(self.system, k)
+                    self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
         self.engine.forget()
         self._relief = relief
         self._choices: dict[int, str] = {}
@@ -191,8 +226,9 @@ class MolecularSimulation(Simulation):
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
         self.state = self.engine.begin(self.state, row)
         self.state.begin_stretch()
-        before = [other for other in self.scene.stages[:k] if not other.is_minimisation]
-        if before and stage.keeps_momentum and not before[-1].keeps_momentum:
+        before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
+        keeps = self.system.keeps_momentum_in
+        if before and keeps(k) and not keeps(before[-1]):
             self.state.books[TAKEN] -= remove_momentum(self.system.model, self.state.velocity)
         if self._conserved is not None:
             self._origins[k] = self._conserved
@@ -211,7 +247,7 @@ class MolecularSimulation(Simulation):
         """Minimise as the present stage says, with a warning if it does not converge."""
         k = self._stage
         stage = self.scene.stages[k]
-        with progress_of(stage.most_iterations, "iterations", progress) as advanced:
+        with progress_of(stage.most_iterations, "iterations", progress, self._spot) as advanced:
             found = minimise(self.system, self.state, stage, lambda: self._interrupted, advanced)
         self.engine.forget()
         self._minima[k] = found
@@ -303,6 +339,7 @@ class MolecularSimulation(Simulation):
             pressure_yz=float(tensor[1, 2]),
             conserved=conserved,
             stage=moment.stage,
+            own=tuple(seen.components[name] for name in self.system.own),
         )
 
     def _own_observers(self) -> list[Observer]:

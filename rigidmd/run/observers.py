@@ -18,6 +18,7 @@ from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
     from rigidmd.output.gsd_file import GsdFile
+    from rigidmd.output.traj_file import TrajFile
     from rigidmd.output.trajectory_file import TrajectoryFile
     from rigidmd.run.loop import Simulation
     from rigidmd.run.results import Results
@@ -63,6 +64,8 @@ class Every(Observer):
     """Calls `function(moment)` every `interval` ps (s for a single body)."""
 
     def __init__(self, interval: float, function: Callable[[Moment], object]):
+        if not interval > 0:
+            raise ValueError(f"Every({interval!r}, ...): the interval must be a time above 0")
         self.interval = interval
         self.function = function
 
@@ -101,7 +104,7 @@ class Frames(Observer):
         self._names = [topology, trajectory]
         self._velocities, self._wrapped = velocities, wrapped
         self._frames: list[Frame] = []
-        self._file: TrajectoryFile | GsdFile | None = None
+        self._file: TrajectoryFile | GsdFile | TrajFile | None = None
 
     def files(self) -> list[str]:
         """Both."""

@@ -45,16 +45,17 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str]) -> dict[st
 
 def scene_digest(scene: Scene) -> str:
     """SHA-256 of all keys of a resolved scene that decide the bits of its run."""
-    keys = keys_of(plain(scene), (*scene.inputs, *APART))
+    keys = keys_of(plain(scene), (*scene.inputs, *scene.held, *APART))
     return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
 
 
 def input_digests(scene: Scene) -> dict[str, str]:
-    """SHA-256 of each input file of a scene, by its dotted key. Raises SceneError."""
+    """SHA-256 of each input of a scene, in a file or held, by its dotted key. Raises SceneError."""
     try:
-        return {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
+        read = {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
     except OSError as error:
         raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
+    return read | {key: hashlib.sha256(content).hexdigest() for key, content in scene.held.items()}
 
 
 def plain(scene: Scene) -> dict[str, Any]:

@@ -1,9 +1,8 @@
 """Results of a run."""
 
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
@@ -11,13 +10,17 @@ from rigidmd.core.state import State
 from rigidmd.validation import settled
 
 if TYPE_CHECKING:
+    import ase
     import MDAnalysis
     import pandas
+    from chemiscope.widget import StructureWidget
+    from matplotlib.figure import Figure
 
     from rigidmd.analyse.findings import Finding
     from rigidmd.analyse.history import History
     from rigidmd.assemble.body import BodySystem
     from rigidmd.assemble.system import System
+    from rigidmd.looking.inline import Film
     from rigidmd.measure.motion import Motion
     from rigidmd.measure.samples import Samples
     from rigidmd.output.frame import Frame
@@ -53,30 +56,14 @@ class Results:
         return f"<Results of {self.system.scene.name}: {self._told}; results[column], .units, .summary, .universe()>"
 
     def _repr_html_(self) -> str:
-        families: dict[tuple[str, str], list[str]] = {}
-        for name, column in self.samples.described.items():
-            families.setdefault((column.unit, column.about), []).append(name)
-        rows = "".join(
-            f"<tr><td>{' '.join(f'<code>{name}</code>' for name in names)}</td><td>{unit}</td>"
-            f'<td>{self._range(names)}</td><td style="text-align: left">{escape(about)}</td></tr>'
-            for (unit, about), names in families.items()
-        )
-        return (
-            f"<b>{escape(self.system.scene.name)}</b>: {escape(self._told)}<table><tr><th>column</th><th>unit</th>"
-            f"<th>first ... last</th><th></th></tr>{rows}</table>"
-        )
+        from rigidmd.looking.notebook import results_html
+
+        return results_html(self)
 
     @property
     def _told(self) -> str:
         files = f"{len(self.files)} files in {self.files[0].parent}" if self.files else "no files"
         return f"{'interrupted, ' if self.interrupted else ''}{len(self.samples)} samples, {files}"
-
-    def _range(self, columns: list[str]) -> str:
-        """First and last value of a scalar column."""
-        values = self[columns[0]]
-        if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
-            return ""
-        return " ... ".join(escape(x) if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])
 
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of the samples as an array (n,), in its unit of `units`: results["energy"].
@@ -106,6 +93,26 @@ class Results:
         }
         return pandas.DataFrame({header: self[name] for name, header in written.items()})
 
+    def plot(self, *columns: str, log: bool = False) -> "Figure":
+        """A figure of Matplotlib, which a notebook shows and `savefig` writes.
+
+        columns : names, drawn against time, those of one unit together; log: absolute values on a logarithmic axis.
+        Without names it is the figure that the run is known by: energy.png, of a body the path of its axis. The name of
+        another figure of a body ("angles", "ellipsoids", "path", "invariants") gives that. Raises KeyError.
+        """
+        from rigidmd.looking.columns import plot
+
+        return plot(self, columns, log)
+
+    def view(self) -> "StructureWidget | Film":
+        """The film of the run in a notebook: molecules by chemiscope, a body on a small page of its own.
+
+        Raises ImportError without chemiscope (rigidmd[view]), ValueError without a trajectory.
+        """
+        from rigidmd.looking.inline import view
+
+        return view(self)
+
     def universe(self) -> "MDAnalysis.Universe":
         """The trajectory as an MDAnalysis Universe: from the files if there are any, else from memory.
 
@@ -124,6 +131,25 @@ class Results:
                 self.system, by_name[settled(output.topology)], by_name[output.trajectory], times
             )
         return trajectory.in_memory(self.system, self._frames)
+
+    @overload
+    def atoms(self, frame: int | None = None) -> "ase.Atoms": ...
+    @overload
+    def atoms(self, frame: slice) -> "list[ase.Atoms]": ...
+    @overload
+    def atoms(self, frame: str) -> "ase.Atoms | list[ase.Atoms]": ...
+    def atoms(self, frame: int | slice | str | None = None) -> "ase.Atoms | list[ase.Atoms]":
+        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory: an index, or a list for a slice
+        or a text like ":" or "::10", as `ase.io.read` has them.
+
+        Atoms are the sites with mass, with the masses of the models, cell, periodicity, `info["time_ps"]` and, where
+        frames have velocities, momenta. The final state, and a last frame at its time, is exact, with energy, forces
+        and stress; other frames have the digits of the trajectory (single precision but for .traj) and the energy
+        where the log has a line at their time. Raises ValueError for a body or without frames, IndexError.
+        """
+        from rigidmd.run.atoms import atoms_of_results
+
+        return atoms_of_results(self, frame)
 
     def analyse(self, name: str, /, start: float | None = None, **options: Any) -> "Finding":
         """The analysis of this name, one's own (`rigidmd.analysis`) or one that comes with rigidmd, as a `Finding`.

@@ -18,7 +18,7 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
 
     The last stage of molecules may be longer or shorter than it was, but not shorter than it has been.
     """
-    apart = [*scene.inputs, *APART]
+    apart = [*scene.inputs, *scene.held, *APART]
     if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
         apart.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:

@@ -2,10 +2,9 @@
 
 import os
 import re
-from collections.abc import Iterable
-from html import escape
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Unpack, overload
 
 from pydantic import Field, PrivateAttr, ValidationError
 
@@ -23,8 +22,10 @@ from rigidmd.errors import SceneError
 from rigidmd.validation import Section, faults_of, meant, nearest, numbers_beyond, perhaps, place
 
 if TYPE_CHECKING:
+    import ase
+
     from rigidmd.scene.body import BodyScene
-    from rigidmd.scene.molecules import MolecularScene
+    from rigidmd.scene.molecules import MolecularScene, Settings
 
 LONGEST_NAME = 100
 
@@ -43,12 +44,15 @@ class Scene(Section):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
+    _held: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.in_short}>"
 
     def _repr_html_(self) -> str:
-        return escape(self.in_short)
+        from rigidmd.looking.notebook import scene_html
+
+        return scene_html(self)
 
     @property
     def in_short(self) -> str:
@@ -73,6 +77,12 @@ class Scene(Section):
         """Every further file that it reads: dotted key -> path."""
         return {}
 
+    @property
+    def held(self) -> dict[str, bytes]:
+        """Contents of further inputs that lie in no file: dotted key, whose value names the file, -> content. The
+        folder of a run has them as files."""
+        return self._held
+
     @classmethod
     def strange_paths(cls, data: dict[str, Any], folder: Path) -> list[str]:
         """Faults: files of a scene that lie outside its folder."""
@@ -83,6 +93,19 @@ class Scene(Section):
         """Faults between tables. They are found even if a table has faults of its own."""
         return []
 
+    @overload
+    @classmethod
+    def read(
+        cls: "type[MolecularScene]", path: str | os.PathLike, overrides: dict[str, Any] | None = None
+    ) -> "MolecularScene": ...
+    @overload
+    @classmethod
+    def read(
+        cls: "type[BodyScene]", path: str | os.PathLike, overrides: dict[str, Any] | None = None
+    ) -> "BodyScene": ...
+    @overload
+    @classmethod
+    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene": ...
     @classmethod
     def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
@@ -96,6 +119,47 @@ class Scene(Section):
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
 
     @classmethod
+    def from_atoms(
+        cls, atoms: "ase.Atoms", models: "str | Sequence[str | dict[str, Any]]", **settings: "Unpack[Settings]"
+    ) -> "MolecularScene":
+        """The scene of an `ase.Atoms`, whose atoms become molecules as those of a structure file do.
+
+        Its cell, its periodicity (along all axes or none) and its momenta are taken. Massless sites, as the M of TIP4P,
+        need not be among the atoms. The scene holds the atoms; a run in a folder writes them there.
+
+        models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file
+        settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
+            start={"temperature_K": 300} draws momenta in place of those of the atoms. Without stages there is one: 1 ps
+            of nve, or a minimisation where neither atoms nor settings give momenta
+
+        Raises SceneError; that the atoms are no molecules of these models is found when the system is built.
+        """
+        from rigidmd.assemble.from_atoms import scene_of_atoms
+
+        return scene_of_atoms(atoms, models, settings)
+
+    @overload
+    @classmethod
+    def from_dict(
+        cls: "type[MolecularScene]",
+        data: dict[str, Any],
+        folder: str | os.PathLike = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+    ) -> "MolecularScene": ...
+    @overload
+    @classmethod
+    def from_dict(
+        cls: "type[BodyScene]",
+        data: dict[str, Any],
+        folder: str | os.PathLike = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+    ) -> "BodyScene": ...
+    @overload
+    @classmethod
     def from_dict(
         cls,
         data: dict[str, Any],
@@ -103,15 +167,28 @@ class Scene(Section):
         overrides: dict[str, Any] | None = None,
         source: str = "scene",
         text: str = "",
+    ) -> "MolecularScene | BodyScene": ...
+    @classmethod
+    def from_dict(
+        cls,
+        data: dict[str, Any],
+        folder: str | os.PathLike = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+        held: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
-        """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault."""
+        """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault.
+
+        held : see `held`; files of a scene that holds inputs, which Python made, may be anywhere
+        """
         folder = Path(folder)
         from rigidmd.scene import BodyScene, MolecularScene
 
         kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind(data, BodyScene, MolecularScene)
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
-        faults = kind.strange_paths(data, folder)
+        faults = [] if held else kind.strange_paths(data, folder)
         overridden = []
         for key, value in (overrides or {}).items():
             faults += _override(data, key, value)
@@ -131,6 +208,7 @@ class Scene(Section):
             raise SceneError(source, faults)
         scene._source = source
         scene._folder = folder
+        scene._held = held or {}
         if missing := scene._missing_files(text, overridden):
             raise SceneError(source, missing)
         return scene

@@ -1,15 +1,17 @@
 """Tables of a scene of molecules: forces between sites."""
 
 from math import inf
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, model_validator
 
+from rigidmd.core.toml_text import shortened
 from rigidmd.molecules import Mixing
-from rigidmd.validation import MOST_TABLES, Count, Flag, NonNegative, Positive, Section
+from rigidmd.validation import MOST_TABLES, Count, Flag, NonNegative, Number, Positive, Section
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
+Truncation = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
 #: Keys of `Forces` for some kinds of electrostatics only.
@@ -28,6 +30,11 @@ ELECTROSTATIC_KEYS = {
 }
 
 
+def usual_start(truncation: str, cutoff: float) -> float:
+    """Where a switch begins if a scene does not say, Å."""
+    return 0.6 * cutoff if truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
+
+
 class UnlikePair(Section):
     """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
 
@@ -39,22 +46,76 @@ class UnlikePair(Section):
     """Lennard-Jones well depth"""
 
 
+class PairParameters(Section):
+    """Parameters of a force of one's own between two kinds of sites."""
+
+    sites: tuple[str, str]
+    """The two kinds, by site, SPECIES.SITE or element"""
+    parameters: dict[str, Number] = Field(max_length=MOST_TABLES)
+    """The parameters"""
+
+
+class CustomForce(Section):
+    """A force of one's own: a formula between pairs of sites, or an object of a Python file."""
+
+    name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
+    """Name in the log; with `module` also that of the object in it"""
+    module: str | None = None
+    """Python file in the scene's folder. It is code, and runs only with --trust FILE"""
+    energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
+    """Without a module: energy of a pair of sites (kJ/mol) of their distance r (Å) and named parameters, such as
+    A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
+    parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
+    """With a module: what its object is called with. With an energy: numbers, the same for all sites, or a table of
+    numbers for each kind of sites, by site, SPECIES.SITE or element; default: `parameters` in the models' files"""
+    sites: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
+    """With an energy: the only sites that it acts on"""
+    pairs: tuple[PairParameters, ...] = Field(default=(), max_length=MOST_TABLES)
+    """With an energy: parameters of particular pairs, in place of mixed ones"""
+    mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(default={}, max_length=MOST_TABLES)
+    """With an energy: the mean of each parameter for unlike sites; default: arithmetic for names that begin with sig,
+    else geometric"""
+    truncation: Truncation | None = None
+    """With an energy: how it ends at the cut-off; default: forces.truncation"""
+    cutoff_A: Positive | None = None
+    """With an energy: its cut-off; default: forces.cutoff_A"""
+    switch_start_A: Positive | None = None
+    """With an energy: where a switch begins; default: forces.switch_start_A"""
+
+    @model_validator(mode="after")
+    def _is_one_of_both(self):
+        if (self.module is None) == (self.energy is None):
+            raise ValueError("give a module, a Python file with the force, or an energy, a formula of r")
+        if self.module is not None:
+            own = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
+            idle = [key for key in own if getattr(self, key) not in (None, (), {})]
+            if idle:
+                raise ValueError(f"{', '.join(idle)} would do nothing with a module: its object has `parameters`")
+            if not self.module.endswith(".py"):
+                raise ValueError(f"module = {shortened(self.module)} must be a Python file, ending in .py")
+        return self
+
+
 class Forces(Section):
     """Forces between sites of different molecules."""
 
     cutoff_A: Positive | None = None
     """Cut-off between sites; default: 9 Å in a periodic box, none without one"""
-    truncation: Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"] = "switch"
+    truncation: Truncation = "switch"
     """How Lennard-Jones and Coulomb forces end at the cut-off; smooth_switch suits integrators of high order. The
     energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. The real-space
     part of ewald and pme ends according to ewald_truncation"""
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin; default: 1 Å before the cut-off, or at 0.9 of it if that is larger. Where
     smooth_switch begins; default: at 0.6 of the cut-off"""
+    lennard_jones: Flag = True
+    """Whether Lennard-Jones sites act; false where `custom` takes their place"""
     mixing: Mixing = "lorentz-berthelot"
     """Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = Field(default=(), max_length=MOST_TABLES)
     """Parameters of particular pairs, in place of the mixing rule"""
+    custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Forces of one's own"""
     tail_correction: Flag = False
     """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` includes it, `virial` does not"""
     electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"

@@ -1,9 +1,10 @@
 """The scene of molecules: species, box, forces, stages, output."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
 
 from rigidmd.core.toml_text import shortened
 from rigidmd.errors import SceneError
@@ -11,14 +12,20 @@ from rigidmd.molecules import SIZES
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
+from rigidmd.scene.own import Own, not_given
 from rigidmd.scene.place import BESIDE, NAMELESS, Box, Start, Structure
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.watch import Watch
 from rigidmd.validation import MOST_TABLES, Count, Flag, Section
 
-TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".dcd", ".nc", ".xyz", ".pdb")
-WITH_VELOCITIES = (".trr", ".nc", ".gsd")
+if TYPE_CHECKING:
+    import ase
+
+#: Name of the structure file of a scene that holds atoms.
+HELD = "atoms.xyz"
+TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb")
+WITH_VELOCITIES = (".trr", ".nc", ".gsd", ".traj")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
@@ -44,8 +51,8 @@ class Output(Section):
     """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line takes an
     evaluation of forces with the virial"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory file; the ending sets the format (.xtc .trr .gsd .dcd .nc .xyz .pdb); .gsd keeps
-    rotations and angular momenta; false for none"""
+    """Trajectory file; the ending sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb); .gsd keeps rotations and
+    angular momenta, .traj is ASE's and has double precision; false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: str = "topology.gro"
@@ -82,6 +89,24 @@ class Output(Section):
         return self
 
 
+class Settings(TypedDict, total=False):
+    """Keywords of `Scene.from_atoms`: the tables and keys of a scene file, but for [[molecules]]."""
+
+    name: str
+    seed: int
+    precision: Literal["double", "mixed"]
+    threads: int
+    structure: dict[str, Any]
+    box: dict[str, Any]
+    forces: dict[str, Any]
+    fields: dict[str, Any]
+    start: dict[str, Any]
+    stages: list[dict[str, Any]]
+    run: dict[str, Any]
+    output: dict[str, Any]
+    watch: dict[str, Any]
+
+
 class MolecularScene(Scene):
     """A scene of moving molecules."""
 
@@ -103,6 +128,25 @@ class MolecularScene(Scene):
     run: Throughout = Throughout()
     output: Output = Output()
     watch: Watch = Watch()
+    from_python: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Set by a run from Python: names of forces and a thermostat that it was given and a scene cannot hold. Such a
+    scene runs only from Python, with the same ones"""
+
+    _own: Own = PrivateAttr(Own())
+
+    @property
+    def own(self) -> Own:
+        """What Python has added."""
+        return self._own
+
+    def with_own(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
+        """The same scene with forces and a thermostat from Python, see `Simulation`. Raises SceneError."""
+        own = Own((*self._own.forces, *forces), thermostat if thermostat is not None else self._own.thermostat)
+        if self.from_python not in ((), own.names):
+            raise SceneError(self.source, [not_given(self.from_python, own.names)])
+        scene = self.model_copy(update={"from_python": own.names})
+        scene._own = own
+        return scene
 
     def lasting(self, until: float) -> "MolecularScene":
         """The same scene with a last stage that ends at a time of the run, ps. Raises SceneError."""
@@ -127,6 +171,14 @@ class MolecularScene(Scene):
 
         return build(self).scene
 
+    def atoms(self) -> "ase.Atoms":
+        """The start as an `ase.Atoms`, before overlaps are relieved: see `Results.atoms`. Raises as `resolved` does."""
+        from rigidmd.assemble.system import build
+        from rigidmd.assemble.to_atoms import atoms_of
+
+        system = build(self)
+        return atoms_of(system, system.state)
+
     @property
     def in_short(self) -> str:
         """Species, their origin and stages."""
@@ -145,14 +197,26 @@ class MolecularScene(Scene):
     @property
     def inputs(self) -> dict[str, Path]:
         """Every further file that it reads: dotted key -> path."""
-        found = {} if self.structure is None else {"structure.file": self.path(self.structure.file)}
+        found = {}
+        if self.structure is not None and "structure.file" not in self.held:
+            found["structure.file"] = self.path(self.structure.file)
         if (names := self.topology) is not None:
             found["structure.topology"] = self.path(names)
         for k, species in enumerate(self.molecules):
             for key in SPECIES_FILES:
                 if (name := getattr(species, key)) is not None:
                     found[f"molecules.{k}.{key}"] = self.path(name)
+        for k, force in enumerate(self.forces.custom):
+            if force.module is not None:
+                found[f"forces.custom.{k}.module"] = self.path(force.module)
         return found
+
+    @property
+    def structure_source(self) -> str:
+        """Where the atoms of the start come from, for messages; empty without a structure."""
+        if self.structure is None:
+            return ""
+        return "atoms" if "structure.file" in self.held else str(self.path(self.structure.file))
 
     @property
     def topology(self) -> str | None:
@@ -259,6 +323,13 @@ class MolecularScene(Scene):
                 for k, entry in enumerate(species)
                 if isinstance(entry, dict)
                 for key in SPECIES_FILES
+            ]
+        forces = data.get("forces")
+        if isinstance(custom := forces.get("custom") if isinstance(forces, dict) else None, list):
+            named += [
+                (f"forces.custom.{k}.module", entry.get("module"))
+                for k, entry in enumerate(custom)
+                if isinstance(entry, dict)
             ]
         return [
             f"{key}: {shortened(file)} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"

@@ -25,7 +25,7 @@ class Structure(Section):
 
     file: str
     """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, a trajectory (.xtc .trr
-    .gsd .dcd .nc), or `final.npz` of an earlier run; beside or below the scene"""
+    .gsd .traj .dcd .nc), or `final.npz` of an earlier run; beside or below the scene"""
     topology: str | None = None
     """Of a trajectory that has no names (all but .gsd): a structure file with the names of its atoms, in their order.
     Default: topology.gro or topology.pdb beside it, as in the folder of a run"""

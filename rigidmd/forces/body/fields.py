@@ -1,11 +1,12 @@
 """External forces on a single body: weight, buoyancy, and those that a scene or a Python function applies."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.core.state import ASK, OK
+from rigidmd.core.state import ASK, OK, State
 from rigidmd.forces.terms import Setup, add_forces, power
 from rigidmd.mechanics.course import Course, value
 from rigidmd.mechanics.flight import along
@@ -60,6 +61,11 @@ class Asked(NamedTuple):
     torque_body: np.ndarray  # (3,)
 
     drives = True
+
+    def answer(self, function: Callable[[float, State], tuple], state: State) -> None:
+        """Call a function of (time, state) for a force (3,) in the lab frame and a torque (3,) in the body frame."""
+        self.force_lab[:], self.torque_body[:] = function(float(state.time[0]), state)
+        self.fresh[0] = 1
 
 
 @implements(add_forces, inline=True)
@@ -181,11 +187,3 @@ def _drive_power(term, state, velocity, omega):
         return total
 
     return drive_power
-
-
-def answer(term: Asked, function, state) -> None:
-    """Call a Python function of (time, state) for a force (3,) in the lab frame and a torque (3,) in the body frame."""
-    force, torque = function(float(state.time[0]), state)
-    term.force_lab[:] = force
-    term.torque_body[:] = torque
-    term.fresh[0] = 1

@@ -189,6 +189,11 @@ class Tail(NamedTuple):
         return self.pressure_square / volume**2
 
 
+def sum_of(tails: list[Tail]) -> Tail | None:
+    """All of them together; None of none."""
+    return Tail(*np.sum(tails, axis=0).tolist()) if tails else None
+
+
 def tail(law: LennardJones) -> Tail:
     """Energy and pressure lost by the cut-off, for g(r) = 1 where the ending changes the potential.
 

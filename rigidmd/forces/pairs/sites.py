@@ -53,6 +53,16 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray]) -> BodySites | Cent
     return BodySites(first, molecule, kind, np.ascontiguousarray(offset))
 
 
+def groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
+    """Group of each site (s,); sites of one group do not interact. A molecule is one; all frozen molecules are one.
+
+    frozen (n,) : whether each molecule is
+    """
+    if not frozen.any():
+        return sites.molecule
+    return np.where(frozen[sites.molecule], len(frozen), sites.molecule).astype(np.int32)
+
+
 class InSlots(NamedTuple):
     """Vectors (x, y, z) of sites in the order of the slots of `clusters`."""
 

@@ -1,0 +1,62 @@
+"""Forces on molecules that Python computes, and the compiled loop asks for."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a
+from rigidmd.core.state import ASK, OK, TALLY_SIZE, State
+from rigidmd.forces.terms import Setup, add_forces
+
+
+class ToldForces(NamedTuple):
+    """Forces from a Python function, which the engine holds."""
+
+    molecules: int
+    turns: bool  # whether molecules turn
+    changes_momentum: np.ndarray  # (3,) components of the total momentum that they may change
+    tied_to_places: bool  # the energy depends on places in the lab
+
+    def workspace(self, setup: Setup) -> "AskedForces":
+        """Room for the values."""
+        n = self.molecules
+        return AskedForces(
+            np.zeros(1, np.int64), np.zeros((n, 3)), np.zeros((n if self.turns else 0, 3)), np.zeros(TALLY_SIZE)
+        )
+
+
+class AskedForces(NamedTuple):
+    """Workspace of a `ToldForces`; it asks for new values whenever positions have changed."""
+
+    fresh: np.ndarray  # (1,) 1 if the values are those of the present moment
+    force: np.ndarray  # (n, 3) lab, u Å/ps²
+    torque_body: np.ndarray  # (n, 3), u Å²/ps²
+    tally: np.ndarray  # (10,) energy and molecular virial
+
+    def answer(self, function: Callable[["AskedForces", State], None], state: State) -> None:
+        """Let a function fill in the forces at a state."""
+        function(self, state)
+
+
+@implements(add_forces)
+def _add_told(term, state, load, tally):
+    if not is_a(term, AskedForces):
+        return None
+
+    def add_told(term, state, load, tally):
+        if term.fresh[0] == 0:
+            return ASK
+        term.fresh[0] = 0
+        for m in range(len(term.force)):
+            for k in range(3):
+                load.force[m, k] += term.force[m, k]
+        for m in range(len(term.torque_body)):
+            for k in range(3):
+                load.torque_body[m, k] += term.torque_body[m, k]
+        if tally is not None:
+            for k in range(len(tally)):
+                tally[k] += term.tally[k]
+        return OK
+
+    return add_told

@@ -1,0 +1,123 @@
+"""Trajectories of molecules as ASE's own .traj, in double precision: for `ase gui` and `ase.io.read`."""
+
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ase.io.trajectory import TrajectoryWriter
+
+from rigidmd.assemble.system import System
+from rigidmd.assemble.to_atoms import atoms_of_sites
+from rigidmd.assemble.traj_format import ATOMS, MASSLESS, MASSLESS_VELOCITY, Stored, TrajReader
+from rigidmd.core.files import whole_file
+from rigidmd.core.state import State
+from rigidmd.errors import OutputError
+
+
+class TrajFile:
+    """Writes frames to a file as they come; each is handed to the disk at once. See `TrajectoryFile` for the arguments.
+
+    The format keeps a table of frames that moves within the file as it grows. So a run goes on with a copy of the
+    frames that a checkpoint knows, which has the bytes of a file that was never left.
+
+    Raises OutputError, here and in every method.
+    """
+
+    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+        self._path, self._system = path, system
+        self._velocities, self._wrapped = velocities, wrapped
+        self._atoms = np.flatnonzero(system.sites.mass > 0)
+        self._others = np.flatnonzero(system.sites.mass == 0)
+        self._sum, self._frames = 0, 0
+        # its symbols, masses and periodicity are those of every frame
+        self._like = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        try:
+            if kept is None or kept[1] == 0:
+                self._file = TrajectoryWriter(path, "w")
+                return
+            with whole_file(path) as temporary:
+                self._copy(temporary, *kept)
+            self._file = TrajectoryWriter(path, "a")
+        except OSError as error:
+            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+
+    @property
+    def kept(self) -> tuple[int, int]:
+        """Checksum of all frames, which are on the disk, and their number."""
+        backend: Any = self._file.backend
+        try:
+            os.fsync(backend.fd.fileno())
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
+        return self._sum, self._frames
+
+    def write(self, state: State, time: float, step: int) -> None:
+        """Add a frame with its own time (ps) and the box."""
+        system = self._system
+        position = system.site_positions(state, self._wrapped)
+        cell = state.cell if np.isfinite(state.cell).all() else None
+        found = Stored(position[self._atoms], None, None, None, cell, float(time), int(step))
+        if len(self._others):
+            found = found._replace(massless=position[self._others])
+        if self._velocities:
+            velocity = system.site_velocities(state)
+            moving = atoms_of_sites(system, position, velocity, state.cell, time)
+            found = found._replace(momenta=moving.get_momenta())
+            if len(self._others):
+                found = found._replace(massless_velocity=velocity[self._others])
+        try:
+            self._append(self._file, found)
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Finish the file."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
+
+    def _append(self, file: TrajectoryWriter, frame: Stored) -> None:
+        atoms = self._like
+        atoms.set_positions(frame.positions)
+        if frame.cell is not None:
+            atoms.set_cell(frame.cell)
+        if frame.momenta is not None:
+            atoms.set_momenta(frame.momenta)
+        atoms.info = {"time_ps": frame.time, "step": frame.step}
+        own = {MASSLESS: frame.massless, MASSLESS_VELOCITY: frame.massless_velocity}
+        if self._frames == 0:
+            own[ATOMS] = self._atoms.astype(np.int64)
+        backend: Any = file.backend
+        backend.write(**{name: array for name, array in own.items() if array is not None})
+        file.write(atoms)
+        self._sum, self._frames = self._summed(frame), self._frames + 1
+
+    def _copy(self, target: Path, kept_sum: int, frames: int) -> None:
+        """Copy the first frames, and hold them against their checksum."""
+        try:
+            old = TrajReader(self._path)
+            try:
+                if old.count < frames or old.sites != len(self._system.sites.mass):
+                    raise OutputError(f"{self._path} is not what it was: {frames} frames are needed to go on with it")
+                with TrajectoryWriter(target, "w") as new:
+                    for k in range(frames):
+                        self._append(new, old.read(k))
+            finally:
+                old.close()
+        except (ValueError, OSError) as error:
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+            raise OutputError(f"{self._path} cannot be read to go on with it: {reason}") from None
+        if self._sum != kept_sum:
+            raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
+
+    def _summed(self, frame: Stored) -> int:
+        """CRC-32 of the frames so far and this one."""
+        found = self._sum
+        for part in (*frame[:5], np.array([frame.time, float(frame.step)])):
+            if part is not None:
+                found = zlib.crc32(np.ascontiguousarray(part, float).tobytes(), found)
+        return found

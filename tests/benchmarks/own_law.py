@@ -1,0 +1,88 @@
+"""What a pair law of one's own costs, compared with the built-in Lennard-Jones with the same ending, in turns.
+
+python tests/benchmarks/own_law.py [molecules] [rounds]
+"""
+
+import sys
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+import rigidmd
+from rigidmd.assemble.rows import row
+from rigidmd.assemble.system import build
+
+STEPS = 40
+
+
+class Mie(NamedTuple):
+    """Parameters of a pair of sites."""
+
+    epsilon: float
+    sigma: float
+
+
+def mie(p: Mie, r, inverse):
+    """Mie 12-6 as a function of the distance."""
+    six = (p.sigma * inverse) ** 6
+    u = 4 * p.epsilon * six
+    return u * (six - 1), u * (12 * six - 6) * inverse
+
+
+def laws(epsilon: float, sigma: float) -> dict[str, rigidmd.PairLaw | None]:
+    """Name -> law; None is the built-in one."""
+    given = {"epsilon": epsilon, "sigma": sigma}
+    text = "4*epsilon*((sigma/r)**12 - (sigma/r)**6)"
+    r = np.linspace(2.4, 9.5, 1000)
+    power = (sigma / r) ** 6
+    return {
+        "built in": None,
+        "text": rigidmd.pair_law(text, {"AR": given}),
+        "function": rigidmd.pair_law(mie, {"AR": Mie(epsilon, sigma)}),
+        "exp-6": rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"AR": {"A": 1.5e6, "B": 3.7, "C": 6.2e3}}),
+        "table": rigidmd.pair_law(table=(r, 4 * epsilon * (power * power - power))),
+    }
+
+
+def main() -> None:
+    """Print the median of the ratios of each law."""
+    count, rounds = (int(x) for x in (*sys.argv[1:], 4000, 9)[:2])
+    print(f"{count} argon, cut-off 9 Å, steps of 4 fs; time of a step relative to the built-in law")
+    for precision in ("double", "mixed"):
+        for truncation in ("plain", "switch"):
+            scene = rigidmd.Scene.from_dict(
+                {
+                    "precision": precision,
+                    "box": {"density_g_cm3": 1.374},
+                    "molecules": [{"model": "argon", "count": count}],
+                    "forces": {"truncation": truncation},
+                    "start": {"temperature_K": 94},
+                    "stages": [{"duration_ps": 1, "timestep_fs": 4}],
+                }
+            )
+            molecule = build(scene).species[0]
+            runs = {}
+            for name, law in laws(float(molecule.epsilon[0]) / 100, float(molecule.sigma[0])).items():
+                of = scene if law is None else scene.model_copy(
+                    update={"forces": scene.forces.model_copy(update={"lennard_jones": False})}
+                ).with_own([law])  # fmt: skip
+                system = build(of)
+                engine = system.engine()
+                state = engine.begin(system.state, row(system, 0))
+                engine.advance(state, row(system, 0), 0.004, STEPS)
+                runs[name] = (engine, state, row(system, 0), [])
+            for turn in range(rounds):
+                for engine, state, scheme, seconds in runs.values():
+                    began = time.perf_counter()
+                    engine.advance(state, scheme, 0.004, STEPS * (turn + 2))
+                    seconds.append(time.perf_counter() - began)
+            base = np.array(runs["built in"][3])
+            ratios = {name: np.median(np.array(run[3]) / base) for name, run in runs.items()}
+            print(
+                f"  {precision:6} {truncation:6}", *(f"{name} {ratio:.2f}" for name, ratio in ratios.items()), sep="  "
+            )
+
+
+if __name__ == "__main__":
+    main()

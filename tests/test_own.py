@@ -1,0 +1,735 @@
+"""Doors: forces, pair laws and thermostats of users, from Python and from scenes; functions of vectors."""
+
+import functools
+import math
+import runpy
+from math import cos, exp, log, sin
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pytest
+from conftest import ROOT, built, small_scene
+from scipy.integrate import quad
+
+import rigidmd
+from rigidmd.assemble.describe import describe
+from rigidmd.assemble.system import build
+from rigidmd.cli import main
+from rigidmd.compile import PAIR_FLAGS, kernel, lanes
+from rigidmd.compile.numba_private import Index
+from rigidmd.core import own_code
+from rigidmd.errors import SceneError, SimulationError
+from rigidmd.forces.laws.endings import NAMES, Plain, ending
+from rigidmd.forces.laws.formulas import FormulaError, of_function, of_table, of_text
+from rigidmd.forces.laws.lennard_jones import energy_and_force as of_built_in
+from rigidmd.forces.laws.lennard_jones import lennard_jones as built_in
+from rigidmd.forces.laws.lennard_jones import tail
+from rigidmd.forces.laws.own import OwnOfOneKind, energy_and_force, tail_of
+from rigidmd.measure.own_forces import check_forces
+from rigidmd.units import KJ_PER_MOL
+
+SCRIPTS = sorted((ROOT / "systems" / "scripts").glob("*.py"))
+LJ = "4*eps*((sig/r)**12 - (sig/r)**6)"
+POINTS = {
+    "box": {"lengths_A": 24},
+    "molecules": [
+        {"name": "dot", "count": 100, "sites": [{"name": "D", "element": "Ar", "mass_u": 40, "position_A": [0, 0, 0]}]}
+    ],
+    "start": {"temperature_K": 94},
+    "stages": [{"duration_ps": 0.04, "timestep_fs": 4}],
+    "output": {"log_interval_ps": 0.02},
+}
+
+
+def points(**sections) -> rigidmd.MolecularScene:
+    return rigidmd.Scene.from_dict(POINTS | sections)
+
+
+# --- functions of vectors --------------------------------------------------------------------------------------------
+
+
+@kernel(fastmath=PAIR_FLAGS, outer=True)
+def every_function(x, y, out):
+    for i in range(0, len(x), lanes.width_of(x)):
+        a, b = lanes.load(x, i), lanes.load(y, i)
+        found = (exp(a), log(a), math.pow(a, b), sin(b), cos(b), -(a**3), a**-2, math.sqrt(a) + abs(b))
+        for k in range(8):
+            lanes.store(out, k * len(x) + i, found[k])
+
+
+@pytest.mark.parametrize("dtype, error", [(np.float64, 4.5e-16), (np.float32, 2e-7)])
+def test_functions_of_vectors_are_right_to_the_last_digits_under_the_flags_of_a_pair_loop(dtype, error):
+    rng = np.random.default_rng(1)
+    n = 4096
+    x = (10 ** rng.uniform(-2, 1.9, n)).astype(dtype)
+    y = rng.uniform(-14, 14, n).astype(dtype)
+    out = np.zeros(8 * n, dtype)
+    every_function(x, y, out)
+    a, b = x.astype(np.longdouble), y.astype(np.longdouble)
+    expected = [np.exp(a), np.log(a), a**b, np.sin(b), np.cos(b), -(a**3), a**-2, np.sqrt(a) + abs(b)]
+    for k, values in enumerate(expected):
+        off = np.abs(out[k * n : (k + 1) * n] / values - 1)
+        assert off[np.abs(values) < np.finfo(dtype).max].max() < error, k
+
+
+def test_functions_of_vectors_at_the_ends_of_their_range():
+    x = np.array([0.0, -1.0, np.inf, np.nan, 800.0, 1e-310, 1.0, 745.0])
+    x, y = np.tile(x, 2), np.tile([2.0, 2.0, -3.0, 1.0, 200.0, 1.0, 0.0, 1e14], 2)
+    out = np.zeros(8 * 16)
+    every_function(x, y, out)
+    with np.errstate(all="ignore"):
+        assert out[:16] == pytest.approx(np.exp(x), rel=1e-15, nan_ok=True)
+        assert out[16:32] == pytest.approx(np.log(x), rel=1e-15, nan_ok=True)
+        powers = np.where(x < 0, np.nan, np.abs(x) ** y)  # of a negative number: no number
+        assert out[32:48] == pytest.approx(powers, rel=1e-15, nan_ok=True)
+    assert np.isnan(out[48:80].reshape(2, 16)[:, [7, 15]]).all()  # a sine of 1e14 would say nothing
+
+
+# --- formulas --------------------------------------------------------------------------------------------------------
+
+FORMULAS = {
+    "A*exp(-B*r) - C/r**6": {"A": 1e5, "B": 3.5, "C": 1e3},
+    "D*(1 - exp(-a*(r - r0)))**2": {"D": 2.0, "a": 1.2, "r0": 3.4},
+    "eps*((sig/r)**n - (sig/r)**m)": {"eps": 1.5, "sig": 3.1, "n": 13.5, "m": 6.0},
+    "k*cos(r)**2/r + log(r)*sin(2*r) + sqrt(r)": {"k": 3.0},
+    "q/r*exp(-r/l)": {"q": -4.0, "l": 2.5},
+}
+
+
+@numba.njit(error_model="numpy")
+def at_distance(law, formula, end, r2):
+    return energy_and_force(law, formula, end, r2)
+
+
+@numba.njit(error_model="numpy")
+def in_numbers(law, r2):
+    return of_built_in(law, law.c12, law.c6, r2)
+
+
+@pytest.mark.parametrize("energy", FORMULAS)
+def test_the_code_of_a_formula_has_the_energy_and_its_derivative(energy):
+    given = FORMULAS[energy]
+    formula = of_text(energy)
+    assert formula.parameters == tuple(sorted(given))
+    own = formula.kind(*formula.numbers(given))
+    end = (0.0, 0.0, 0.0, 0.0)
+    law, radial = OwnOfOneKind(20.0, Plain(20.0), own, (), end), formula.radial(given)
+    names = {"exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
+    for r in (2.1, 3.7, 8.5):
+        u, w = at_distance(law, own, end, r * r)
+        assert u / KJ_PER_MOL == pytest.approx(eval(energy, names | given | {"r": r}), rel=1e-13)
+        v, force, slope = radial(r)
+        assert (v, force) == pytest.approx((u, w * r), rel=1e-12)
+        step = 1e-5
+        assert force == pytest.approx((radial(r - step)[0] - radial(r + step)[0]) / (2 * step), rel=1e-7, abs=1e-3)
+        assert slope == pytest.approx((radial(r + step)[1] - radial(r - step)[1]) / (2 * step), rel=1e-7, abs=1e-3)
+
+
+def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
+    formula = of_text("c*eps*((sig/r)**n - (sig/r)**m)", {"n": 14.0, "m": 6.0, "c": 2.0})
+    assert formula.parameters == ("eps", "sig")
+    assert not formula.kind.uses_root  # even powers of r: no square root
+    assert of_text("A/r**7").kind.uses_root
+
+
+@pytest.mark.parametrize(
+    "energy, word",
+    [
+        ("A*exp(-B*r", "is not a formula"),
+        ("A^2/r", "powers are written"),
+        ("__import__('os').getcwd()*r", "no place in a formula"),
+        ("[r for r in (1,)]", "no place in a formula"),
+        ("r.real", "no place in a formula"),
+        ("tan(r)", "not a function of one number"),
+        ("A + B", "does not depend on the distance"),
+        ("r**9**9**9", "beyond 200"),
+        ("r/0", "divides by 0"),
+        ("1e999*r", "no finite number"),
+        ("+".join(["r"] * 2000), "characters"),
+        ("(" * 150 + "r" + ")" * 150 + "**", "not a formula"),
+        ("*".join(f"(r+{k})" for k in range(100)), "more than 200"),
+    ],
+)
+def test_a_text_that_is_no_formula_is_told(energy, word):
+    with pytest.raises(FormulaError, match=word.replace("(", r"\(")):
+        of_text(energy)
+
+
+def test_a_table_is_as_good_as_it_says():
+    r = np.linspace(2.5, 10, 200)
+    given = {"eps": 1.0, "sig": 3.4}
+    exact = of_text(LJ).radial(given)
+    table = of_table(r, [exact(x)[0] / KJ_PER_MOL for x in r], 9.0)
+    radial, well = table.radial({"scale": 1.0}), KJ_PER_MOL
+    off = max(abs(radial(x)[0] - exact(x)[0]) / well for x in np.linspace(2.9, 9, 3001))
+    assert off < 3 * table.error < 1e-3
+    for x in (3.0, 5.0, 8.0):
+        step = 1e-5
+        assert radial(x)[1] == pytest.approx((radial(x - step)[0] - radial(x + step)[0]) / (2 * step), rel=1e-6)
+    for bad, word in ((([1, 2], [1, 2]), "8 distances"), ((r, r**2), "does not repel"), ((r[::-1], r), "ascending")):
+        with pytest.raises(FormulaError, match=word):
+            of_table(*bad, 9.0)
+    with pytest.raises(FormulaError, match=r"ends at 10 Å, before the cut-off"):
+        of_table(r, 1 / r, 12.0)
+
+
+class Pair(NamedTuple):
+    eps: float
+    sig: float
+
+
+def lennard_jones(p: Pair, r, inverse):
+    six = (p.sig * inverse) ** 6
+    return 4 * p.eps * (six * six - six), 24 * p.eps * (2 * six * six - six) * inverse
+
+
+def test_a_function_needs_to_say_what_its_parameters_are():
+    def bare(p, r):
+        return r, r
+
+    def strange(p: Pair, radius):
+        return radius, radius
+
+    def alone(p: Pair, r):
+        return r
+
+    assert of_function(lennard_jones).radial({"eps": 1.0, "sig": 3.0})(4.0)[0] == pytest.approx(
+        of_text(LJ).radial({"eps": 1.0, "sig": 3.0})(4.0)[0]
+    )
+    with pytest.raises(FormulaError, match="annotate p with a NamedTuple"):
+        of_function(bare)
+    with pytest.raises(FormulaError, match="not a function of Python"):
+        of_function(functools.partial(lennard_jones))
+    with pytest.raises(FormulaError, match="radius"):
+        of_function(strange)
+    with pytest.raises(FormulaError, match="two numbers"):
+        of_function(alone).radial({"eps": 1.0, "sig": 3.0})(4.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_law_ends_as_the_built_in_one(name):
+    theirs = built_in(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
+    formula, given = of_text(LJ), {"eps": 1.0, "sig": 3.4}
+    end = ending(name, theirs.shape, formula.radial(given))
+    own = OwnOfOneKind(9.0, theirs.shape, formula.kind(*formula.numbers(given)), (), end)
+    one = theirs.room(8, np.float64)
+    for r in (2.9, 7.4, 8.2, 8.99):
+        expected = in_numbers(one, r * r)
+        assert at_distance(own, own.formula, end, r * r) == pytest.approx(expected, rel=1e-11, abs=1e-11)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_tail_of_a_law_is_that_of_the_built_in_one(name):
+    theirs = built_in(np.zeros(10, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
+    radial = of_text(LJ).radial({"eps": 1.0, "sig": 3.4})
+    found = tail_of(radial, np.array(ending(name, theirs.shape, radial)), theirs.shape)
+    assert 100 * np.array(found) == pytest.approx(np.array(tail(theirs)), rel=1e-8)
+    with pytest.raises(ArithmeticError, match="too slowly"):
+        tail_of(of_text("1/r**3").radial({}), np.zeros(4), theirs.shape)
+
+
+# --- pair laws in a system -------------------------------------------------------------------------------------------
+
+
+def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
+    """A law equals the built-in Lennard-Jones of the same models, with mixing and ending."""
+    scene = small_scene(counts, 25.0, forces={"electrostatics": "none", **forces})
+    system, engine, state = built(counts, 25.0, spread=0.0, forces={"electrostatics": "none", **forces})
+    expected_load, expected = engine.evaluate(state)
+    given = {
+        f"{m.name}.{name}": {"eps": m.epsilon[i] / KJ_PER_MOL, "sig": m.sigma[i]}
+        for m in system.species
+        for i, name in enumerate(m.site_names)
+        if m.epsilon[i] > 0
+    }
+    own = build(scene.with_own([(law or rigidmd.pair_law)(given)]))
+    load, tallies = own.engine_of({name: own.terms[name] for name in own.own}, "double").evaluate(state)
+    (tally,) = tallies.values()
+    assert tally.energy == pytest.approx(expected["lennard_jones"].energy, rel=tolerance)
+    assert tally.virial == pytest.approx(expected["lennard_jones"].virial, rel=tolerance, abs=tolerance * 1e5)
+    for mine, theirs in zip(load, expected_load, strict=True):
+        assert mine == pytest.approx(theirs, rel=tolerance, abs=tolerance * np.abs(theirs).max(initial=0.0))
+
+
+def from_text(given, **more):
+    return rigidmd.pair_law(LJ, given, **more)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("truncation", NAMES)
+def test_a_law_is_the_built_in_one_in_a_box(truncation):
+    same_as_built_in({"argon": 60}, 1e-12, law=from_text, truncation=truncation)
+    same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_text, truncation=truncation)
+
+
+@pytest.mark.slow
+def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
+    def from_function(given):
+        return rigidmd.pair_law(lennard_jones, {key: Pair(**own) for key, own in given.items()})
+
+    def from_table(given):
+        (own,) = given.values()
+        r = np.linspace(2.4, 9.5, 2000)
+        return rigidmd.pair_law(table=(r, 4 * own["eps"] * ((own["sig"] / r) ** 12 - (own["sig"] / r) ** 6)))
+
+    same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_function)
+    same_as_built_in({"argon": 60}, 1e-6, law=from_table)
+
+
+def test_who_interacts_with_which_parameters():
+    def numbers(law, counts={"argon": 3, "krypton": 3}, **forces):  # noqa: B006
+        law = build(small_scene(counts, 25.0, forces=forces).with_own([law])).terms["pair_law"].law
+        return law.parameters, law.acts
+
+    both = {"Ar": {"k": 1.0}, "Kr": {"k": 4.0}}
+    parameters, acts = numbers(rigidmd.pair_law("k/r**9", both))
+    assert parameters[0] == pytest.approx(100 * np.array([[1.0, 2.0], [2.0, 4.0]]))
+    assert acts.all()
+    parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, mixing={"k": "arithmetic"}, pairs={}))
+    assert parameters[0, 0, 1] == pytest.approx(250)
+    parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, pairs={("Kr", "Ar"): {"k": 7.0}}))
+    assert parameters[0, 0, 1] == parameters[0, 1, 0] == pytest.approx(700)
+    parameters, acts = numbers(rigidmd.pair_law("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}}))
+    assert np.array_equal(acts, [[0, 1], [1, 0]])
+    # as in [[forces.pairs]]: a name means sites of that name, and elements only if no site has it
+    parameters, acts = numbers(rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}}))
+    assert parameters[0] == pytest.approx(200)
+    assert acts.shape == (1, 1)
+    one = build(small_scene({"argon": 3}, 25.0).with_own([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms["pair_law"]
+    assert one.law.acts.shape == (1, 1)
+    with pytest.raises(SceneError, match=r"have no geometric mean"):
+        numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
+    with pytest.raises(SceneError, match=r"no site is 'Xe'; there are AR, argon.AR"):
+        numbers(rigidmd.pair_law("k/r**9", {"Xe": {"k": 1.0}}))
+    with pytest.raises(SceneError, match=r"(?s)Ar: there is no k.*Ar: l is no parameter"):
+        numbers(rigidmd.pair_law("k/r**9", {"Ar": {"l": 1.0}}))
+    with pytest.raises(SceneError, match="there is no k among its parameters"):
+        numbers(rigidmd.pair_law("k/r**9 + l/r", {"l": 1.0}))
+    with pytest.raises(SceneError, match="mixing: q is no parameter"):
+        numbers(rigidmd.pair_law("k/r**9", both, mixing={"q": "arithmetic"}))
+    with pytest.raises(SceneError, match="is there twice"):
+        numbers(rigidmd.pair_law("k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}}))
+    with pytest.raises(SceneError, match="switch_start_A would do nothing"):
+        numbers(rigidmd.pair_law("k/r**9", both, truncation="shift", switch_start_A=7.0))
+    with pytest.raises(SceneError, match=r"longer than half"):
+        numbers(rigidmd.pair_law("k/r**9", {"k": 1.0}, cutoff_A=13.0))
+    with pytest.raises(SceneError, match="it has no cut-off, and the box is periodic"):
+        numbers(rigidmd.pair_law("k/r**9", {"k": 1.0}, cutoff_A=math.inf))
+
+
+def test_parameters_may_come_from_the_model():
+    sites = [
+        {"name": "D", "element": "Ar", "mass_u": 40, "position_A": [0, 0, 0], "parameters": {"k": 3.0, "other": 1.0}}
+    ]
+    scene = points(
+        molecules=[{"name": "dot", "count": 10, "sites": sites}],
+        forces={"custom": [{"name": "wall", "energy": "k/r**9"}]},
+    )
+    assert build(scene).terms["wall"].law.parameters[0, 0, 0] == pytest.approx(300)
+    assert "wall: k/r**9, 10 sites, cut-off 9 Å, switch" in describe(scene)
+
+
+@pytest.mark.parametrize(
+    "arguments, word",
+    [
+        ({}, "needs an energy or a table"),
+        ({"energy": "1/r", "truncation": "shfit"}, "shift"),
+        ({"energy": "1/r", "mixing": {"k": "mean"}}, "geometric"),
+        ({"energy": "k/r", "parameters": {"Ar": {"k": math.nan}}}, "finite"),
+        ({"energy": "k/r", "parameters": {"Ar": {"k": 1.0}, "k": 1.0}}, "either numbers"),
+        ({"energy": "k/r", "parameters": {"Ar": "k"}}, "not a table of numbers"),
+        ({"energy": "k/r", "pairs": {"Ar": {"k": 1.0}}}, "pair of names"),
+        ({"energy": "1/r", "cutoff_A": -1.0}, "above 0"),
+        ({"energy": "1/r", "cutoff_A": True}, "above 0"),
+        ({"energy": "k/r", "parameters": {"r": 1.0}}, "is the distance"),
+        ({"energy": "k/r", "mixing": "geometric"}, "must be a dictionary"),
+        ({"table": "x.dat"}, "two lists"),
+    ],
+)
+def test_a_law_that_makes_no_sense_is_told_at_once(arguments, word):
+    with pytest.raises(ValueError, match=word):
+        rigidmd.pair_law(**arguments)
+
+
+# --- forces in Python ------------------------------------------------------------------------------------------------
+
+
+class Field(rigidmd.Force):
+    """A field along z, on sites."""
+
+    changes_momentum = (False, False, False)
+    tied_to_places = False
+
+    def begin(self, system):
+        self.charge = system.of_sites(lambda molecule: molecule.charges)
+
+    def on_sites(self, position, state):
+        force = self.charge[:, None] * [0, 0, 9.64853321233]
+        return -(force * position).sum(), force
+
+
+class Spring(rigidmd.Force):
+    """A spring to the origin."""
+
+    name = "spring"
+
+    def on_molecules(self, state):
+        return 0.5 * (state.position**2).sum(), -state.position
+
+
+def test_a_field_on_sites_is_the_built_in_one():
+    forces = {"electrostatics": "none"}
+    own = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces).with_own([Field()]))
+    theirs = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces, fields={"electric_V_per_nm": [0, 0, 1]}))
+    load, tallies = own.engine_of({"field": own.terms["field"]}, "double").evaluate(own.state)
+    expected, told = theirs.engine_of({"e": theirs.terms["electric_field"]}, "double").evaluate(own.state)
+    assert tallies["field"].energy == pytest.approx(told["e"].energy, rel=1e-9)
+    assert load.force == pytest.approx(expected.force, abs=1e-9)
+    assert load.torque_body == pytest.approx(expected.torque_body, rel=1e-9, abs=1e-6)
+    assert own.model.keeps_momentum.all()
+
+
+def test_a_force_in_python_conserves_energy_and_is_in_the_log(tmp_path):
+    results = rigidmd.Simulation(points(), tmp_path / "run", forces=[Spring()]).run()
+    assert results["spring"] == pytest.approx(results["potential"])
+    assert abs(results["drift"]).max() < 1e-4 * results["kinetic"][0]
+    assert results.system.freedom.translation == 300  # the momentum is not conserved
+    header = (tmp_path / "run" / "log.csv").read_text().splitlines()[0]
+    assert header.endswith('"spring (kJ/mole)"')
+    assert results.units["spring"] == "kJ/mol"
+    assert results.summary["own_forces"] == {"spring": "Spring, computed by Python"}
+
+
+def test_a_run_with_forces_from_python_is_repeated_by_python_only(tmp_path, capsys):
+    folder = tmp_path / "run"
+    whole = rigidmd.Simulation(points(), tmp_path / "whole", forces=[Spring()]).run()
+    short = points(stages=[{"duration_ps": 0.02, "timestep_fs": 4}])
+    rigidmd.Simulation(short, folder, forces=[Spring()]).run()
+    assert main(["resume", str(folder), "--until", "0.04ps"]) == 2
+    assert "from_python: this run had spring from Python" in capsys.readouterr().err
+    scene = rigidmd.Scene.read(folder / "scene.toml")
+    with pytest.raises(SceneError, match="this has field"):
+        rigidmd.Simulation(scene, forces=[Field()])
+    results = rigidmd.Simulation(scene.lasting(0.04), folder, forces=[Spring()], resume=True).run()
+    assert np.array_equal(results.state.position, whole.state.position)
+    assert np.array_equal(results["spring"], whole["spring"])
+    assert main(["report", str(folder)]) == 0  # what has ended can be looked at without the code
+
+
+class Faulty(rigidmd.Force):
+    """Goes wrong in the way that it is told, once some molecule has moved."""
+
+    def __init__(self, way):
+        self.way, self.seen = way, None
+
+    def on_molecules(self, state):
+        energy, force = 0.5 * (state.position**2).sum(), -state.position
+        self.seen = state.position.copy() if self.seen is None else self.seen
+        if self.way == "raises":
+            raise KeyError("charge")
+        if self.way == "shape":
+            return energy, force[0]
+        if self.way == "energy":
+            return "much", force
+        if self.way == "virial":
+            return energy, force, None, [1.0, 2.0]
+        if self.way == "tuple":
+            return force
+        if state.step[0] > 3:
+            force[6, 1] = np.nan
+        return energy, force
+
+
+@pytest.mark.parametrize(
+    "way, word",
+    [
+        ("raises", r"on_molecules of the force faulty raised KeyError: 'charge', line \d+ of .*test_own.py"),
+        ("shape", r"the force faulty gave forces of the shape \(3,\), not \(100, 3\)"),
+        ("energy", "gave 'much' as its energy"),
+        ("tuple", "gave ndarray; it must give a tuple"),
+        ("virial", r"gave \[1.0, 2.0\] as its virial"),
+        ("nan", r"stopped at step \d \(.* ps\): the force faulty gave .*nan.* on molecule 7 \(dot\)"),
+    ],
+)
+def test_a_faulty_force_is_told_with_its_molecule_and_step(way, word):
+    with pytest.raises(SimulationError if way == "nan" else SceneError, match=word):
+        rigidmd.Simulation(points(), forces=[Faulty(way)]).run()
+
+
+class Neither(rigidmd.Force):
+    pass
+
+
+class Wrong(rigidmd.Force):
+    def on_molecules(self, state):
+        return 0.5 * (state.position**2).sum(), +state.position
+
+
+class Turned(rigidmd.Force):
+    def on_molecules(self, state):
+        return 0.0, np.zeros_like(state.position), np.ones_like(state.position)
+
+
+class Unstretched(Spring):
+    tied_to_places = False
+
+
+class Sheared(rigidmd.Force):
+    tied_to_places = False
+
+    def on_molecules(self, state):
+        return 0.0, np.zeros_like(state.position), None, np.diag([500.0, -500.0, 0.0])
+
+
+class InPlace(rigidmd.Force):
+    def on_sites(self, position, state):
+        position %= 20.0
+        return 0.0, np.zeros(position.shape)
+
+
+class Leaving(rigidmd.Force):
+    def on_molecules(self, state):
+        raise SystemExit(0)
+
+
+class Halfway(Spring):
+    changes_momentum = (True, False)  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(
+    "force, word",
+    [
+        (Wrong(), r"wrong: the force on molecule \d+ \(spce\) is not the derivative of the energy.* falls by -"),
+        (Turned(), "turned: the torque on molecule"),
+        (Unstretched(), "spring: the component xx of its molecular virial is 0 kJ/mol.*tied_to_places = True"),
+        (Sheared(), "the component xx of its molecular virial is 500"),
+        (InPlace(), "read-only"),
+        (Leaving(), "SystemExit: 0"),
+        (Halfway(), "must be three truth values"),
+        (Neither(), "must define one of on_sites and on_molecules"),
+        (lambda state: 0.0, "is no force"),
+    ],
+)
+def test_a_force_that_is_not_what_its_energy_says_stops_the_run_with_the_numbers(force, word):
+    scene = small_scene({"spce": 8}, 20.0, forces={"electrostatics": "none"})
+    with pytest.raises((SceneError, SimulationError), match=word):
+        system = build(scene.with_own([force]))
+        check_forces(system, system.state)
+
+
+def test_forces_from_python_exclude_what_they_cannot_go_with():
+    stage = {"ensemble": "npt", "temperature_K": 94, "pressure_bar": 1, "duration_ps": 1}
+    with pytest.raises(SceneError, match="spring depend on places in it: keep the volume"):
+        rigidmd.Simulation(points(stages=[stage]), forces=[Spring()])
+    top = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml")
+    with pytest.raises(SceneError, match="forces: for molecules; a single body takes applied"):
+        rigidmd.Simulation(top, forces=[Spring()])
+    with pytest.raises(SceneError, match="energy is a column of the log"):
+        rigidmd.Simulation(points(), forces=[rigidmd.pair_law("1/r**9", name="energy")])
+    with pytest.raises(SceneError, match="thermostat: 3 is neither"):
+        rigidmd.Simulation(points(), thermostat=3)
+
+
+# --- code in files ---------------------------------------------------------------------------------------------------
+
+MINE = """
+from typing import NamedTuple
+import rigidmd
+
+class Trap(NamedTuple):
+    stiffness: float
+    tied_to_places = True
+
+@rigidmd.compiled_force(Trap)
+def add(term, state, load, tally):
+    for m in range(len(state.position)):
+        for k in range(3):
+            load.force[m, k] -= term.stiffness * state.position[m, k]
+            if tally is not None:
+                tally[0] += 0.5 * term.stiffness * state.position[m, k] ** 2
+
+def trap(stiffness_kJ_mol_A2):
+    return Trap(100 * stiffness_kJ_mol_A2)
+
+ready = Trap(1.0)
+"""
+
+
+def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(f"{MINE}\n# {tmp_path}")  # not trusted by an earlier test
+    custom = {"module": "mine.py", "name": "trap", "parameters": {"stiffness_kJ_mol_A2": 1.0}}
+    import tomli_w
+
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(POINTS | {"forces": {"custom": [custom]}}))
+    assert main(["check", "s.toml"]) == 2
+    assert "mine.py is Python code, which can do whatever you can" in capsys.readouterr().err
+    assert main(["check", "s.toml", "--trust", "nosuch.py"]) == 2
+    assert main(["run", "s.toml", "--trust", "mine.py"]) == 0
+    capsys.readouterr()
+    spring = rigidmd.Simulation(points(), forces=[Spring()]).run()
+    assert main(["energy", "s.toml", "--json"]) == 0  # this process trusts it by now
+    import json
+
+    assert json.loads(capsys.readouterr().out)["components"]["trap"] == pytest.approx(spring["spring"][0], rel=1e-12)
+    # the file and its digest go with the run, which repeats
+    (copy,) = (tmp_path / "runs" / "s").glob("input_*mine.py")
+    assert copy.read_bytes() == (tmp_path / "mine.py").read_bytes()
+    assert main(["run", "runs/s/scene.toml", "-o", "again", "--trust", str(copy)]) == 0
+    assert main(["compare", "runs/s", "again"]) == 0
+    # a changed file is another one
+    (tmp_path / "mine.py").write_text(MINE.replace("0.5", "0.25"))
+    assert main(["check", "s.toml"]) == 2
+    assert main(["run", "s.toml", "-o", "third", "--trust", "mine.py"]) == 2
+    assert "is not the derivative of the energy" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text, entry, word",
+    [
+        ("import nosuchmodule", {"name": "x"}, "ModuleNotFoundError: No module named 'nosuchmodule'"),
+        ("def f(:", {"name": "x"}, "line 1 raised SyntaxError"),
+        (MINE, {"name": "tarp"}, "has no tarp; did you mean .*trap"),
+        (MINE, {"name": "trap"}, r"trap\(...\) raised TypeError"),
+        (MINE, {"name": "ready", "parameters": {"k": 1.0}}, "parameters would do nothing"),
+        ("x = 3", {"name": "x"}, "3 is no force"),
+    ],
+)
+def test_a_file_that_is_no_use_is_told(text, entry, word, tmp_path):
+    (tmp_path / "mine.py").write_text(text)
+    rigidmd.trust(tmp_path / "mine.py")
+    scene = rigidmd.Scene.from_dict(POINTS | {"forces": {"custom": [{"module": "mine.py", **entry}]}}, tmp_path)
+    with pytest.raises(SceneError, match=word):
+        build(scene)
+
+
+@pytest.mark.parametrize(
+    "entry, word",
+    [
+        ({"name": "x"}, "give a module"),
+        ({"name": "x", "module": "m.py", "energy": "1/r"}, "give a module"),
+        ({"name": "x", "module": "m.py", "sites": ["A"]}, "sites would do nothing with a module"),
+        ({"name": "x", "module": "m.txt"}, "ending in .py"),
+        ({"name": "x", "module": "../m.py"}, "outside the scene's folder"),
+        ({"name": "x y", "energy": "1/r"}, "name"),
+    ],
+)
+def test_entries_of_custom_forces_are_checked(entry, word):
+    with pytest.raises(SceneError, match=word):
+        points(forces={"custom": [entry]})
+
+
+def test_code_for_classes_of_users_has_an_index_of_its_own():
+    index = Index("/nowhere", "f", 0)
+    source = b"from typing import NamedTuple\nclass Term(NamedTuple):\n    x: float\n"
+    kept = own_code.module_of(source, "<test>").Term
+    assert own_code.module_of(source, "<test>").Term is kept  # one class for one text
+    assert own_code.module_of(source + b"\n", "<test>").Term is not kept
+
+    def key(value):
+        return ((numba.typeof((value, 1.0)),), ())
+
+    assert index._apart(key(1.0)) is index
+    assert index._apart(key(Pair(1.0, 2.0))) is None  # of a module that may change: not kept
+    of_file = own_code.module_of(source, "<test>", own_code.OF_FILE).Term
+    assert index._apart(key(of_file(1.0))) is None  # it may hold what it has read
+    apart = index._apart(key(kept(1.0)))
+    assert apart._index_path not in (index._index_path, None)
+
+
+STRENGTH = 1.0
+
+
+class One(NamedTuple):
+    k: float
+
+
+def of_strength(p: One, r):
+    return STRENGTH * p.k / r, STRENGTH * p.k / r**2
+
+
+def test_a_law_of_a_function_sees_what_the_function_uses_when_the_law_is_made(monkeypatch):
+    made, end = [], (0.0, 0.0, 0.0, 0.0)
+    for strength in (1.0, 5.0):
+        monkeypatch.setitem(globals(), "STRENGTH", strength)
+        own = rigidmd.pair_law(of_strength, {"D": One(2.0)}).formula(9.0).kind(2.0)
+        made.append(at_distance(OwnOfOneKind(20.0, Plain(20.0), own, (), end), own, end, 4.0)[0])
+    assert made == [pytest.approx(100.0), pytest.approx(500.0)]
+
+
+# --- thermostats -----------------------------------------------------------------------------------------------------
+
+
+class Halving(NamedTuple):
+    """Halves the kinetic energy in a time."""
+
+    time: float
+    halved = False
+
+
+@rigidmd.compiled_thermostat(Halving)
+def halve(bath, model, state, h, draw):
+    factor = 0.5 ** (h / bath.time)
+    before = 0.0
+    for m in range(len(state.velocity)):
+        for k in range(3):
+            before += 0.5 * model.mass[model.species[m]] * state.velocity[m, k] ** 2
+            state.velocity[m, k] *= math.sqrt(factor)
+    state.books[0] += (factor - 1) * before
+
+
+def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():
+    given = {"D": {"A": 1e5, "B": 4.0, "C": 1.0}}
+    scene = points(forces={"custom": [{"name": "soft", "energy": "A*exp(-B*r) - C/r**6", "parameters": given}]})
+    results = rigidmd.Simulation(scene, thermostat=Halving(0.01)).run()
+    assert results["kinetic"][-1] == pytest.approx(results["kinetic"][0] / 16, rel=0.02)
+    assert results["heat"][-1] == pytest.approx(results["energy"][-1] - results["energy"][0], rel=0.02)
+    assert any("thermostat: halving, from Python" in note for note in results.system.notes)
+    assert results.system.scene.from_python == ("thermostat halving",)
+
+
+# --- examples --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
+    from rigidmd.analyse import registry
+
+    monkeypatch.setattr(registry, "KNOWN", dict(registry.KNOWN))
+    assert len(path.read_text().splitlines()) < 40
+    assert path.read_text().startswith("# ")
+    runpy.run_path(str(path), run_name="__main__")
+
+
+def test_scripts_are_listed_and_copied(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["examples"]) == 0
+    listed = capsys.readouterr().out
+    assert all(f"  {path.stem} " in listed for path in SCRIPTS)
+    assert main(["new", "mie"]) == 0
+    assert "python mie.py" in capsys.readouterr().out
+    assert (tmp_path / "mie.py").read_bytes() == (ROOT / "systems" / "scripts" / "mie.py").read_bytes()
+    assert main(["new", "mie", "-o", "mine.toml", "--force"]) == 2
+    assert "must end in .py" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_langevin_function_of_dipoles_in_a_field_in_python():
+    """Free dipoles in a field: the mean of cos is coth x - 1/x with x = mu E/kT."""
+    scene = rigidmd.Scene.from_dict(
+        {
+            "box": {"lengths_A": 60},
+            "molecules": [{"model": "spce", "count": 200}],
+            "forces": {"electrostatics": "none", "lennard_jones": False},
+            "start": {"temperature_K": 300},
+            "stages": [{"ensemble": "nvt", "temperature_K": 300, "duration_ps": 100, "thermostat": "langevin"}],
+        }
+    )
+    results = rigidmd.Simulation(scene, forces=[Field()]).run()
+    energy = results["field"][len(results["field"]) // 10 :]
+    mu = results.system.species[0].dipole_debye * 0.20819434 * 9.64853321233
+    thermal = 8.31446261815324e-3 * 300
+    weight = quad(lambda c: math.exp(mu * c / thermal), -1, 1)[0]
+    mean = quad(lambda c: c * math.exp(mu * c / thermal), -1, 1)[0] / weight
+    assert energy.mean() / 200 == pytest.approx(-mu * mean, rel=0.01)
