@@ -167,6 +167,12 @@ class Molecule:
         return float(np.linalg.norm(self.charges @ self.positions_body)) / DEBYE
 
     @property
+    def has_dipole(self) -> bool:
+        """Whether the dipole moment about the centre of mass is more than rounding."""
+        scale = SAME_PLACE * self.radius * np.abs(self.charges).sum()
+        return bool(self.dipole_debye * DEBYE > scale)
+
+    @property
     def quadrupole_debye_A(self) -> np.ndarray:
         """Traceless quadrupole moment (3, 3) about the centre of mass, body frame, D Å: sum of q (3 x x - r²) / 2."""
         x, q = self.positions_body, self.charges
@@ -189,9 +195,7 @@ class Molecule:
         charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
         dipole = ""
         if self.charges.any() and self.radius > 0:
-            size = self.dipole_debye * DEBYE
-            gone = size <= SAME_PLACE * self.radius * np.abs(self.charges).sum()
-            dipole = ", no dipole" if gone else f", dipole {self.dipole_debye:.3f} D"
+            dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
         return f"{shape}, {_counted(len(self.masses), 'site')}, {self.mass:.4f} u, {charge}{dipole}"
 
     @property

@@ -205,7 +205,7 @@ def test_bodies_that_are_all_but_linear_go_on(spread):
     assert np.ptp(results["energy"]) < 0.01 * results["kinetic"].max()
 
 
-@pytest.mark.parametrize(("timestep", "wrong"), [(9.0, True), (2.0, False)])
+@pytest.mark.parametrize(("timestep", "wrong"), [(11.0, True), (2.0, False)])
 def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
     """It takes out in every step what the step has added, so that the temperature of all motion looks right."""
     stage = {"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": timestep, "duration_ps": 12.0}

@@ -46,7 +46,7 @@ def dielectric(history: History) -> Finding:
             "pme, ewald or reaction_field"
         )
     dipole = total_dipole(history)
-    if not dipole.any():
+    if not any(kind.molecule.has_dipole for kind in history.kinds):
         raise OutputError("no molecule has a dipole: its fluctuation gives no dielectric constant")
     gap = history.span / (len(history) - 1)
     off = dipole - dipole.mean(axis=0)

@@ -80,7 +80,7 @@ def _axes_in_words(kind: Kind) -> str:
     """Which axis of a molecule is its dipole's."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
     size = float(np.linalg.norm(dipole))
-    if kind.molecule.charge or size <= 1e-6 * kind.molecule.radius * np.abs(kind.molecule.charges).sum():
+    if kind.molecule.charge or not kind.molecule.has_dipole:
         return ""
     along = int(np.abs(dipole).argmax())
     if abs(dipole[along]) < (1 - 1e-6) * size:
