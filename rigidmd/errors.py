@@ -72,6 +72,10 @@ class SimulationError(RigidMDError):
     """A run that was stopped because its numbers became meaningless."""
 
 
+class EngineError(RigidMDError):
+    """Another engine that is not here, cannot do what a scene asks for, or failed."""
+
+
 class SettingError(RigidMDError):
     """A setting of the machine that cannot be used, such as an environment variable."""
 

@@ -22,6 +22,7 @@ ROOMS = [
     ("output",),
     ("analyse",),
     ("shipped",),
+    ("peers",),
     ("run",),
     ("study",),
     ("looking",),
@@ -42,7 +43,7 @@ LIBRARIES = {
     "gsd": {"assemble/gsd_format.py", "output/gsd_file.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
-    "sympy": {"forces/laws/formulas.py"},
+    "sympy": {"forces/laws/formulas.py", "peers/tables.py"},
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",

@@ -124,10 +124,7 @@ def observe(
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     model = system.model
     mass = model.mass[model.species]
-    translation = float(0.5 * mass @ (state.velocity**2).sum(axis=1))
-    rotation = 0.0
-    if len(state.angular_momentum_body):
-        rotation = float(0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum())
+    translation, rotation = kinetic_energies(system, state)
     slant = verlet_step**2 / 12
     translation_unbiased = translation + slant * float((load.force**2).sum(axis=1) @ model.inverse_mass[model.species])
     rotation_unbiased = rotation
@@ -153,6 +150,14 @@ def observe(
         orthogonality=orthogonality_error(state.rotation),
         load=load,
     )
+
+
+def kinetic_energies(system: System, state: State) -> tuple[float, float]:
+    """Of translation and rotation, u Å²/ps²."""
+    model, rotation = system.model, 0.0
+    if len(state.angular_momentum_body):
+        rotation = float(0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum())
+    return float(0.5 * model.mass[model.species] @ (state.velocity**2).sum(axis=1)), rotation
 
 
 def _temperature(kinetic: float, freedom: int) -> float:

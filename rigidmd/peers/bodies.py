@@ -1,0 +1,98 @@
+"""Bodies from sites: another engine tells positions, velocities and forces of sites, a run needs those of bodies."""
+
+import numpy as np
+
+from rigidmd.assemble.system import System
+from rigidmd.core.state import Load, State
+
+
+class Bodies:
+    """Rebuilds states and loads of a system from what its sites do."""
+
+    def __init__(self, system: System):
+        model, sites = system.model, system.sites
+        self._molecule, self._body = sites.molecule, sites.offset_body
+        self._count = len(model.species)
+        self._weight = sites.mass
+        self._mass = model.mass[model.species]
+        self._inertia = model.inertia[model.species]
+        self._frozen = (model.inverse_mass == 0)[model.species]
+        spread = np.zeros((self._count, 3, 3))
+        np.add.at(spread, self._molecule, np.einsum("si,sj->sij", self._body, self._body))
+        extent = np.linalg.norm(np.linalg.eigvalsh(spread), axis=1)
+        # linear bodies have one moment of inertia that is 0; points have no extent at all
+        self._linear = (self._inertia == 0).any(axis=1) & (extent > 0)
+        self._still = self._frozen | (extent == 0)
+
+    def state(self, before: State, position: np.ndarray, velocity: np.ndarray, cell: np.ndarray) -> State:
+        """The state of sites (s, 3), molecules whole and not wrapped; what sites do not tell is as before.
+
+        Frozen molecules stay where they were. The spin of a linear body about its axis has no meaning: its rotation is
+        the one nearest to that before.
+        """
+        centre, drift = self._mean(position), self._mean(velocity)
+        arm = position - centre[self._molecule]
+        rotation, spin = before.rotation.copy(), before.angular_momentum_body.copy()
+        if len(rotation):
+            turned = ~self._still
+            rotation[turned] = self._rotations(before.rotation, arm)[turned]
+            whirl = np.cross(arm, velocity - drift[self._molecule]) * self._weight[:, None]
+            spin[turned] = np.einsum("nij,ni->nj", rotation, self._sum(whirl))[turned]
+            spin[self._inertia == 0] = 0.0
+        held = self._frozen[:, None]
+        return before._replace(
+            position=np.where(held, before.position, centre),
+            velocity=np.where(held, before.velocity, drift),
+            rotation=np.ascontiguousarray(rotation),
+            angular_momentum_body=spin,
+            cell=np.ascontiguousarray(cell),
+        )
+
+    def load(self, state: State, position: np.ndarray, force: np.ndarray) -> Load:
+        """Forces and torques on bodies from those on sites (s, 3)."""
+        arm = position - self._mean(position)[self._molecule]
+        total = np.where(self._frozen[:, None], 0.0, self._sum(force))
+        if not len(state.rotation):
+            return Load(total, np.zeros((0, 3)))
+        torque = np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force)))
+        return Load(total, np.where(self._frozen[:, None] | (self._inertia == 0), 0.0, torque))
+
+    def within(self, position: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Sum (3, 3) of F (x) d, d from the centre of mass: the virial of sites less this is that of molecules."""
+        return force.T @ (position - self._mean(position)[self._molecule])
+
+    def _sum(self, of_sites: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(self._molecule, part, self._count) for part in of_sites.T], axis=1)
+
+    def _mean(self, of_sites: np.ndarray) -> np.ndarray:
+        return self._sum(of_sites * self._weight[:, None]) / self._mass[:, None]
+
+    def _rotations(self, before: np.ndarray, arm: np.ndarray) -> np.ndarray:
+        """Rotations (n, 3, 3) that bring the templates nearest to the arms (s, 3) of the sites."""
+        overlap = np.zeros((self._count, 9))
+        products = np.einsum("si,sj->sij", arm, self._body).reshape(-1, 9)
+        for k in range(9):
+            overlap[:, k] = np.bincount(self._molecule, products[:, k], self._count)
+        left, size, right = np.linalg.svd(overlap.reshape(-1, 3, 3))
+        left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+        found = left @ right
+        if self._linear.any():
+            axis = left[:, :, 0][self._linear]  # of the lab, to which `along` of the body points
+            along = right[:, 0][self._linear]
+            found[self._linear] = _tilted(
+                before[self._linear], np.einsum("nij,nj->ni", before[self._linear], along), axis
+            )
+        return found
+
+
+def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Rotations followed by the shortest ones that bring unit vectors old (n, 3) to new (n, 3).
+
+    Source: Rodrigues' formula for the rotation by the angle between the two about their cross product.
+    """
+    cross, cosine = np.cross(old, new), np.einsum("ni,ni->n", old, new)
+    hat = np.zeros((len(old), 3, 3))
+    for (i, j), k in {(2, 1): 0, (0, 2): 1, (1, 0): 2}.items():
+        hat[:, i, j], hat[:, j, i] = cross[:, k], -cross[:, k]
+    step = np.eye(3) + hat + hat @ hat / (1 + cosine)[:, None, None]
+    return step @ rotation

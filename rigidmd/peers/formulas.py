@@ -1,0 +1,45 @@
+"""Pair laws as formulas of r in the language of Lepton, which LAMMPS and OpenMM read; the numbers are those of the laws.
+
+They serve where an engine has no form of its own with the same ending. `max`, `erfc` and powers are Lepton's.
+"""
+
+from rigidmd.forces.laws.coulomb import ReactionField
+from rigidmd.forces.laws.endings import Bent, Shape, SmoothlySwitched, Switched
+from rigidmd.forces.laws.lennard_jones import LennardJones
+from rigidmd.forces.laws.screened import DampedShiftedForce
+
+#: S of t = (r - start)/(cut-off - start), see forces.laws.endings.
+SWITCHES: dict[type, str] = {
+    Switched: "1-10*t^3+15*t^4-6*t^5",
+    SmoothlySwitched: "1-126*t^5+420*t^6-540*t^7+315*t^8-70*t^9",
+}
+
+
+def lennard_jones_formula(law: LennardJones, c12: float, c6: float, unit: float) -> str:
+    """Energy of two sites with c12/r¹² - c6/r⁶, r in Å, in units of `unit` u Å²/ps²."""
+    twelve, six = float(c12 / unit), float(c6 / unit)
+    end = tuple(twelve * of12 - six * of6 for of12, of6 in zip(law.end12, law.end6, strict=True))
+    return _ended(f"{twelve!r}/r^12-{six!r}/r^6", law.shape, end)
+
+
+def coulomb_formula(law: ReactionField | DampedShiftedForce, strength: float) -> str:
+    """Energy of two charges whose plain law is strength/r, r in Å."""
+    strength = float(strength)
+    if isinstance(law, DampedShiftedForce):
+        return f"{strength!r}*(erfc({law.alpha!r}*r)/r+{float(law.slope)!r}*r+({float(law.shift)!r}))"
+    end = tuple(strength * part for part in law.end)
+    return _ended(f"{strength!r}/r+({strength * law.field!r})*r^2", law.shape, end)
+
+
+def _ended(formula: str, shape: Shape, end: tuple[float, ...]) -> str:
+    """A formula with an ending; see forces.laws.endings for both."""
+    constant, linear, quadratic, cubic = (float(part) for part in end)
+    whole = f"{formula}+({constant!r})" if constant else formula
+    if isinstance(shape, Bent):
+        return (
+            f"{whole}-(x*({linear!r})+x^3*({quadratic / 3!r})+x^4*({cubic / 4!r})); x=max(0,r-{float(shape.start)!r})"
+        )
+    if type(shape) in SWITCHES:
+        width = float(shape.cutoff - shape.start)
+        return f"({whole})*({SWITCHES[type(shape)]}); t=max(0,(r-{float(shape.start)!r})/{width!r})"
+    return whole

