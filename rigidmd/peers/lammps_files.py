@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from math import inf, pi
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -131,7 +131,7 @@ def write_data(path: Path, portrait: Portrait, state: State) -> None:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _n(number: float) -> str:
+def _n(number: Any) -> str:
     """The shortest digits that give a number back."""
     return repr(float(number))
 

@@ -35,7 +35,9 @@ def add_commands(
         "rigidmd verify systems/water_pme.toml --engine lammps --ranks 2",
     )
     scene_arguments(verify)
-    verify.add_argument("--engine", required=True, choices=["lammps", "openmm"], help="the other engine")
+    verify.add_argument(
+        "--engine", choices=["lammps", "openmm"], help="the other engine (default: the scene's, or lammps)"
+    )
     verify.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
     verify.add_argument("--platform", metavar="NAME", help="of openmm: its platform (default: Reference)")
     verify.add_argument("--json", action="store_true", help="print JSON")
@@ -60,9 +62,10 @@ def _verify(options: argparse.Namespace) -> int:
 
     from rigidmd.study.verify import verify
 
-    platform = {"platform": options.platform or "Reference"} if options.engine == "openmm" else {}
-    if "platform" in platform:
-        options.platform = platform["platform"]
+    if options.engine is None and not options.read_scene(options).engine.is_other:
+        options.engine = "lammps"
+    if options.engine == "openmm" and options.platform is None:
+        options.platform = "Reference"
     scene = options.read_scene(options)
     found = verify(scene)
     print(json.dumps(found.told(), indent=2) if options.json else found.in_words())
