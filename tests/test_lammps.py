@@ -11,40 +11,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT, built, small_scene
+from engine_scenes import PME, SCENES
 
 from rigidmd import cli
 from rigidmd.assemble.system import build
 from rigidmd.core.state import HEAT, NOW
 from rigidmd.errors import EngineError, SimulationError
+from rigidmd.measure.summary import mean
 from rigidmd.molecules import available_models
 from rigidmd.output.record import read_record
 from rigidmd.peers import lammps, lammps_files
 from rigidmd.peers.bodies import Bodies
 from rigidmd.peers.checking import compare_at, in_words
 from rigidmd.peers.lammps import LammpsEngine
+from rigidmd.run import Simulation
 from rigidmd.study.verify import verify
 
 pytest.importorskip("lammps")
 
-PME = {"electrostatics": "pme", "cutoff_A": 7.0}
 THERE = {"engine": {"name": "lammps"}}
-WALL = [{"model": "argon", "count": 20, "frozen": True}, {"model": "spce", "count": 30}]
-#: Ten systems of every kind: scenes by name.
-SCENES = {
-    "three sites": ({"spce": 30}, {"forces": PME}),
-    "four sites": ({"tip4p2005": 30}, {"forces": PME}),
-    "five sites": ({"tip5p": 30}, {"forces": PME}),
-    "nitrogen": ({"nitrogen": 40}, {"forces": {"cutoff_A": 7.0}}),
-    "carbon dioxide": ({"co2_epm2": 20}, {"forces": PME}),
-    "benzene": ({"benzene_opls": 8}, {"forces": PME}),
-    "mixture": ({"spce": 20, "nitrogen": 10, "argon": 5}, {"forces": {"cutoff_A": 7.0}}),
-    "ions": ({"spce": 20, "na_spce": 3, "cl_spce": 3}, {"forces": PME}),
-    "frozen wall": ({}, {"molecules": WALL, "forces": PME}),
-    "triclinic": (
-        {"spce": 40},
-        {"forces": PME, "box": {"lengths_A": [16.0, 17.0, 18.0], "angles_deg": [75.0, 80.0, 70.0]}},
-    ),
-}
 
 
 def both(counts, sections, seed=1, edge=15.0, **more):
@@ -283,3 +268,30 @@ def test_a_process_ends_with_its_engine():
     assert process.poll() is None and folder.is_dir()
     del engine
     assert process.poll() is not None and not folder.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ensemble", ["nve", "nvt", "npt"])
+def test_means_are_those_of_rigidmd(ensemble):
+    """216 SPC/E: potential energy, temperatures, pressure and density within errors, of runs that share their start."""
+    warm = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 10.0, "thermostat": "nose_hoover"}
+    last = {"ensemble": ensemble, "duration_ps": 60.0}
+    last |= {"temperature_K": 300.0, "thermostat": "nose_hoover"} if ensemble != "nve" else {}
+    last |= {"pressure_bar": 1.0} if ensemble == "npt" else {}
+    forces = {"cutoff_A": 9.0, "electrostatics": "pme", "tail_correction": True}
+    settings = {"forces": forces, "stages": [warm], "box": {"density_g_cm3": 0.998}, "output": {"trajectory": False}}
+    liquid = Simulation(small_scene({"spce": 216}, 18.6, **settings))
+    liquid.run()
+    found = {}
+    for engine in ("rigidmd", "lammps"):
+        stages = {"stages": [last], "engine": {"name": engine}}
+        simulation = Simulation(small_scene({"spce": 216}, 18.6, **settings | stages))
+        simulation.start_from(liquid.state)
+        samples = simulation.run().samples
+        late = slice(len(samples.rows) // 6, None)
+        names = ("potential", "temperature_translation", "temperature_rotation", "pressure_bar", "density")
+        found[engine] = {name: mean(list(samples[name][late])) for name in names}
+    for name, (here, error) in found["rigidmd"].items():
+        there, other_error = found["lammps"][name]
+        if ensemble == "npt" or name != "density":
+            assert abs(here - there) < 4 * np.hypot(error, other_error), (name, found)

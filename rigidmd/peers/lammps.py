@@ -127,11 +127,16 @@ class LammpsEngine:
         """Declare that positions were changed from outside since the last step."""
         self._has = None
 
-    def rotor(self, model: Model) -> NamedTuple:
+    def rotor(self, model: Model) -> "NamedTuple | None":
         """That of LAMMPS' fix rigid/nve: half a turn about the axes with the largest and the middle moment, a whole one
-        about that with the smallest, and the same back (NO_SQUISH, Miller et al. 2002, J. Chem. Phys. 116, 8649)."""
+        about that with the smallest, and the same back (NO_SQUISH, Miller et al. 2002, J. Chem. Phys. 116, 8649).
+
+        None with linear, symmetric and spherical bodies: LAMMPS does not tell which of their equal axes it took.
+        """
         if not isinstance(model.rotor, SplitRotor):
             return model.rotor
+        if (model.rotor.symmetry[model.inertia.any(axis=1)] != NONE).any():
+            return None
         inverse = model.rotor.inverse_inertia
         largest_first = np.argsort(-model.inertia, axis=1, kind="stable")
         return model.rotor._replace(

@@ -14,6 +14,7 @@ from rigidmd.errors import SceneError
 from rigidmd.peers.checking import ERRORS, Line, compare_at, in_words
 from rigidmd.peers.engines import OtherEngine, other_engine
 from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene.engine import OTHERS
 from rigidmd.scene.stage import Stage
 from rigidmd.study.export import start_of
 from rigidmd.units import FEMTOSECOND
@@ -61,6 +62,8 @@ def verify(scene: Scene) -> Verified:
     """
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body has no other engine: verify is for molecules"])
+    if not scene.engine.is_other:
+        raise SceneError(scene.source, [f"engine.name names no other engine; there are {', '.join(OTHERS)}"])
     system = build(scene)
     state = start_of(system)
     short = Stage(ensemble="nve", duration_ps=STEPS * STEP * FEMTOSECOND, timestep_fs=STEP)
