@@ -79,7 +79,14 @@ class LammpsEngine:
         self.counts_heat = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._bodies = Bodies(system)
         self._process = Process(command(ranks))
-        self.made_by = f"LAMMPS {self._process.version}"
+        date, there = self._process.say(f'print "{FIGURES} $(version) $(extract_setting(world_size))"')
+        if there != ranks:
+            self.close()
+            raise EngineError(
+                f"{ranks} ranks were asked for, and LAMMPS has {there:.0f}: the launcher is of another MPI than LAMMPS; "
+                "put its own mpirun on the PATH, or take 1 rank"
+            )
+        self.made_by = f"LAMMPS {date:.0f}"
         self._has: State | None = None  # the state that LAMMPS has
         self._books = 0.0  # of heat, when it was given a state
         self._moved: State | None = None
@@ -280,12 +287,6 @@ class Process:
         runs = any(line.startswith("run ") and line != "run 0" for line in lines)
         kind = SimulationError if runs else EngineError
         raise kind(f"LAMMPS stopped: {'; '.join(said) or f'exit code {self._process.wait()}'}")
-
-    @property
-    def version(self) -> str:
-        """Its date, as in 20250722."""
-        (date,) = self.say(f'print "{FIGURES} $(version)"')
-        return f"{date:.0f}"
 
     def close(self) -> None:
         """End it and remove its folder."""

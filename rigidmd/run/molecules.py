@@ -452,7 +452,8 @@ class MolecularSimulation(Simulation):
         measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
         """
         relief = self.start()
-        seen = observe(self.system, self.engine, self.state)
+        moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
+        seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state)
         force, molecule = seen.largest_force
         found = {
             "unit": unit,
