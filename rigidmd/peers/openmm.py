@@ -18,7 +18,7 @@ from rigidmd.forces.waves.corrections import background, intramolecular_energy, 
 from rigidmd.measure.observables import kinetic_energies
 from rigidmd.peers import openmm_system as parts
 from rigidmd.peers.bodies import Bodies
-from rigidmd.peers.openmm_stages import integration_groups, integrator_of, movers, tolerance
+from rigidmd.peers.openmm_stages import integration_groups, integrator_of, movers, step, tolerance
 from rigidmd.peers.portrait import Portrait, portrait
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 
@@ -121,7 +121,7 @@ class OpenmmEngine:
             return
         self._integrator.setStepSize(dt)
         try:
-            self._integrator.step(steps)
+            step(self._integrator, steps)
         except parts.library().OpenMMException as error:
             if "NaN" in str(error):
                 raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan))) from None

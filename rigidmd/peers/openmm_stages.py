@@ -10,6 +10,8 @@ from rigidmd.scene.stage import Stage
 if TYPE_CHECKING:
     import openmm
 
+#: Variables of the integrator for velocity Verlet: part of a kick, and whether positions move.
+KICK, MOVES = "kick", "moves"
 #: One more than the largest seed of random numbers; OpenMM chooses one itself for 0.
 SEEDS = 2**31 - 1
 #: Relative tolerance of kept distances where they are computed in double precision, mixed and single.
@@ -41,18 +43,37 @@ def integrator_of(portrait: Portrait, k: int, kept_to: float) -> "openmm.Integra
 
 
 def velocity_verlet(mm, dt: float) -> Any:
-    """Velocity Verlet with kept distances (RATTLE; Andersen 1983, J. Comput. Phys. 52, 24): velocities are those of
-    the positions, while VerletIntegrator's are half a step behind."""
+    """Velocity Verlet with kept distances, to be stepped by `step`.
+
+    As leapfrog steps with half a kick at either end: the same positions and velocities (RATTLE; Andersen 1983, J.
+    Comput. Phys. 52, 24), but no forces are needed within a step, where OpenMM has not yet put virtual sites in place.
+    """
     made = mm.CustomIntegrator(dt)
+    made.addGlobalVariable(KICK, 1.0)
+    made.addGlobalVariable(MOVES, 1.0)
     made.addPerDofVariable("x1", 0)
-    made.addUpdateContextState()
-    made.addComputePerDof("v", "v+0.5*dt*f/m")
+    made.addComputePerDof("v", f"v+{KICK}*dt*f/m")
+    made.beginIfBlock(f"{MOVES} = 1")
     made.addComputePerDof("x", "x+dt*v")
     made.addComputePerDof("x1", "x")
     made.addConstrainPositions()
-    made.addComputePerDof("v", "v+0.5*dt*f/m+(x-x1)/dt")
+    made.addComputePerDof("v", "v+(x-x1)/dt")
+    made.endBlock()
+    made.beginIfBlock(f"{MOVES} = 0")
     made.addConstrainVelocities()
+    made.endBlock()
     return made
+
+
+def step(integrator: Any, steps: int) -> None:
+    """Take some steps, of which velocity Verlet begins and ends with half a kick."""
+    if not hasattr(integrator, "setGlobalVariableByName"):
+        integrator.step(steps)
+        return
+    for kick, moves, count in ((0.5, 1, 1), (1.0, 1, steps - 1), (0.5, 0, 1)):
+        integrator.setGlobalVariableByName(KICK, kick)
+        integrator.setGlobalVariableByName(MOVES, moves)
+        integrator.step(count)
 
 
 def integration_groups(portrait: Portrait, stage: Stage) -> set[int]:
