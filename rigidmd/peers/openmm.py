@@ -14,6 +14,7 @@ from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.engines import Tally
 from rigidmd.engines.cpu import NotFiniteError, keep_time
 from rigidmd.errors import EngineError, SimulationError
+from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.waves.corrections import background, intramolecular_energy, self_energy
 from rigidmd.measure.observables import kinetic_energies
 from rigidmd.peers import openmm_system as parts
@@ -104,6 +105,8 @@ class OpenmmEngine:
             self._groups.add(parts.RECIPROCAL)
         self._has: State | None = None  # the state that the mover has
         self._books = 0.0  # heat in the books of a state that it was given, less what it had counted by then
+        #: What the thermostat's chain held when last asked, kJ/mol; before its first step OpenMM cannot be asked.
+        self._chain, self._stepped = 0.0, False
         self._moved: State | None = None
         self._seen: tuple[State, Load, dict[str, Tally]] | None = None
 
@@ -122,6 +125,7 @@ class OpenmmEngine:
         self._integrator.setStepSize(dt)
         try:
             step(self._integrator, steps)
+            self._stepped = True
         except parts.library().OpenMMException as error:
             if "NaN" in str(error):
                 raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan))) from None
@@ -150,18 +154,18 @@ class OpenmmEngine:
     def memory(self) -> dict[str, np.ndarray]:
         """What OpenMM itself keeps of its context: particles, random numbers, its thermostat."""
         kept = np.frombuffer(self._mover.createCheckpoint(), np.uint8).copy() if self._has else np.zeros(0, np.uint8)
-        return {"context": kept, "heat": np.array([self._books])}
+        return {"context": kept, "heat": np.array([self._books, self._chain])}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         """Go on from a state with what `memory` gave for it. Raises ValueError if they do not fit."""
         kept = memory["context"]
-        self._has = None
+        self._has, self._stepped = None, False
         if len(kept):
             try:
                 self._mover.loadCheckpoint(kept.tobytes())
             except parts.library().OpenMMException as error:
                 raise ValueError(f"OpenMM cannot go on from its checkpoint: {error}") from None
-            self._has, self._books = state.copy(), float(memory["heat"][0])
+            self._has, (self._books, self._chain) = state.copy(), memory["heat"].tolist()
         self._moved = state
 
     def forget(self) -> None:
@@ -209,7 +213,9 @@ class OpenmmEngine:
     def _heat(self, state: State) -> float:
         """What the thermostat has put in, up to a constant, u Å²/ps²."""
         if self._stage.thermostat_kind == "nose_hoover" and not self._stage.has_barostat:
-            return -KJ_PER_MOL * self._integrator.computeHeatBathEnergy()
+            if self._stepped:
+                self._chain = self._integrator.computeHeatBathEnergy()._value
+            return -KJ_PER_MOL * self._chain
         if self._stage.has_thermostat:  # friction, noise and moves of the box are not counted: what the energy gained
             groups = integration_groups(self._held.drawn, self._stage)
             energy = self._mover.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
@@ -234,17 +240,18 @@ class OpenmmEngine:
         drawn, virial = self._held.drawn, self._virial(state)
         self._put(self._seer, state)
         found = {"lennard_jones": self._energy(parts.LENNARD_JONES)} if parts.LENNARD_JONES in self._groups else {}
-        if drawn.has_waves:
-            alpha = drawn.system.scene.forces.ewald_alpha_per_A
+        law = drawn.coulomb
+        if isinstance(law, ScreenedCoulomb):
+            alpha = law.alpha
             charge = drawn.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
             found["coulomb_real"] = self._energy(parts.COULOMB_PAIRS) - self._within(state, alpha)
-            if drawn.coulomb.shift:
+            if law.shift:
                 found["coulomb_real"] += self._energy(parts.STEP_COULOMB)
             found["coulomb_reciprocal"] = self._energy(parts.RECIPROCAL) - self_energy(charge, alpha) - even
             if "coulomb_background" in drawn.system.terms:
                 found["coulomb_background"] = even
-        elif drawn.coulomb is not None:
+        elif law is not None:
             found["coulomb"] = self._energy(parts.COULOMB_PAIRS)
         zero = np.zeros((3, 3))
         return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}

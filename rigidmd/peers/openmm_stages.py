@@ -1,19 +1,18 @@
 """The stages of a scene in OpenMM: integrators, thermostats, barostats."""
 
 from math import pi
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rigidmd.peers import openmm_system as parts
 from rigidmd.peers.portrait import Portrait
 from rigidmd.scene.stage import Stage
 
-if TYPE_CHECKING:
-    import openmm
-
 #: Variables of the integrator for velocity Verlet: part of a kick, and whether positions move.
 KICK, MOVES = "kick", "moves"
 #: One more than the largest seed of random numbers; OpenMM chooses one itself for 0.
 SEEDS = 2**31 - 1
+#: Steps between removals of the total momentum that never come.
+NEVER = 2**31 - 1
 #: Relative tolerance of kept distances where they are computed in double precision, mixed and single.
 TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 
@@ -23,7 +22,7 @@ def tolerance(platform: str, properties: dict[str, str]) -> float:
     return TOLERANCES[properties.get("Precision", "double")]
 
 
-def integrator_of(portrait: Portrait, k: int, kept_to: float) -> "openmm.Integrator":
+def integrator_of(portrait: Portrait, k: int, kept_to: float) -> Any:
     """The integrator of stage k: of a minimisation that which conserves the energy."""
     mm, stage = parts.library(), portrait.system.scene.stages[k]
     dt = stage.timestep_fs * 1e-3
@@ -86,13 +85,16 @@ def integration_groups(portrait: Portrait, stage: Stage) -> set[int]:
 
 
 def movers(portrait: Portrait, k: int) -> list:
-    """What moves the box in stage k."""
-    mm, stage = parts.library(), portrait.system.scene.stages[k]
-    if not stage.has_barostat:
-        return []
-    barostat = mm.MonteCarloBarostat(stage.pressures[0][0], stage.temperatures[0], stage.moves_every)
-    barostat.setRandomNumberSeed(_seed(portrait, k) % (SEEDS - 1) + 1)
-    return [barostat]
+    """What of stage k is not a matter of its integrator: a barostat; that a thermostat counts no total momentum."""
+    mm, stage, system = parts.library(), portrait.system.scene.stages[k], portrait.system
+    found = []
+    if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int((~portrait.frozen).sum()):
+        found.append(mm.CMMotionRemover(NEVER))
+    if stage.has_barostat:
+        barostat = mm.MonteCarloBarostat(stage.pressures[0][0], stage.temperatures[0], stage.moves_every)
+        barostat.setRandomNumberSeed(_seed(portrait, k) % (SEEDS - 1) + 1)
+        found.append(barostat)
+    return found
 
 
 def _seed(portrait: Portrait, k: int) -> int:

@@ -6,12 +6,12 @@ are virtual. Its units are nm, ps, u, e and kJ/mol.
 
 import re
 from math import inf
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.errors import EngineError
-from rigidmd.forces.laws.endings import Plain
+from rigidmd.forces.laws.endings import Plain, Switched
 from rigidmd.forces.laws.lennard_jones import LennardJones
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.peers.bodies import Points
@@ -36,7 +36,7 @@ PME_ORDER = 5
 LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL, STEP_LENNARD_JONES, STEP_COULOMB, TAIL = range(6)
 
 
-def library():
+def library() -> Any:
     """OpenMM. Raises EngineError with what to install."""
     try:
         import openmm
@@ -51,8 +51,8 @@ def faults(portrait: Portrait) -> list[str]:
     found = [f"{what} is left to rigidmd" for what in strange(system)]
     if portrait.has_waves and grid_for(portrait, PME_ORDER) is None:
         found.append(
-            f"forces.electrostatics = {forces.electrostatics!r}: no grid for OpenMM's splines, of order {PME_ORDER}, has "
-            "the accuracy asked for; ask for less"
+            f"forces.electrostatics = {forces.electrostatics!r}: no grid for OpenMM's splines, of order {PME_ORDER}, "
+            "has the accuracy asked for; ask for less"
         )
     for k, stage in enumerate(system.scene.stages):
         found += [f"stages.{k}.{fault}" for fault in _stage_faults(stage)]
@@ -174,7 +174,7 @@ def openmm_system(portrait: Portrait, particles: Layout, cell: np.ndarray) -> "o
     return made
 
 
-def _virtual(mm, points: list[int], weight: list[float], cross: float):
+def _virtual(mm: Any, points: list[int], weight: list[float], cross: float):
     """The virtual site at the sum of weight times point."""
     if len(points) == 2:
         return mm.TwoParticleAverageSite(*points, *weight)
@@ -186,14 +186,14 @@ def _virtual(mm, points: list[int], weight: list[float], cross: float):
     return mm.LocalCoordinatesSite(points, weight, [-1, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0])
 
 
-def _forces(mm, portrait: Portrait, particles: Layout) -> list[tuple]:
+def _forces(mm: Any, portrait: Portrait, particles: Layout) -> list[tuple]:
     """Forces and their groups."""
     found, law, coulomb = [], portrait.lennard_jones, portrait.coulomb
     if law is not None and portrait.epsilon.any():
         plain = _plain_lennard_jones(portrait)
         force = _own_lennard_jones(mm, portrait, particles) if plain is None else _nonbonded(mm, portrait, law.cutoff)
         if plain is not None:
-            if portrait.truncation == "switch" and law.cutoff < inf:
+            if isinstance(law.shape, Switched):
                 force.setUseSwitchingFunction(True)
                 force.setSwitchingDistance(float(law.shape.start) * NM)
             _fill(force, particles, np.zeros_like(portrait.charge), plain[0][portrait.kind], plain[1][portrait.kind])
@@ -250,7 +250,7 @@ def mixed_by_lorentz_berthelot(portrait: Portrait) -> tuple[np.ndarray, np.ndarr
     return (sigma, epsilon) if same and wide[deep].all() else None
 
 
-def _nonbonded(mm, portrait: Portrait, cutoff: float):
+def _nonbonded(mm: Any, portrait: Portrait, cutoff: float):
     """A NonbondedForce without particles."""
     force = mm.NonbondedForce()
     force.setUseDispersionCorrection(False)
@@ -277,7 +277,7 @@ def _fill(force, particles: Layout, charge, sigma=None, epsilon=None) -> None:
         force.addParticle(*row)
 
 
-def _custom(mm, portrait: Portrait, particles: Layout, cutoff: float, formula: str, values: dict[str, np.ndarray]):
+def _custom(mm: Any, portrait: Portrait, particles: Layout, cutoff: float, formula: str, values: dict[str, np.ndarray]):
     """A CustomNonbondedForce of a formula of r in Å, with values (s,) of sites."""
     text = re.sub(r"\br\b", "R", formula)
     force = mm.CustomNonbondedForce(f"{text}; R={1 / NM!r}*r" if text != formula else text)
@@ -293,7 +293,7 @@ def _custom(mm, portrait: Portrait, particles: Layout, cutoff: float, formula: s
     return force
 
 
-def _own_lennard_jones(mm, portrait: Portrait, particles: Layout, step: bool = False):
+def _own_lennard_jones(mm: Any, portrait: Portrait, particles: Layout, step: bool = False):
     """The law as a formula, or the step that it makes at the cut-off; linear in c12 and c6, which tables of kinds give.
 
     Kind 0 of the tables is that of points that are no sites.
@@ -320,7 +320,7 @@ def _own_lennard_jones(mm, portrait: Portrait, particles: Layout, step: bool = F
     return force
 
 
-def _between_charges(mm, portrait: Portrait, particles: Layout, formula: str):
+def _between_charges(mm: Any, portrait: Portrait, particles: Layout, formula: str):
     """q q times a formula of unit strength; charges are in units where q q/r is in kJ/mol."""
     law = portrait.coulomb
     assert law is not None
