@@ -55,25 +55,28 @@ class MassPoints(NamedTuple):
         return {site: place.weight @ point + place.cross * normal for site, place in self.placed.items()}
 
 
-def mass_points(molecule: Molecule, frozen: bool = False) -> MassPoints:
-    """The points for a molecule; all its sites where it is frozen, which nothing moves."""
+def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
+    """The points for a molecule; all its sites where it is frozen, which nothing moves.
+
+    sites : whether its sites may be the points, where just enough of them have mass
+    """
     if frozen:
         every = np.arange(len(molecule.masses))
         return MassPoints(molecule.masses, molecule.positions_body, every, {})
-    mass, position, site = _points(molecule)
+    mass, position, site = _points(molecule, sites)
     others = [k for k in range(len(molecule.masses)) if k not in site]
     limit = OFF * molecule.radius
     return MassPoints(mass, position, site, {k: _place(position, molecule.positions_body[k], limit) for k in others})
 
 
-def _points(molecule: Molecule) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masses, positions and sites of the points: sites themselves if just enough have mass, else a simplex."""
     heavy = np.flatnonzero(molecule.masses > 0)
     total, inertia = molecule.mass, molecule.inertia
     second = np.maximum(inertia.sum() / 2 - inertia, 0.0)  # sum of m x² along each axis
     if not inertia.any():
         return np.array([total]), np.zeros((1, 3)), heavy[:1]
-    if _serve(molecule, heavy):
+    if sites and _serve(molecule, heavy):
         return molecule.masses[heavy], molecule.positions_body[heavy], heavy
     reach = np.sqrt(second / total)
     if molecule.kind == "linear":

@@ -144,6 +144,5 @@ def _topology(holds: Held) -> "Topology":
 
 def _write_pdb(file, topology: "Topology", position) -> None:
     from openmm import Vec3, app
-    from openmm.unit import Quantity, nanometers
 
-    app.PDBFile.writeFile(topology, Quantity([Vec3(*row) for row in position.tolist()], nanometers), file)
+    app.PDBFile.writeFile(topology, [Vec3(*row) for row in (position / parts.NM).tolist()], file)  # Å
