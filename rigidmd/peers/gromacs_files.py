@@ -282,7 +282,7 @@ def _settings(portrait: Portrait, k: int) -> str:
         "lincs-order": 8,
         "lincs-iter": 4,
         "DispCorr": "AllEnerPres" if system.tail is not None else "no",
-        "ld-seed": scene.seed % SEEDS,
+        "ld-seed": (scene.seed * 1000 + k) % SEEDS,
     }
     if portrait.lennard_jones is not None:
         found["vdw-modifier"] = MODIFIERS[portrait.truncation]

@@ -218,7 +218,7 @@ def _forces(mm: Any, portrait: Portrait, particles: Layout) -> list[tuple]:
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
             found.append((_between_charges(mm, portrait, particles, height), STEP_COULOMB))
     if (tail := portrait.system.tail) is not None:
-        energy = tail.energy_volume / KJ_PER_MOL * NM**3
+        energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
         found.append((mm.CustomVolumeForce(f"{energy!r}/v"), TAIL))
     return found
 
