@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -126,14 +127,14 @@ def extrapolated(system, make, start, row):
         state = engine.begin(start, row)
         engine.advance(state, row, 1e-3 / n, 50 * n)
         found.append(system.site_positions(state))
-    first, second = ((4 * b - a) / 3 for a, b in zip(found, found[1:], strict=False))
+    first, second = ((4 * b - a) / 3 for a, b in pairwise(found))
     return (16 * second - first) / 15
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
 def test_both_engines_go_the_same_way(platform):
     """OpenMM turns bodies by keeping distances, another method of order 2: what is left at no step is the physics."""
-    system, ours, state = built(MIXTURE | {"argon": 2}, None, seed=3, spread=0.1)
+    system, _, state = built(MIXTURE | {"argon": 2}, None, seed=3, spread=0.1)
     row = system.scene.stages[0].scheme
     mine = extrapolated(system, system.engine, state, row)
     its = extrapolated(system, lambda: OpenmmEngine(system, platform=platform), state, row)
