@@ -44,6 +44,7 @@ LIBRARIES = {
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
     "sympy": {"forces/laws/formulas.py", "peers/tables.py"},
+    "openmm": {"peers/openmm_system.py", "peers/openmm_files.py"},
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",

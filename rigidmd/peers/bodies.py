@@ -1,16 +1,27 @@
 """Bodies from sites: another engine tells positions, velocities and forces of sites, a run needs those of bodies."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
 
 
-class Bodies:
-    """Rebuilds states and loads of a system from what its sites do."""
+class Points(NamedTuple):
+    """Points that stand for the molecules of a system, each fixed in one of them."""
 
-    def __init__(self, system: System):
-        model, sites = system.model, system.sites
+    molecule: np.ndarray  # (s,)
+    offset_body: np.ndarray  # (s, 3) from the centre of mass, Å
+    mass: np.ndarray  # (s,) u
+
+
+class Bodies:
+    """Rebuilds states and loads of a system from what its sites do, or other points with the same mass and centre."""
+
+    def __init__(self, system: System, points: Points | None = None):
+        model, sites = system.model, system.sites if points is None else points
+        self._inverse = model.inverse_inertia[model.species]
         self._molecule, self._body = sites.molecule, sites.offset_body
         self._count = len(model.species)
         self._weight = sites.mass
@@ -47,6 +58,15 @@ class Bodies:
             angular_momentum_body=spin,
             cell=np.ascontiguousarray(cell),
         )
+
+    def points(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities (s, 3) of the sites at a state, lab frame."""
+        centre, drift = state.position[self._molecule], state.velocity[self._molecule]
+        if not len(state.rotation):
+            return centre + self._body, drift
+        arm = np.einsum("sij,sj->si", state.rotation[self._molecule], self._body)
+        omega = np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body * self._inverse)
+        return centre + arm, drift + np.cross(omega[self._molecule], arm)
 
     def load(self, state: State, position: np.ndarray, force: np.ndarray) -> Load:
         """Forces and torques on bodies from those on sites (s, 3)."""

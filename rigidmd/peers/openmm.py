@@ -1,0 +1,290 @@
+"""An engine that lets OpenMM compute, on one of its platforms.
+
+Two contexts hold the system: one moves it, the other evaluates, so that looks leave no trace in the motion. OpenMM has
+no virial; that of molecules follows from energies at centres of mass that are moved apart and together.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.system import System
+from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
+from rigidmd.engines import Tally
+from rigidmd.engines.cpu import NotFiniteError, keep_time
+from rigidmd.errors import EngineError, SimulationError
+from rigidmd.forces.laws.screened import ScreenedCoulomb
+from rigidmd.forces.waves.corrections import background, intramolecular_energy, self_energy
+from rigidmd.measure.observables import kinetic_energies
+from rigidmd.peers import openmm_system as parts
+from rigidmd.peers.bodies import Bodies
+from rigidmd.peers.openmm_stages import integration_groups, integrator_of, movers, step, tolerance
+from rigidmd.peers.portrait import Portrait, portrait
+from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    import openmm
+
+PLATFORMS = ("CPU", "Reference", "CUDA", "OpenCL", "HIP")
+ANGSTROM = 1 / parts.NM  # in nm
+#: kJ/mol/nm in u Å/ps².
+FORCE = KJ_PER_MOL * parts.NM
+#: Strain of the differences that give the virial, where energies are double and single. The error of a difference is
+#: its square times a few hundred, and rounding over it.
+STRAIN = {True: 2e-5, False: 5e-4}
+
+
+class Held(NamedTuple):
+    """A system in OpenMM, and what reads it."""
+
+    drawn: Portrait
+    particles: parts.Layout
+    bodies: Bodies
+    made: "openmm.System"
+
+    def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
+        at, velocity = np.zeros((2, len(self.particles.mass), 3))
+        at[self.particles.site] = self.drawn.system.site_positions(state)
+        at[self.particles.point], velocity[self.particles.point] = self.bodies.points(state)
+        velocity[self.particles.mass == 0] = 0.0
+        return at, velocity
+
+
+def held(drawn: Portrait, state: State) -> Held:
+    """A system in OpenMM with the cell of a state."""
+    particles = parts.layout(drawn)
+    bodies = Bodies(drawn.system, particles.points)
+    return Held(drawn, particles, bodies, parts.openmm_system(drawn, particles, state.cell))
+
+
+def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
+    """A platform of OpenMM and its properties. Raises EngineError with those that are there."""
+    mm = parts.library()
+    there = [mm.Platform.getPlatform(k).getName() for k in range(mm.Platform.getNumPlatforms())]
+    if name not in there:
+        known = "" if name in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
+        raise EngineError(f"OpenMM has no platform {name!r} here: there are {', '.join(there)}{known}")
+    scene = system.scene
+    if name == "CPU":
+        return mm.Platform.getPlatformByName(name), {"Threads": str(scene.threads)} if scene.threads else {}
+    return mm.Platform.getPlatformByName(name), {} if name == "Reference" else {"Precision": scene.precision}
+
+
+class OpenmmEngine:
+    """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
+
+    Raises EngineError, with all that OpenMM cannot do, or if it is not there.
+    """
+
+    moves = (0, 0)
+
+    def __init__(self, system: System, stage: int = 0, platform: str = "CPU"):
+        mm = parts.library()
+        drawn = portrait(system)
+        if faults := parts.faults(drawn):
+            raise EngineError(f"{system.scene.source}: OpenMM cannot run this scene: {'; '.join(faults)}")
+        where, properties = platform_of(platform, system)
+        self._system, self._stage = system, system.scene.stages[stage]
+        self._held = held(drawn, system.state)
+        #: Whether forces are computed in double precision.
+        self._double = platform == "Reference" or properties.get("Precision") == "double"
+        self._integrator = integrator_of(drawn, stage, tolerance(platform, properties))
+        rest = mm.VerletIntegrator(0.001)
+        try:
+            # the one that evaluates comes first: a barostat is for the other one only
+            self._seer = mm.Context(self._held.made, rest, where, properties)
+            for mover in movers(drawn, stage):
+                self._held.made.addForce(mover)
+            self._mover = mm.Context(self._held.made, self._integrator, where, properties)
+        except mm.OpenMMException as error:
+            raise EngineError(f"OpenMM cannot hold this system on {platform}: {error}") from None
+        self._groups = {force.getForceGroup() for force in self._held.made.getForces()}
+        if drawn.has_waves:
+            self._groups.add(parts.RECIPROCAL)
+        self._has: State | None = None  # the state that the mover has
+        self._books = 0.0  # heat in the books of a state that it was given, less what it had counted by then
+        #: What the thermostat's chain held when last asked, kJ/mol; before its first step OpenMM cannot be asked.
+        self._chain, self._stepped = 0.0, False
+        self._moved: State | None = None
+        self._seen: tuple[State, Load, dict[str, Tally]] | None = None
+
+    def begin(self, state: State, row: Scheme | Solver) -> State:
+        """A copy of a state; what thermostats and barostats evolve is OpenMM's own."""
+        return state.copy()._replace(bath=np.zeros(0))
+
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
+        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
+        keep_time(state, dt)
+        self._give(state)
+        self._moved = state
+        steps = until - int(state.step[NOW])
+        if steps <= 0:
+            return
+        self._integrator.setStepSize(dt)
+        try:
+            step(self._integrator, steps)
+            self._stepped = True
+        except parts.library().OpenMMException as error:
+            if "NaN" in str(error):
+                raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan))) from None
+            raise SimulationError(f"OpenMM stopped: {error}") from None
+        self._take(state)
+        state.step[NOW] = until
+        state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
+        state.books[HEAT] = self._books + self._heat(state)
+        self._has = state.copy()
+
+    def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """Forces and torques at a state, and each term's energy; the virial of all of them, its diagonal, stands with
+        the first."""
+        if self._seen is None or not _same(self._seen[0], state):
+            tallies = self._tallies(state)
+            self._seen = state.copy(), self._load(state), tallies
+        _, load, tallies = self._seen
+        return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
+
+    def snapshot(self) -> State:
+        """A copy of the state that was last moved."""
+        if self._moved is None:
+            raise ValueError("this engine has moved no state yet")
+        return self._moved.copy()
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """What OpenMM itself keeps of its context: particles, random numbers, its thermostat."""
+        kept = np.frombuffer(self._mover.createCheckpoint(), np.uint8).copy() if self._has else np.zeros(0, np.uint8)
+        return {"context": kept, "heat": np.array([self._books, self._chain])}
+
+    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
+        """Go on from a state with what `memory` gave for it. Raises ValueError if they do not fit."""
+        kept = memory["context"]
+        self._has, self._stepped = None, False
+        if len(kept):
+            try:
+                self._mover.loadCheckpoint(kept.tobytes())
+            except parts.library().OpenMMException as error:
+                raise ValueError(f"OpenMM cannot go on from its checkpoint: {error}") from None
+            self._has, (self._books, self._chain) = state.copy(), memory["heat"].tolist()
+        self._moved = state
+
+    def forget(self) -> None:
+        """Declare that positions were changed from outside since the last step."""
+        self._has = None
+
+    def close(self) -> None:
+        """Let OpenMM's memory go."""
+        del self._mover, self._seer, self._integrator
+
+    def _give(self, state: State) -> None:
+        """Let OpenMM have a state, unless it has it already; its thermostat goes on."""
+        if self._has is not None and _same(self._has, state):
+            return
+        self._put(self._mover, state)
+        velocity = self._held.positions(state)[1]
+        self._mover.setVelocities(velocity * parts.NM)
+        self._books = float(state.books[HEAT]) - self._heat(state)
+        self._has = state.copy()
+
+    def _put(self, context, state: State) -> None:
+        """Give a context the positions and the cell of a state."""
+        if not state.is_finite:
+            raise NotFiniteError(state)
+        if self._held.drawn.boxed:
+            context.setPeriodicBoxVectors(*(state.cell * parts.NM))
+        context.setPositions(self._held.positions(state)[0] * parts.NM)
+
+    def _take(self, state: State) -> None:
+        """Fill a state in, in place, with what OpenMM has. Raises NotFiniteError."""
+        had = self._mover.getState(getPositions=True, getVelocities=True)
+        point = self._held.particles.point
+        position = had.getPositions(asNumpy=True)._value[point] * ANGSTROM
+        velocity = had.getVelocities(asNumpy=True)._value[point] * ANGSTROM
+        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+            raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
+        cell = had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM if self._stage.has_barostat else state.cell
+        found = self._held.bodies.state(state, position, velocity, cell)
+        if self._stage.has_barostat:  # OpenMM puts molecules back into the box whenever it changes that
+            moved = found.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(state.cell)
+            found.position[:] -= np.rint(moved) @ cell
+        for mine, its in zip(state[:5], found[:5], strict=True):
+            mine[:] = its
+
+    def _heat(self, state: State) -> float:
+        """What the thermostat has put in, up to a constant, u Å²/ps²."""
+        if self._stage.thermostat_kind == "nose_hoover" and not self._stage.has_barostat:
+            if self._stepped:
+                self._chain = self._integrator.computeHeatBathEnergy()._value
+            return -KJ_PER_MOL * self._chain
+        if self._stage.has_thermostat:  # friction, noise and moves of the box are not counted: what the energy gained
+            groups = integration_groups(self._held.drawn, self._stage)
+            energy = self._mover.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
+            return KJ_PER_MOL * energy + sum(kinetic_energies(self._system, state))
+        return 0.0
+
+    def _energy(self, group: int | set[int]) -> float:
+        """Energy of some groups where the evaluating context is, u Å²/ps²."""
+        groups = group if isinstance(group, set) else {group}
+        return KJ_PER_MOL * self._seer.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
+
+    def _load(self, state: State) -> Load:
+        """Forces and torques on bodies; OpenMM gives the forces on virtual sites to the mass points that place them."""
+        self._put(self._seer, state)
+        acting = self._groups - {parts.STEP_LENNARD_JONES, parts.STEP_COULOMB}
+        force = self._seer.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
+        position, _ = self._held.bodies.points(state)
+        return self._held.bodies.load(state, position, force[self._held.particles.point] * FORCE)
+
+    def _tallies(self, state: State) -> dict[str, Tally]:
+        """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
+        drawn, virial = self._held.drawn, self._virial(state)
+        self._put(self._seer, state)
+        found = {"lennard_jones": self._energy(parts.LENNARD_JONES)} if parts.LENNARD_JONES in self._groups else {}
+        law = drawn.coulomb
+        if isinstance(law, ScreenedCoulomb):
+            alpha = law.alpha
+            charge = drawn.charge * COULOMB_CHARGE
+            even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
+            found["coulomb_real"] = self._energy(parts.COULOMB_PAIRS) - self._within(state, alpha)
+            if law.shift:
+                found["coulomb_real"] += self._energy(parts.STEP_COULOMB)
+            found["coulomb_reciprocal"] = self._energy(parts.RECIPROCAL) - self_energy(charge, alpha) - even
+            if "coulomb_background" in drawn.system.terms:
+                found["coulomb_background"] = even
+        elif law is not None:
+            found["coulomb"] = self._energy(parts.COULOMB_PAIRS)
+        zero = np.zeros((3, 3))
+        return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
+
+    def _within(self, state: State, alpha: float) -> float:
+        """What OpenMM takes off for the pairs that do not act on one another, which the sum over waves has."""
+        drawn, total = self._held.drawn, 0.0
+        species = drawn.system.model.species
+        for k, m in enumerate(drawn.system.species):
+            count = int(((species == k) & ~drawn.frozen).sum())
+            total += count * intramolecular_energy(m.charges * COULOMB_CHARGE, m.positions_body, alpha)
+        still = drawn.frozen[drawn.system.sites.molecule] & (drawn.charge != 0)
+        if still.any():
+            position = drawn.system.site_positions(state)[still]
+            total += intramolecular_energy(drawn.charge[still] * COULOMB_CHARGE, position, alpha)
+        return total
+
+    def _virial(self, state: State) -> np.ndarray:
+        """The diagonal (3, 3) of the virial of molecules: how the energy falls as their centres move apart along an
+        axis, from energies that are continuous at the cut-off. 0 without a box."""
+        virial, strain = np.zeros((3, 3)), STRAIN[self._double]
+        if not self._held.drawn.boxed:
+            return virial
+        groups = self._groups - {parts.TAIL}
+        for k in range(3):
+            for sign in (-1, 1):
+                stretch = np.ones(3)
+                stretch[k] += sign * strain
+                self._put(self._seer, state._replace(position=state.position * stretch, cell=state.cell * stretch))
+                virial[k, k] -= self._energy(groups) * sign / (2 * strain)
+        return virial
+
+
+def _same(one: State, other: State) -> bool:
+    """Whether two states are the same to the bit, but for time and books."""
+    return all(np.array_equal(mine, its) for mine, its in zip(one[:5], other[:5], strict=True))
