@@ -15,6 +15,7 @@ class OtherEngine(Engine, Protocol):
 
     made_by: str  # its name and version
     moves: tuple[int, int]  # of the box, tried and accepted; (0, 0) where it does not tell
+    lengths_to: float  # relative error of lengths in its molecules
     counts_heat: bool  # whether it counts what its thermostat and barostat take out; if not, heat is what energy gains
 
     def rotor(self, model: Model) -> "NamedTuple | None":

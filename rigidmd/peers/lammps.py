@@ -70,6 +70,7 @@ class LammpsEngine:
     """
 
     moves: tuple[int, int] = (0, 0)
+    lengths_to = 0.0
 
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         drawn = portrait(system)
@@ -83,7 +84,7 @@ class LammpsEngine:
         if there != ranks:
             self.close()
             raise EngineError(
-                f"{ranks} ranks were asked for, and LAMMPS has {there:.0f}: the launcher is of another MPI than LAMMPS; "
+                f"{ranks} ranks were asked for, and LAMMPS has {there:.0f}: the launcher is of another MPI than it; "
                 "put its own mpirun on the PATH, or take 1 rank"
             )
         self.made_by = f"LAMMPS {date:.0f}"
