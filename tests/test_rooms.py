@@ -9,7 +9,7 @@ PACKAGE = ROOT / "rigidmd"
 
 # In this order: a room may import from those above it and from itself.
 ROOMS = [
-    ("errors", "units", "core", "compile", "validation"),
+    ("errors", "units", "core", "compile", "validation", "arguments"),
     ("mechanics",),
     ("forces",),
     ("dynamics",),

@@ -1,9 +1,10 @@
 """The command `analyse`. It prints and never computes."""
 
 import argparse
-import re
 from collections.abc import Callable
 from pathlib import Path
+
+from rigidmd.arguments import time_ps
 
 
 def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
@@ -33,14 +34,6 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     )  # fmt: skip
     analyse.add_argument("--list", action=_List, nargs=0, help="list the analyses")
     analyse.set_defaults(scene="this run", writes=True)
-
-
-def time_ps(text: str) -> float:
-    """Picoseconds in a time such as 200ps."""
-    found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
-    return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
 
 
 def _positive(text: str) -> float:
