@@ -12,6 +12,8 @@ from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
 WIDTH, HEIGHT, ACROSS, MOST_NAMED = 4.4, 3.0, 2, 20
 #: Share of the distance between places of the axis over which curves stand beside each other, so that bars do not hide.
 ASIDE = 0.12
+#: Largest over smallest value from which on the axis is logarithmic.
+DECADES = 100.0
 
 
 class Curve(NamedTuple):
@@ -63,7 +65,8 @@ def draw_sweep(path: Path, title: str, axis: Axis, panels: list[Panel]) -> None:
 
 def _draw(place, axis: Axis, panel: Panel) -> None:
     gaps = np.concatenate([np.diff(np.unique(curve.x)) for curve in panel.curves])
-    aside = ASIDE * (gaps.min() if len(gaps) else 1.0) / max(1, len(panel.curves) - 1)
+    has_bars = any(np.isfinite(curve.errors).any() for curve in panel.curves)
+    aside = has_bars * ASIDE * (gaps.min() if len(gaps) else 1.0) / max(1, len(panel.curves) - 1)
     if panel.band is not None:
         middle, error = panel.band
         place.axhline(middle, color=FAINT, lw=0.9, zorder=0)
@@ -89,10 +92,20 @@ def _draw(place, axis: Axis, panel: Panel) -> None:
         from matplotlib.ticker import MaxNLocator
 
         place.xaxis.set_major_locator(MaxNLocator(integer=True))
-    place.ticklabel_format(axis="y", useOffset=False) if not _is_tiny(panel) else None
+    if _spans_decades(panel):
+        place.set_yscale("log")
+    elif not _is_tiny(panel):
+        place.ticklabel_format(axis="y", useOffset=False)
     place.spines[["top", "right"]].set_visible(False)
     place.spines[:].set_color(INK)
     place.tick_params(labelsize=8, colors=INK)
+
+
+def _spans_decades(panel: Panel) -> bool:
+    """Whether positive values have sizes that one linear axis does not show."""
+    values = np.concatenate([curve.values for curve in panel.curves])
+    values = values[np.isfinite(values)]
+    return bool(len(values) and values.min() > 0 and values.max() > DECADES * values.min())
 
 
 def _is_tiny(panel: Panel) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
 from rigidmd.output.folder import LOCK, MARKER, SUMMARY, add_to_folder, is_empty, written_by_runs
+from rigidmd.output.sweep_names import point_name, short_keys
 
 MANIFEST, TABLE, FIGURE, SCRIPT = "sweep.json", "sweep.csv", "sweep.png", "sweep.sbatch"
 #: While it is there, points that run elsewhere stop at their next look.
@@ -67,6 +68,10 @@ class Manifest:
     def overrides(self, point: Point) -> dict[str, Any]:
         """Dotted key -> value of a point, for `Scene.read`."""
         return self.fixed | {key: value for first, value in point.values.items() for key in self.keys[first]}
+
+    def folder_of(self, values: dict[str, Any]) -> str:
+        """The name of the folder for what is found over the replicas of a combination of values."""
+        return point_name(values, short_keys(self.keys))
 
     def combinations(self) -> list[tuple[dict[str, Any], list[Point]]]:
         """The values of all keys but `seed`, each with its points: its replicas, if the seed is swept."""

@@ -129,6 +129,8 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
 
     folder, manifest = sweep.folder, sweep.manifest
     jobs, threads = shares(sweep.left, options.jobs, options.threads, sweep.is_body)
+    if options.scheduler not in (None, "local"):
+        threads = options.threads or 1  # a thread of a worker of dask for each point
     count = len(manifest.points)
     print(f"{manifest.name}: {count} points in {folder}, {count - sweep.left} of them finished before", flush=True)
     if sweep.left:

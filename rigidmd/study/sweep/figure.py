@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.output.sweep_figure import Axis, Curve, Panel, draw_sweep
 from rigidmd.output.sweep_folder import FIGURE, SEED
-from rigidmd.study.sweep.axes import in_words, short_keys, value_name
+from rigidmd.output.sweep_names import in_words, short_keys, value_name
 from rigidmd.study.sweep.table import DRIFT, MAIN, MAIN_OF_BODY, Row, Table
 
 DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"

@@ -72,9 +72,11 @@ def settle(folder: Path, point: Point) -> None:
 
 
 def _names(folder: Path) -> list[str]:
-    """Folders of the points that are there; none if the manifest cannot be read."""
+    """Folders of points and of means over replicas that are there; none if the manifest cannot be read."""
     try:
-        return [point.folder for point in read_manifest(folder).points]
+        there = read_manifest(folder)
+        means = [there.folder_of(values) for values, _ in there.combinations() if values]
+        return [*(point.folder for point in there.points), *means]
     except OutputError:
         return []
 

@@ -9,9 +9,10 @@ from typing import Any
 
 from rigidmd.errors import Faults, RigidMDError, SceneError
 from rigidmd.output.sweep_folder import SEED, Point
+from rigidmd.output.sweep_names import in_words, point_name, short_keys
 from rigidmd.run.provenance import APART, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene
-from rigidmd.study.sweep.axes import Axis, in_words, point_name, settings, short_keys
+from rigidmd.study.sweep.axes import Axis, settings
 
 
 @dataclass

@@ -19,7 +19,7 @@ JOB = """#!/bin/bash
 #SBATCH --array={array}
 #SBATCH --time={time}
 #SBATCH --cpus-per-task={threads}
-#SBATCH --output={folder}/slurm-%a.out
+#SBATCH --output="{folder}/slurm-%a.out"
 #SBATCH --open-mode=append
 cd {here} || exit 2
 {point} --point "$SLURM_ARRAY_TASK_ID" --threads {threads} --walltime {inner}

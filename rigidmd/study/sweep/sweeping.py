@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.core.toml_text import read_toml, shortened
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.output.folder import FolderLock
 from rigidmd.output.sweep_folder import (
@@ -20,7 +21,8 @@ from rigidmd.output.sweep_folder import (
     read_manifest,
     write_manifest,
 )
-from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.base import name_of_file
 from rigidmd.study.sweep.axes import Axis, axes_of, checked
 from rigidmd.study.sweep.figure import write_figure
 from rigidmd.study.sweep.plan import known_axes, planned, settle
@@ -78,8 +80,10 @@ def opened(wanted: Wanted, stack: ExitStack, step: Callable[[float], object] = l
 
     for path in wanted.trust:
         trust(path)
-    axes = wanted.axes if wanted.replicas is None else [*wanted.axes, _seeds(wanted)]
-    folder = wanted.folder or Path("runs") / f"{_first_scene(wanted.path, axes).name}-sweep"
+    data, _ = read_toml(wanted.path, SceneError)
+    axes = wanted.axes if wanted.replicas is None else _with_seeds(wanted, data)
+    named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
+    folder = wanted.folder or Path("runs") / f"{named or name_of_file(wanted.path)}-sweep"
     check_sweep_folder(folder)
     axes = checked(axes if wanted.force else known_axes(folder, axes))
     asked = points_of(wanted.path, axes, step)
@@ -107,19 +111,20 @@ def opened_again(folder: Path, stack: ExitStack) -> Opened:
     return Opened(folder, manifest, False)
 
 
-def _first_scene(path: Path, axes: Sequence[Axis]) -> Scene:
-    return Scene.read(path, {key: axis.values[0] for axis in axes for key in axis.keys})
-
-
-def _seeds(wanted: Wanted) -> Axis:
-    """The seeds of replicas."""
-    if any(SEED in axis.keys and axis.swept for axis in wanted.axes):
-        raise SceneError("--replicas", ["are seeds, and --set gives them too; leave out one of them"])
-    scene = _first_scene(wanted.path, wanted.axes)
-    if isinstance(scene, BodyScene):
+def _with_seeds(wanted: Wanted, data: Mapping[str, Any]) -> list[Axis]:
+    """The axes with the seeds of replicas, from that of the scene on."""
+    if "body" in data:
         raise SceneError("--replicas", [f"{wanted.path} is a single body, whose motion has no seed"])
-    seed: int = scene.seed  # pyright: ignore[reportAttributeAccessIssue]
-    return Axis((SEED,), tuple(range(seed, seed + (wanted.replicas or 1))))
+    own = [axis for axis in wanted.axes if SEED in axis.keys]
+    if any(axis.swept or len(axis.keys) > 1 for axis in own):
+        raise SceneError("--replicas", ["are seeds, and --set gives them too; leave out one of them"])
+    seed = own[0].values[0] if own else data.get(SEED, MolecularScene.model_fields[SEED].default)
+    if not isinstance(seed, int):
+        raise SceneError(str(wanted.path), [f"seed is {shortened(seed)}, must be a whole number"])
+    return [
+        *(axis for axis in wanted.axes if axis not in own),
+        Axis((SEED,), tuple(range(seed, seed + (wanted.replicas or 1)))),
+    ]
 
 
 def shares(count: int, jobs: int | None, threads: int | None, is_body: bool) -> tuple[int, int]:
@@ -192,7 +197,7 @@ def run_point(folder: Path, k: int, walltime: float | None, tell: Tell) -> tuple
 
 
 def runner_of(folder: Path, scheduler: str | None, jobs: int, threads: int) -> Runner:
-    """Processes here, or a cluster of dask. Raises SettingError."""
+    """Processes here, or a cluster of dask with `threads` for each point. Raises SettingError."""
     if scheduler is None:
         return Pool(jobs, threads)
     from rigidmd.study.sweep.cluster import Cluster

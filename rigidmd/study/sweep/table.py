@@ -19,7 +19,7 @@ from rigidmd.measure.samples import COLUMNS
 from rigidmd.measure.summary import mean
 from rigidmd.output.record import Record, read_record
 from rigidmd.output.sweep_folder import FINISHED, TABLE, Manifest
-from rigidmd.study.sweep.axes import short_keys, value_name
+from rigidmd.output.sweep_names import short_keys, value_name
 
 if TYPE_CHECKING:
     import pandas
@@ -30,8 +30,7 @@ POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per 
 #: Columns that a person reads, where there are any: of molecules, of a body.
 MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
 MAIN_OF_BODY = (
-    "theta lowest (rad)", "theta highest (rad)", "energy end (J)", "energy_error largest (1)",
-    "L_size_error largest (1)",
+    "theta lowest (rad)", "theta highest (rad)", "energy end (J)", "energy_error largest", "L_size_error largest",
 )  # fmt: skip
 #: Columns of a body that the table leaves out: rotation in its other forms.
 NOT_OF_BODY = ("t", "q", "orthogonality_error")
@@ -56,6 +55,8 @@ class Row:
         if len(found) < 2:
             return found[0] if found else (nan, None)
         values = np.array([value for value, _ in found])
+        if np.ptp(values) == 0:  # where rounding would give it an error
+            return float(values[0]), 0.0
         return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
@@ -164,6 +165,8 @@ def _of_molecules(record: Record) -> dict[str, Measured]:
         average, error = mean(values[own])
         if average is None:
             continue
+        if np.ptp(values[own]) == 0:
+            average, error = float(values[own][0]), 0.0
         found[COLUMNS[name].header] = average, error
         if name == "potential":
             n = len(record.molecules.model.species)
@@ -185,7 +188,7 @@ def _of_body(record: Record) -> dict[str, Measured]:
             continue
         unit = BODY_COLUMNS[name].unit if name in BODY_COLUMNS else "1"
         if name.endswith("_error"):
-            found[f"{name} largest ({unit})"] = float(np.abs(values).max()), None
+            found[f"{name} largest"] = float(np.abs(values).max()), None
             continue
         figures = {"mean": values.mean(), "lowest": values.min(), "highest": values.max(), "end": values[-1]}
         found |= {f"{name} {word} ({unit})": (float(value), None) for word, value in figures.items()}
