@@ -19,6 +19,8 @@ FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)
 #: Of the manifest.
 SCHEMA = 1
 WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED = "waiting", "running", "finished", "interrupted", "failed"
+#: What MDAnalysis writes beside a trajectory .NAME that it reads.
+OFFSETS = ("_offsets.npz", "_offsets.lock")
 #: The key whose values make replicas.
 SEED = "seed"
 
@@ -145,7 +147,8 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
             continue
         try:
             for name in written_by_runs(inner):
-                (inner / name).unlink(missing_ok=True)
+                for own in (name, *(f".{name}{ending}" for ending in OFFSETS)):
+                    (inner / own).unlink(missing_ok=True)
             (inner / MARKER).unlink(missing_ok=True)
             if inner != folder:
                 (inner / LOCK).unlink(missing_ok=True)

@@ -39,7 +39,8 @@ def points_of(path: str | Path, axes: Sequence[Axis], step: Callable[[float], ob
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     short = short_keys(keys)
     every = settings(axes)
-    digest, faults, checked = Digests(), _Told(str(path)), set()
+    digest, faults = Digests(), _Told(str(path))
+    checked: dict[str, RigidMDError | None] = {}  # values but for the seed -> what is wrong; replicas are built alike
     asked: Asked | None = None
     for k, values in enumerate(every):
         step(k / len(every))
@@ -48,9 +49,10 @@ def points_of(path: str | Path, axes: Sequence[Axis], step: Callable[[float], ob
         try:
             scene = Scene.read(path, overrides)
             kind = json.dumps({key: value for key, value in values.items() if key != SEED}, default=str)
-            if kind not in checked:  # replicas are built alike
-                checked.add(kind)
-                _build(scene)
+            if kind not in checked:
+                checked[kind] = _fault_of(scene)
+            if (wrong := checked[kind]) is not None:
+                raise wrong
         except Faults as error:
             faults.add(
                 told, [f"{error.where}: {fault}" if error.where != str(path) else fault for fault in error.faults]
@@ -98,8 +100,16 @@ class Digests:
         return hashlib.sha256(told.encode()).hexdigest()
 
 
+def _fault_of(scene: MolecularScene | BodyScene) -> RigidMDError | None:
+    """What only the system of a scene shows to be wrong."""
+    try:
+        _build(scene)
+    except RigidMDError as error:
+        return error
+    return None
+
+
 def _build(scene: MolecularScene | BodyScene) -> None:
-    """Find what only the system of a scene shows. Raises RigidMDError."""
     if isinstance(scene, BodyScene):
         from rigidmd.assemble.body import build_body
 
