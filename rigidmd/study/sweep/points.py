@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,7 @@ def points_of(path: str | Path, axes: Sequence[Axis], step: Callable[[float], ob
 def common_part(scene: Scene, apart: Sequence[str], digest: "Digests") -> tuple[dict[str, Any], dict[str, str]]:
     """Keys of a scene and digests of its inputs, without the swept keys."""
     keys = keys_of(plain(scene), (*APART, *apart, *scene.inputs, *scene.held))
+    keys = {key: str(value) if value in (inf, -inf) else value for key, value in keys.items()}  # JSON has no infinity
     inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in apart}
     return keys, inputs
 
