@@ -431,7 +431,7 @@ def test_one_point_of_a_kind_compiles_before_the_others(argon, tmp_path):
 def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
     """3 temperatures, 8 seeds, two workers; parent and workers are killed in the middle."""
     arguments = [str(argon), "--set", "start.temperature_K=90,100,110", "--set", "seed=1..8", "--set",
-                 "stages.0.duration_ps=200", "--jobs", "2"]  # fmt: skip
+                 "stages.0.duration_ps=100", "--jobs", "2"]  # fmt: skip
     command = [sys.executable, "-m", "rigidmd", "sweep", *arguments, "-o", str(tmp_path / "parts")]
     parent = subprocess.Popen(command, start_new_session=True)
     while sum(state == "finished" for state in states_or_none(tmp_path / "parts").values()) < 6:
@@ -508,8 +508,9 @@ def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
     assert "pip install 'rigidmd[dask]'" in capsys.readouterr().err
 
 
-def test_a_script_for_slurm(argon, finished, tmp_path, monkeypatch, capsys):
-    """The array is run by a stub of sbatch, the tasks that run out of time submit themselves again."""
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """A working directory, and a stub of sbatch that runs an array at once."""
     (tmp_path / "bin").mkdir()
     stub = f"""#!{sys.executable}
 import os, re, subprocess, sys
@@ -528,6 +529,9 @@ for part in spec.split(","):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("PYTHONPATH", str(Path(rigidmd.__file__).parents[1]))
+
+
+def test_a_script_for_slurm(argon, finished, slurm, capsys):
     arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "start.temperature_K=120", "-o", "my sweep"]
     assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:10:00"]) == 0
     script = Path("my sweep/sweep.sbatch")
@@ -546,16 +550,9 @@ for part in spec.split(","):
 
 
 @pytest.mark.slow
-def test_slurm_jobs_submit_themselves_again(argon, tmp_path, monkeypatch):
-    (tmp_path / "bin").mkdir()
-    stub = '#!/bin/bash\necho job >> jobs\nfor k in 0 1; do SLURM_ARRAY_TASK_ID=$k; for a; do case $a in --array=*) SLURM_ARRAY_TASK_ID=${a#--array=};; esac; done; export SLURM_ARRAY_TASK_ID; bash "${@: -1}"; [ $# -gt 1 ] && break; done\n'
-    for name, text in (("sbatch", stub), ("rigidmd", f'#!/bin/bash\nexec {sys.executable} -m rigidmd "$@"\n')):
-        (tmp_path / "bin" / name).write_text(text)
-        (tmp_path / "bin" / name).chmod(0o755)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", str(Path(rigidmd.__file__).parents[1]))
-    arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=2000", "-o", "sweep"]
+def test_slurm_jobs_submit_themselves_again(argon, slurm):
+    """Jobs whose time is up, until their points have finished."""
+    arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=400", "-o", "sweep"]
     assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:00:08"]) == 0
     subprocess.run(["sbatch", "sweep/sweep.sbatch"], check=True)
     assert len(Path("jobs").read_text().splitlines()) > 2

@@ -11,7 +11,7 @@ from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
 #: Inches of a panel; panels beside each other; curves in the legend.
 WIDTH, HEIGHT, ACROSS, MOST_NAMED = 4.4, 3.0, 2, 20
 #: Share of the distance between places of the axis over which curves stand beside each other, so that bars do not hide.
-ASIDE = 0.12
+ASIDE = 0.06
 #: Largest over smallest value from which on the axis is logarithmic.
 DECADES = 100.0
 

@@ -32,6 +32,7 @@ def write_figure(table: Table, name: str) -> Path | None:
     counts = sorted({len(row.runs) for row in rows})
     runs = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     over = f"means over {runs} runs, with" if counts[-1] > 1 else "with"
+    over = over if table.keys else f"each run, and {over}"
     draw_sweep(path, f"{name}: {over} one standard error" if _has_errors(rows, shown) else name, axis, panels)
     return path
 

@@ -32,6 +32,8 @@ MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
 MAIN_OF_BODY = (
     "theta lowest (rad)", "theta highest (rad)", "energy end (J)", "energy_error largest", "L_size_error largest",
 )  # fmt: skip
+#: What they are called where there is little room.
+SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}
 #: Columns of a body that the table leaves out: rotation in its other forms.
 NOT_OF_BODY = ("t", "q", "orthogonality_error")
 
@@ -209,7 +211,7 @@ def table_text(table: Table) -> str:
     """The main columns as a person reads them."""
     short = short_keys(table.keys)
     shown = [column for column in (*MAIN, *MAIN_OF_BODY) if column in table.columns]
-    lines = [[*short.values(), "runs", *shown]]
+    lines = [[*short.values(), "runs", *(SHORT.get(column, column) for column in shown)]]
     for row in table.rows:
         cells = [value_name(row.values[key]) for key in table.keys] + [str(len(row.runs))]
         lines.append([*cells, *(_told(row, column) for column in shown)])
