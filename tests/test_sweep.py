@@ -402,7 +402,7 @@ def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
     manifest = long_sweep(argon, tmp_path / "sweep")
     point = manifest.points[0]
     point.scene_sha256 = "other"
-    ended = worker.run_task(sweeping.task_of(tmp_path / "sweep", manifest, point, None))
+    ended = worker.run_task(sweeping.task_of(tmp_path / "sweep", manifest, point))
     assert ended["state"] == "failed"
     assert "has changed since the sweep began" in ended["message"]
 
@@ -644,3 +644,17 @@ def test_a_manifest_names_no_folder_outside(copied, argon, capsys):
         (copied / "sweep.json").write_text(json.dumps(told))
         assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
         assert "names of folders that a sweep does not give" in capsys.readouterr().err
+
+
+def test_a_manifest_of_a_stranger_is_held_against_what_it_should_be(copied, argon, capsys):
+    whole = json.loads((copied / "sweep.json").read_text())
+    for change in (
+        {"keys": []}, {"keys": {"seed": ["other"], "start.temperature_K": ["start.temperature_K"]}}, {"fixed": "x"},
+        {"common": 3}, {"name": None}, {"points": 3}, {"points": [3]}, {"trust": ["evil.py"]},
+        {"points": [whole["points"][0] | {"state": "done"}]}, {"points": [whole["points"][0] | {"values": {}}]},
+        {"points": [whole["points"][0] | {"seconds": "long"}]}, {"points": whole["points"][:1] * 2},
+    ):  # fmt: skip
+        (copied / "sweep.json").write_text(json.dumps(whole | change))
+        for command in (["sweep", str(argon), *GRID, "-o"], ["analyse"]):
+            assert cli.main([*command, str(copied)]) == 2, change
+            assert "is no manifest of a sweep" in capsys.readouterr().err, change

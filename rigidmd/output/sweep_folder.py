@@ -51,7 +51,6 @@ class Manifest:
     """What a sweep is made of.
 
     scene : the file of the scene
-    trust : Python files that it may run
     keys : swept key -> the keys that are set together with it, itself first
     fixed : key -> value for all points
     common : dotted key -> value of the scene, without the swept keys
@@ -60,7 +59,6 @@ class Manifest:
 
     name: str
     scene: str
-    trust: list[str]
     keys: dict[str, list[str]]
     fixed: dict[str, Any]
     common: dict[str, Any]
@@ -106,6 +104,8 @@ def read_manifest(folder: Path) -> Manifest:
         points = [Point(**point) for point in told.pop("points")]
         found = Manifest(**told, points=points)
         names = [point.folder for point in points]
+        if not _is_whole(found):
+            raise ValueError("values of other types")
         if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
             raise ValueError("names of folders that a sweep does not give")
         if any(point.values.keys() != found.keys.keys() for point in points):
@@ -115,6 +115,22 @@ def read_manifest(folder: Path) -> Manifest:
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise OutputError(f"{path} is no manifest of a sweep: {error}; --force begins the sweep anew") from None
     return found
+
+
+def _is_whole(found: Manifest) -> bool:
+    """Whether all that a manifest tells has the types that it should have."""
+    tables = (found.keys, found.fixed, found.common, found.inputs, *(point.values for point in found.points))
+    words = [found.name, found.scene, *(word for point in found.points for word in (point.folder, point.scene_sha256))]
+    perhaps = [word for point in found.points for word in (point.ran_sha256, point.message)]
+    return (
+        all(isinstance(table, dict) for table in tables)
+        and all(isinstance(word, str) for word in words)
+        and all(word is None or isinstance(word, str) for word in perhaps)
+        and all(point.state in (WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED) for point in found.points)
+        and all(isinstance(point.seconds, int | float) for point in found.points)
+        and all(isinstance(together, list) and key in together for key, together in found.keys.items())
+        and all(isinstance(key, str) for together in found.keys.values() for key in together)
+    )
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -143,7 +159,7 @@ def make_sweep_folder(folder: Path) -> None:
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
     """Remove what a sweep wrote: its own files, and those of the runs in folders of these names. Raises OutputError."""
     for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
-        if not inner.is_dir():
+        if not inner.is_dir() or (inner.is_symlink() and inner != folder):
             continue
         try:
             for name in written_by_runs(inner):

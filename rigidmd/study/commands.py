@@ -143,7 +143,7 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
                 f"  on the cluster {options.scheduler}, {threads} thread{'s' if threads > 1 else ''} each", flush=True
             )
         with progress_of(sweep.left, "points", True) as advanced:
-            outcome = run_points(folder, manifest, runner, options.walltime, _Listener(advanced).hear)
+            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(advanced).hear)
     else:
         from rigidmd.study.sweep.running import Outcome
 
@@ -224,7 +224,9 @@ def _to_slurm(options: argparse.Namespace, sweep: "Opened") -> int:
     if not sweep.left:
         print(f"all {len(sweep.manifest.points)} points in {sweep.folder} have finished")
         return _collect(sweep)
-    path, count = write_script(sweep.folder, sweep.manifest, options.walltime, options.threads or 1, OUT_OF_TIME)
+    path, count = write_script(
+        sweep.folder, sweep.manifest, options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
+    )
     print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")
     folder = shlex.quote(str(sweep.folder))
     print(f"  when all have ended: rigidmd sweep {shlex.quote(options.scene)} -o {folder} --collect")
@@ -245,7 +247,9 @@ def _one_point(options: argparse.Namespace) -> int:
         elif kind == "said":
             say(value)
 
-    name, ended = run_point(Path(options.output), options.point, options.walltime, tell)
+    name, ended = run_point(
+        Path(options.output), options.point, Path(options.scene), options.walltime, options.trust, tell
+    )
     print(f"{name}: {ended['state']}, {ended['seconds']:.3g} s")
     if ended["message"]:
         print(f"rigidmd: {name}: {visible(ended['message'])}", file=sys.stderr)

@@ -33,16 +33,15 @@ def known_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
     return sorted(known, key=lambda axis: order.index(axis.keys[0]) if axis.keys[0] in order else len(order))
 
 
-def planned(folder: Path, asked: Asked, trust: list[str], force: bool) -> Manifest:
+def planned(folder: Path, asked: Asked, force: bool) -> Manifest:
     """The manifest of a folder with what is asked for, each point in the state that its folder tells.
 
     A sweep that is there keeps its points, and gets those that are new. force : remove it and begin anew. Raises
     OutputError, also if the scene is another one.
     """
     scene = str(Path(asked.source).absolute())
-    trust = [str(Path(path).absolute()) for path in trust]
     fresh = Manifest(
-        asked.name, scene, trust, asked.keys, asked.fixed, asked.common, asked.inputs, list(asked.points)
+        asked.name, scene, asked.keys, asked.fixed, asked.common, asked.inputs, list(asked.points)
     )  # fmt: skip
     if not is_sweep(folder):
         return fresh

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -30,11 +30,8 @@ class Asked:
     is_body: bool = False
 
 
-def points_of(path: str | Path, axes: Sequence[Axis], step: Callable[[float], object] = lambda share: None) -> Asked:
-    """All points of a sweep over a scene file, checked. Raises SceneError with all faults of all points.
-
-    step : called with the share that is done
-    """
+def points_of(path: str | Path, axes: Sequence[Axis]) -> Asked:
+    """All points of a sweep over a scene file, checked. Raises SceneError with all faults of all points."""
     swept = [axis for axis in axes if axis.swept]
     keys = {axis.keys[0]: list(axis.keys) for axis in swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
@@ -43,8 +40,7 @@ def points_of(path: str | Path, axes: Sequence[Axis], step: Callable[[float], ob
     digest, faults = Digests(), _Told(str(path))
     checked: dict[str, RigidMDError | None] = {}  # values but for the seed -> what is wrong; replicas are built alike
     asked: Asked | None = None
-    for k, values in enumerate(every):
-        step(k / len(every))
+    for values in every:
         overrides = fixed | {key: value for first, value in values.items() for key in keys[first]}
         told = in_words(values, short)
         try:

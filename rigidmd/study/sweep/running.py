@@ -4,7 +4,7 @@ import contextlib
 import signal
 import time as clock
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -70,12 +70,16 @@ def run_points(
     manifest: Manifest,
     runner: Runner,
     walltime: float | None = None,
+    trust: Sequence[str] = (),
     hear: Callable[[str, str, Any], object] = lambda name, kind, value: None,
 ) -> Outcome:
     """Run what is not finished. A point waits while one that compiles the same code has not begun.
 
-    walltime : seconds after which all has to have ended. hear : told (point, kind, value) of every `Message`. Raises
-    OutputError if the manifest cannot be written.
+    walltime : seconds after which all has to have ended
+    trust : Python files that the scene may run
+    hear : told (point, kind, value) of every `Message`
+
+    Raises OutputError if the manifest cannot be written.
     """
     began, found = clock.monotonic(), Outcome()
     by_name = {point.folder: point for point in manifest.points}
@@ -99,7 +103,7 @@ def run_points(
             late = ends_at is not None and clock.time() + least > ends_at
             while found.signal is None and not late and runner.free and (point := waiting.next()):
                 busy.add(point.folder)
-                runner.give(task_of(folder, manifest, point, ends_at))
+                runner.give(task_of(folder, manifest, point, ends_at, trust))
             if not busy:
                 break
             if found.signal is not None:
@@ -142,14 +146,16 @@ def _note(folder: Path, point: Point, message: Message, found: Outcome) -> None:
         (found.finished if point.state == FINISHED else found.failed).append(point.folder)
 
 
-def task_of(folder: Path, manifest: Manifest, point: Point, ends_at: float | None) -> Task:
+def task_of(
+    folder: Path, manifest: Manifest, point: Point, ends_at: float | None = None, trust: Sequence[str] = ()
+) -> Task:
     """A point for a worker."""
     return {
         "folder": str(folder.absolute()),
         "name": point.folder,
         "scene": manifest.scene,
         "overrides": manifest.overrides(point),
-        "trust": manifest.trust,
+        "trust": [str(Path(path).absolute()) for path in trust],
         "sha256": point.scene_sha256,
         "ran_sha256": point.ran_sha256,
         "ends_at": ends_at,

@@ -29,7 +29,9 @@ exit $code
 """
 
 
-def write_script(folder: Path, manifest: Manifest, walltime: float, threads: int, again: int) -> tuple[Path, int]:
+def write_script(
+    folder: Path, manifest: Manifest, walltime: float, threads: int, trust: Sequence[str], again: int
+) -> tuple[Path, int]:
     """Write sweep.sbatch for the points that have not finished. Returns it and their number.
 
     walltime : of a job, s; again : exit code of a run whose time was up. Raises OutputError.
@@ -37,8 +39,8 @@ def write_script(folder: Path, manifest: Manifest, walltime: float, threads: int
     path = folder.absolute() / SCRIPT
     left = [k for k, point in enumerate(manifest.points) if point.state != FINISHED]
     words = ["rigidmd", "sweep", manifest.scene, "-o", str(folder.absolute())]
-    for trusted in manifest.trust:
-        words += ["--trust", trusted]
+    for trusted in trust:
+        words += ["--trust", str(Path(trusted).absolute())]
     text = JOB.format(
         count=len(left),
         name=manifest.name,

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,11 +70,11 @@ class Opened(NamedTuple):
         return sum(point.state != FINISHED for point in self.manifest.points)
 
 
-def opened(wanted: Wanted, stack: ExitStack, step: Callable[[float], object] = lambda share: None) -> Opened:
+def opened(wanted: Wanted, stack: ExitStack) -> Opened:
     """Check all points, hold them against the folder, and write the manifest. No other sweep runs there until the
     stack ends.
 
-    step : called with the share that is checked. Raises SceneError, OutputError.
+    Raises SceneError, OutputError.
     """
     from rigidmd.own.trust import trust
 
@@ -86,11 +86,11 @@ def opened(wanted: Wanted, stack: ExitStack, step: Callable[[float], object] = l
     folder = wanted.folder or Path("runs") / f"{named or name_of_file(wanted.path)}-sweep"
     check_sweep_folder(folder)
     axes = checked(axes if wanted.force else known_axes(folder, axes))
-    asked = points_of(wanted.path, axes, step)
+    asked = points_of(wanted.path, axes)
     lock = FolderLock(folder)
     stack.callback(lock.release)
     lock.take()
-    manifest = planned(folder, asked, list(wanted.trust), wanted.force)
+    manifest = planned(folder, asked, wanted.force)
     make_sweep_folder(folder)
     lock.take()
     write_manifest(folder, manifest)
@@ -163,7 +163,9 @@ def sweep(
     with ExitStack() as stack:
         there = opened(wanted, stack)
         manifest = there.manifest
-        outcome = run_points(there.folder, manifest, Pool(*shares(there.left, jobs, threads, there.is_body)))
+        outcome = run_points(
+            there.folder, manifest, Pool(*shares(there.left, jobs, threads, there.is_body)), trust=trust
+        )
         if outcome.signal is not None:
             raise KeyboardInterrupt
         table, _ = collected(there.folder, manifest)
@@ -184,16 +186,21 @@ def collected(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
     return table, [path for path in files if path is not None]
 
 
-def run_point(folder: Path, k: int, walltime: float | None, tell: Tell) -> tuple[str, Ended]:
-    """Run one point of a sweep that is there, in this process: its name, and how it ended. Raises OutputError."""
+def run_point(
+    folder: Path, k: int, scene: Path, walltime: float | None, trust: Sequence[str], tell: Tell
+) -> tuple[str, Ended]:
+    """Run one point of a sweep that is there, in this process: its name, and how it ended. Raises OutputError.
+
+    scene : its file; that of the manifest is not believed
+    """
     if not is_sweep(folder):
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
     manifest = read_manifest(folder)
     if k >= len(manifest.points):
         raise OutputError(f"{folder} has points 0 to {len(manifest.points) - 1}, not {k}")
-    point = manifest.points[k]
+    point, manifest.scene = manifest.points[k], str(scene.absolute())
     ends_at = None if walltime is None else time.time() + walltime
-    return point.folder, run_task(task_of(folder, manifest, point, ends_at), tell, progress=True)
+    return point.folder, run_task(task_of(folder, manifest, point, ends_at, trust), tell, progress=True)
 
 
 def runner_of(folder: Path, scheduler: str | None, jobs: int, threads: int) -> Runner:
