@@ -576,6 +576,7 @@ def test_words_for_slurm():
         ([], "no key has several values"),
         (["--set", "seed=3"], "no key has several values"),
         (["--set", "seed=1..3", "--set", "seed=5,6"], "seed is set 2 times"),
+        (["--set", "seed=4..1", "--set", "a=1,,2"], "2 faults"),
         (["--set", "seed=1,1"], "seed: 1 is there 2 times"),
         (["--set", "start.temperature_K=90,90.0"], "90 is there 2 times"),
         (["--set", "sed=1..3"], "did you mean seed?"),
@@ -621,6 +622,7 @@ def test_folders_that_are_none(argon, tmp_path, copied, capsys):
     assert cli.main(["sweep", str(argon), "-o", str(copied), "--point", "4"]) == 2
     assert "has points 0 to 3, not 4" in capsys.readouterr().err
     assert cli.main(["report", str(copied)]) == 2
+    assert "is the folder of a sweep; name one of the runs in it" in capsys.readouterr().err
     for text in (
         "",
         "{}",

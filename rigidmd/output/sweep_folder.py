@@ -9,10 +9,10 @@ from typing import Any
 
 from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
-from rigidmd.output.folder import LOCK, MARKER, SUMMARY, add_to_folder, is_empty, written_by_runs
+from rigidmd.output.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_empty, written_by_runs
 from rigidmd.output.sweep_names import point_name, short_keys
 
-MANIFEST, TABLE, FIGURE, SCRIPT = "sweep.json", "sweep.csv", "sweep.png", "sweep.sbatch"
+MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
 #: While it is there, points that run elsewhere stop at their next look.
 STOP = "stop"
 FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)

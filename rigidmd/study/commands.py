@@ -82,7 +82,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from rigidmd.errors import OutputError
-    from rigidmd.study.sweep.axes import parse_axis
+    from rigidmd.study.sweep.axes import parse_axes
     from rigidmd.study.sweep.sweeping import Wanted, opened, opened_again
 
     _check(options)
@@ -94,7 +94,7 @@ def _sweep(options: argparse.Namespace) -> int:
             if folder is None:
                 raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
             return _collect(opened_again(folder, stack))
-        axes = [parse_axis(text) for text in options.sets]
+        axes = parse_axes(options.sets)
         wanted = Wanted(Path(options.scene), axes, folder, options.replicas, options.trust, options.force)
         sweep = opened(wanted, stack)
         if options.collect:
@@ -156,7 +156,7 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
     )
     for point in manifest.points:
         if point.folder in outcome.failed:
-            print(f"  failed: {point.folder}: {point.message}")
+            print(f"  failed: {point.folder}: {visible(point.message or '')}")
     if outcome.failed or outcome.left:
         print(f"  the same command goes on with what is left, and repeats what failed: {again}")
     if outcome.signal is not None:
@@ -172,7 +172,7 @@ class _Listener:
     def __init__(self, advanced: Callable[[float], object]):
         self._advanced = advanced
         self._shares: dict[str, float] = {}
-        self._warned: set[str] = set()
+        self._told: set[str] = set()
 
     def hear(self, name: str, kind: str, value: Any) -> None:
         """A message of a point."""
@@ -187,8 +187,11 @@ class _Listener:
             why = value if kind == "died" else value["message"] if ended else None
             if why:
                 tqdm.write(f"  {name}: {visible(why)}", file=sys.stderr)
-        elif kind == "warned" and value not in self._warned:
-            self._warned.add(value)
+        elif kind == "said" and value.startswith("compiling") and value not in self._told:
+            self._told.add(value)
+            tqdm.write(f"  {name}: {value} ...", file=sys.stderr)
+        elif kind == "warned" and value not in self._told:
+            self._told.add(value)
             tqdm.write(f"rigidmd: warning: {name}: {visible(value)}", file=sys.stderr)
 
 

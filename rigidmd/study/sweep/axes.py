@@ -47,6 +47,19 @@ def parse_axis(text: str) -> Axis:
     return Axis(keys, tuple(values))
 
 
+def parse_axes(texts: Sequence[str]) -> list[Axis]:
+    """`parse_axis` of each. Raises SceneError with all faults."""
+    found, faults = [], []
+    for text in texts:
+        try:
+            found.append(parse_axis(text))
+        except SceneError as error:
+            faults += error.faults
+    if faults:
+        raise SceneError(WHERE, faults)
+    return found
+
+
 def _span(piece: str, text: str) -> range | None:
     """The whole numbers of 1..8, both ends included; None of another text. Raises SceneError."""
     if not (ends := re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*\.\.\s*(-?\d+(?:\.\d+)?)", piece)):
