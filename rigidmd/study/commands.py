@@ -163,7 +163,7 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
         return BY_SIGNAL + outcome.signal
     if outcome.out_of_time:
         return OUT_OF_TIME
-    return FAILED if outcome.failed else 0
+    return FAILED if outcome.failed or outcome.left else 0
 
 
 class _Listener:

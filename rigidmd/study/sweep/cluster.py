@@ -90,7 +90,7 @@ class Cluster:
 
     def messages(self, seconds: float) -> list[tuple[str, Message]]:
         """(name of the point, message) of those that come within so many seconds."""
-        found = []
+        found: list[tuple[str, Message]] = []
         try:
             found.append(self._heard.get(timeout=seconds))
             while True:
@@ -100,7 +100,7 @@ class Cluster:
         for name, message in found:
             if message.kind in ("ended", "died"):
                 self._futures.pop(name, None)
-        return [(name, message) for name, message in found]
+        return found
 
     def stop(self) -> None:
         """Let all runs end with checkpoints: a file tells them."""

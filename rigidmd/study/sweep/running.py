@@ -109,6 +109,8 @@ def run_points(
             if found.signal is not None:
                 runner.kill() if pressed > 1 else runner.stop()
             for name, message in runner.messages(TICK):
+                if name not in busy:  # a cluster may deliver late
+                    continue
                 if message.kind != "died" or found.signal is None:  # else it was stopped before its first step
                     hear(name, *message)
                 point = by_name[name]

@@ -11,7 +11,6 @@ from rigidmd.core.toml_text import read_toml, shortened
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.output.folder import FolderLock
 from rigidmd.output.sweep_folder import (
-    FAILED,
     FINISHED,
     SEED,
     Manifest,
@@ -169,11 +168,11 @@ def sweep(
         if outcome.signal is not None:
             raise KeyboardInterrupt
         table, _ = collected(there.folder, manifest)
-    if outcome.failed:
-        first = next(point for point in manifest.points if point.state == FAILED)
-        raise SimulationError(
-            f"{len(outcome.failed)} of {len(manifest.points)} points failed; {first.folder}: {first.message}"
-        )
+    for point in manifest.points:
+        if point.state != FINISHED:
+            count = len(outcome.failed) + len(outcome.left)
+            why = point.message or "it was stopped"
+            raise SimulationError(f"{count} of {len(manifest.points)} points failed; {point.folder}: {why}")
     return table
 
 
