@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rigidmd.own.trust import trust
     from rigidmd.run import Every, Moment, Observer, Results, Simulation
     from rigidmd.scene import BodyScene, MolecularScene, Scene
+    from rigidmd.study.sweep.sweeping import sweep
 
     __version__: str
 
@@ -38,6 +39,7 @@ __all__ = [
     "compiled_force",
     "compiled_thermostat",
     "pair_law",
+    "sweep",
     "trust",
 ]
 
@@ -47,7 +49,13 @@ _HOMES = (
     | dict.fromkeys(("Every", "Moment", "Observer", "Results", "Simulation"), "run")
     | dict.fromkeys(("compiled_force", "compiled_thermostat"), "dynamics.own")
     | dict.fromkeys(("PairLaw", "pair_law"), "own.pair_law")
-    | {"Force": "own.force", "LivePlot": "looking.live", "analysis": "analyse.registry", "trust": "own.trust"}
+    | {
+        "Force": "own.force",
+        "LivePlot": "looking.live",
+        "analysis": "analyse.registry",
+        "sweep": "study.sweep.sweeping",
+        "trust": "own.trust",
+    }
 )
 
 

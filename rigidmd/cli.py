@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import re
 import shlex
 import sys
 import warnings
@@ -12,18 +11,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigidmd.analyse import commands as analysing
-from rigidmd.analyse.commands import time_ps
+from rigidmd.arguments import (
+    BAD_INPUT,
+    BY_SIGNAL,
+    FAILED,
+    INTERRUPTED,
+    OUT_OF_TIME,
+    add_trust,
+    say,
+    seconds,
+    time_ps,
+    warn,
+)
 from rigidmd.looking import commands as looking
+from rigidmd.study import commands as studying
 from rigidmd.study import handing_over
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
-
-#: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
-BY_SIGNAL = 128
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
-#: Exit code of a run that stopped because its wall time was up: run it again with --resume.
-OUT_OF_TIME = 75
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -48,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
 
     def show(message, category, *where, **more):
-        _warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
+        warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
 
     try:
         with warnings.catch_warnings(), checked_streams(lasting=options.writes):
@@ -128,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
         "rigidmd resume runs/water --until 200ps",
     )
     resume.add_argument("folder", metavar="DIR", help="folder of the run")
-    _trusting(resume)
+    add_trust(resume)
     _going_on(resume)
     resume.set_defaults(overrides=[], force=False, resume=True)
 
@@ -221,6 +226,7 @@ def _parser() -> argparse.ArgumentParser:
     stability.set_defaults(scene="stability", writes=True)
 
     analysing.add_commands(partial(_command, commands))
+    studying.add_commands(partial(_command, commands))
     looking.add_commands(partial(_command, commands))
 
     models = _command(
@@ -292,18 +298,7 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         help="override a key of the scene by its dotted path (list entries count from 0); KEY= without a value "
         "removes the key; may be repeated",
     )
-    _trusting(parser)
-
-
-def _trusting(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--trust",
-        action="append",
-        default=[],
-        metavar="FILE.py",
-        help="let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and can do whatever "
-        "you can; may be repeated",
-    )
+    add_trust(parser)
 
 
 def _engines(parser: argparse.ArgumentParser) -> None:
@@ -319,22 +314,13 @@ def _going_on(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(writes=True)
     parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
     parser.add_argument(
-        "--walltime", type=_walltime, metavar="H:MM:SS",
+        "--walltime", type=seconds, metavar="H:MM:SS",
         help="stop shortly before this time is up, with a checkpoint and exit code 75",
     )  # fmt: skip
     parser.add_argument(
         "--until", type=time_ps, metavar="TIME",
         help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run",
     )  # fmt: skip
-
-
-def _walltime(text: str) -> float:
-    """Seconds in H:MM:SS, MM:SS or D-H:MM:SS."""
-    found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
-    days, hours, minutes, seconds = (float(part or 0) for part in found.groups())
-    return 86400 * days + 3600 * hours + 60 * minutes + seconds
 
 
 def _read_scene(options: argparse.Namespace, **more):
@@ -417,7 +403,7 @@ def _run(options: argparse.Namespace) -> int:
     from rigidmd.run import Simulation
 
     going_on = {"resume": options.resume, "walltime": options.walltime}
-    simulation = Simulation(scene, folder, options.force, say=_say, warn=_warn, **going_on)
+    simulation = Simulation(scene, folder, options.force, say=say, warn=warn, **going_on)
     print(simulation.introduction(), flush=True)
     results = simulation.run(progress=True)
     print(simulation.conclusion(results))
@@ -448,17 +434,6 @@ def _compare(options: argparse.Namespace) -> int:
     found = compare(Path(options.first), Path(options.second))
     print(json.dumps(found.told(), indent=2) if options.json else in_words(found))
     return 0 if found.same else FAILED
-
-
-def _say(sentence: str) -> None:
-    """Announce something that takes a moment."""
-    print(f"  {sentence} ...", file=sys.stderr, flush=True)
-
-
-def _warn(sentence: str) -> None:
-    from rigidmd.errors import visible
-
-    print(f"rigidmd: warning: {visible(sentence)}", file=sys.stderr)
 
 
 def _energy(options: argparse.Namespace) -> int:
@@ -534,7 +509,7 @@ def _check(options: argparse.Namespace) -> int:
 
         refuse(build(scene))
     for warning in [] if isinstance(scene, BodyScene) else long_steps(scene):
-        _warn(warning)
+        warn(warning)
     return 0
 
 
@@ -558,7 +533,7 @@ def _precision(options: argparse.Namespace) -> int:
         return _averages(options, scene, folder, integrators, timesteps)
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it goes with --averages that has no PS of its own"])
-    _say("compiling and running the reference")
+    say("compiling and running the reference")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         found = precision(
             scene,
@@ -587,7 +562,7 @@ def _averages(
     from rigidmd.study.averages import SAMPLE_PS, averages
 
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
-    _say("compiling, and running what comes before the last stage")
+    say("compiling, and running what comes before the last stage")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         found = averages(scene, methods, timesteps, sample, lambda share: bar.update(share - bar.n))
     print(table_text(found), "", *advice(found), sep="\n")
@@ -671,7 +646,7 @@ def _own_model(options: argparse.Namespace) -> int:
     write_model(path, made.file)
     print(f"{path}: {made.molecule.name}, {made.molecule.words}; {made.file.source}")
     for note in made.notes:
-        _warn(note)
+        warn(note)
     print("next:")
     print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")
     print(f'a scene takes it by a line of its [[molecules]]: file = "{path.name}"')

@@ -29,6 +29,7 @@ CHAPTERS = (
     "looking",
     "notebook",
     "measuring",
+    "studies",
     "ase",
     "engines",
     "extending",

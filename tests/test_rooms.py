@@ -9,7 +9,7 @@ PACKAGE = ROOT / "rigidmd"
 
 # In this order: a room may import from those above it and from itself.
 ROOMS = [
-    ("errors", "units", "core", "compile", "validation"),
+    ("errors", "units", "core", "compile", "validation", "arguments"),
     ("mechanics",),
     ("forces",),
     ("dynamics",),
@@ -40,6 +40,7 @@ LIBRARIES = {
     "MDAnalysis": {
         "assemble/frame_reader.py", "output/readers.py", "output/trajectory.py", "output/trajectory_file.py",
     },
+    "distributed": {"study/sweep/cluster.py"},
     "gsd": {"assemble/gsd_format.py", "output/gsd_file.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
@@ -48,7 +49,7 @@ LIBRARIES = {
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
-        "looking/film.py", "analyse/files.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
+        "looking/film.py", "analyse/files.py", "output/sweep_figure.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
     "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py", "scene/engine.py"},
     "IPython": {"output/progress.py"},

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from rigidmd.analyse.files import write_findings
+from rigidmd.analyse.files import stretch_of, write_findings
 from rigidmd.analyse.findings import Finding
 from rigidmd.analyse.history import History
 from rigidmd.analyse.registry import chosen
@@ -54,6 +54,6 @@ def analyse_folder(folder: Path, task: Task, step: Callable[[float, str], object
             failed[entry.name] = str(error)
     if not findings:
         raise OutputError(f"{folder}: no analysis is possible: {'; '.join(failed.values())}")
-    files = write_findings(folder, history, findings, failed)
+    files = write_findings(folder, stretch_of(history), findings, failed)
     step(1.0, "")
     return Done(history, findings, failed, files)

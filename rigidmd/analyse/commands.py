@@ -1,9 +1,14 @@
 """The command `analyse`. It prints and never computes."""
 
 import argparse
-import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigidmd.arguments import time_ps
+
+if TYPE_CHECKING:
+    from rigidmd.analyse.all import Task
 
 
 def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
@@ -14,7 +19,7 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each with its error",
         "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
     )
-    analyse.add_argument("folder", metavar="RUN", help="folder of a run")
+    analyse.add_argument("folder", metavar="RUN", help="folder of a run, or of a sweep: means and errors over its runs")
     analyse.add_argument(
         "--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
         metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them",
@@ -33,14 +38,6 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     )  # fmt: skip
     analyse.add_argument("--list", action=_List, nargs=0, help="list the analyses")
     analyse.set_defaults(scene="this run", writes=True)
-
-
-def time_ps(text: str) -> float:
-    """Picoseconds in a time such as 200ps."""
-    found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
-    return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
 
 
 def _positive(text: str) -> float:
@@ -67,6 +64,7 @@ def _analyse(options: argparse.Namespace) -> int:
 
     from rigidmd.analyse.all import Task, analyse_folder
     from rigidmd.analyse.registry import trusted
+    from rigidmd.output.sweep_folder import is_sweep
 
     for path in options.trust:
         trusted(Path(path))
@@ -77,6 +75,8 @@ def _analyse(options: argparse.Namespace) -> int:
             bar.update(share - bar.n)
 
         task = Task(options.only, options.start, options.viscosity)
+        if is_sweep(Path(options.folder)):
+            return _analyse_sweep(Path(options.folder), task, step)
         done = analyse_folder(Path(options.folder), task, step)
     history = done.history
     print(f"{options.folder}: {len(history)} frames from {history.time[0]:g} to {history.time[-1]:g} ps")
@@ -87,4 +87,22 @@ def _analyse(options: argparse.Namespace) -> int:
     for name, why in done.failed.items():
         print(f"{name}: left out: {why}")
     print(f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd report` shows them")
+    return 0
+
+
+def _analyse_sweep(folder: Path, task: "Task", step: Callable[[float, str], object]) -> int:
+    """`analyse` of a sweep."""
+    from rigidmd.analyse.replicas import ANALYSES, analyse_sweep
+
+    found = analyse_sweep(folder, task, step)
+    step(1.0, "")
+    for combination in found:
+        runs = f"{combination.runs} run{'s' if combination.runs > 1 else ''}"
+        print(f"{combination.title or folder}: {runs}, {len(combination.files)} files in {combination.files[0].parent}")
+        for finding in combination.findings:
+            print(finding)
+        for name, why in combination.failed.items():
+            print(f"{name}: left out: {why}")
+        print()
+    print(f"values of all in {folder / ANALYSES}")
     return 0

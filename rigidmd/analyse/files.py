@@ -24,10 +24,23 @@ WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10
 UNDRAWN = re.compile(r"n .+-.+")
 
 
-def write_findings(folder: Path, history: History, findings: list[Finding], failed: dict[str, str]) -> list[Path]:
+def stretch_of(history: History) -> dict[str, Any]:
+    """What analysis.json tells of the frames that were used."""
+    return {
+        "stage": history.stage.label,
+        "from_ps": float(history.time[0]),
+        "to_ps": float(history.time[-1]),
+        "frames": len(history),
+        "notes": history.notes,
+    }
+
+
+def write_findings(
+    folder: Path, stretch: dict[str, Any], findings: list[Finding], failed: dict[str, str]
+) -> list[Path]:
     """Write what was found; entries of other analyses that the folder holds stay. Returns the files.
 
-    failed : analysis -> the sentence that tells why it found nothing. Raises OutputError.
+    stretch : see `stretch_of`. failed : analysis -> the sentence that tells why it found nothing. Raises OutputError.
     """
     known = read_table(folder)
     owner, marked = _owners(known, folder), written_by_runs(folder)
@@ -43,13 +56,6 @@ def write_findings(folder: Path, history: History, findings: list[Finding], fail
     add_to_folder(folder, [ANALYSIS, *own])
     written = []
     entries = dict(known.get("analyses", {}))
-    stretch = {
-        "stage": history.stage.label,
-        "from_ps": float(history.time[0]),
-        "to_ps": float(history.time[-1]),
-        "frames": len(history),
-        "notes": history.notes,
-    }
     for finding in findings:
         files = []
         for curve in finding.curves:

@@ -12,6 +12,7 @@ from rigidmd.errors import OutputError
 from rigidmd.output.pressure import TENSOR_FILE, read_tensor
 from rigidmd.output.record import Record
 from rigidmd.output.trajectory import read_frames
+from rigidmd.scene.stage import Stage
 
 if TYPE_CHECKING:
     from rigidmd.run.results import Results
@@ -80,6 +81,18 @@ def of_results(results: "Results", start: float | None = None) -> History:
     )
     columns = {name: results[name] for name in results.units}
     return _history(system, columns, raw, results._tensor, start, [], lambda share: None)
+
+
+def production_of(record: Record) -> tuple[Stage, np.ndarray]:
+    """The last stage of a run of molecules in which time passes, and which samples of the log are of its production.
+
+    Raises OutputError.
+    """
+    columns = record.columns
+    stage, first, last = _last_stage(record.molecules, columns)
+    time = columns["time"]
+    begin = production(columns, (time >= first) & (time <= last), stage.changes_box)
+    return stage, (time >= begin) & (time <= last)
 
 
 class _Raw(NamedTuple):

@@ -16,6 +16,8 @@ CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
 #: Marks the folder of a run and lists the files that the run may write, one a line; --force may remove these.
 MARKER = ".rigidmd-run"
 LOCK = ".rigidmd-lock"
+#: The manifest of a sweep, in the folder around those of its runs.
+SWEEP = "sweep.json"
 
 
 def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None:
@@ -83,6 +85,8 @@ def check_is_run(folder: Path) -> None:
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "is not there"
         raise OutputError(f"{folder} {what}; name the folder of a run, such as runs/water")
+    if (folder / SWEEP).is_file():
+        raise OutputError(f"{folder} is the folder of a sweep; name one of the runs in it")
     if not (folder / MARKER).is_file() or not (folder / SCENE).is_file():
         raise OutputError(f"{folder} is not the folder of a run: `rigidmd run` wrote no {SCENE} there")
 

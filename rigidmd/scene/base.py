@@ -115,7 +115,7 @@ class Scene(Section):
         """
         path = Path(path)
         data, text = read_toml(path, SceneError)
-        data.setdefault("name", re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene")
+        data.setdefault("name", name_of_file(path))
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
 
     @classmethod
@@ -225,6 +225,11 @@ class Scene(Section):
             alike = perhaps([other.name for other in there if other.stem in stems])
             faults.append(f"{place(keys, text, overridden)}: {fault}: {shortened(str(path))}{alike}")
         return faults
+
+
+def name_of_file(path: Path) -> str:
+    """The name of the scene in a file that says none."""
+    return re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene"
 
 
 def _beside(path: Path) -> list[Path]:

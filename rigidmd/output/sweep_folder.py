@@ -1,0 +1,187 @@
+"""The folder of a sweep: its manifest sweep.json, and in a folder each, which are those of runs, its points."""
+
+import contextlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rigidmd.core.files import whole_file
+from rigidmd.errors import OutputError
+from rigidmd.output.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_empty, written_by_runs
+from rigidmd.output.sweep_names import point_name, short_keys
+
+MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
+#: While it is there, points that run elsewhere stop at their next look.
+STOP = "stop"
+FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)
+#: Of the manifest.
+SCHEMA = 1
+WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED = "waiting", "running", "finished", "interrupted", "failed"
+#: What MDAnalysis writes beside a trajectory .NAME that it reads.
+OFFSETS = ("_offsets.npz", "_offsets.lock")
+#: The key whose values make replicas.
+SEED = "seed"
+
+
+@dataclass
+class Point:
+    """A point of a sweep.
+
+    folder : name of its folder
+    values : swept key -> value
+    scene_sha256 : digest of its scene, as it was read, and of the files that it reads
+    ran_sha256 : scene_sha256 of the summary of its run, once it has ended
+    message : of a failed point, why
+    seconds : that it ran, in all
+    """
+
+    folder: str
+    values: dict[str, Any]
+    scene_sha256: str
+    state: str = WAITING
+    ran_sha256: str | None = None
+    message: str | None = None
+    seconds: float = 0.0
+
+
+@dataclass
+class Manifest:
+    """What a sweep is made of.
+
+    scene : the file of the scene
+    keys : swept key -> the keys that are set together with it, itself first
+    fixed : key -> value for all points
+    common : dotted key -> value of the scene, without the swept keys
+    inputs : dotted key -> SHA-256 of the files that all points read
+    """
+
+    name: str
+    scene: str
+    keys: dict[str, list[str]]
+    fixed: dict[str, Any]
+    common: dict[str, Any]
+    inputs: dict[str, str]
+    points: list[Point] = field(default_factory=list)
+
+    def overrides(self, point: Point) -> dict[str, Any]:
+        """Dotted key -> value of a point, for `Scene.read`."""
+        return self.fixed | {key: value for first, value in point.values.items() for key in self.keys[first]}
+
+    def folder_of(self, values: dict[str, Any]) -> str:
+        """The name of the folder for what is found over the replicas of a combination of values."""
+        return point_name(values, short_keys(self.keys))
+
+    def combinations(self) -> list[tuple[dict[str, Any], list[Point]]]:
+        """The values of all keys but `seed`, each with its points: its replicas, if the seed is swept."""
+        found: list[tuple[dict[str, Any], list[Point]]] = []
+        places: dict[str, int] = {}
+        for point in self.points:
+            values = {key: value for key, value in point.values.items() if key != SEED}
+            place = places.setdefault(json.dumps(values), len(found))
+            if place == len(found):
+                found.append((values, []))
+            found[place][1].append(point)
+        return found
+
+
+def is_sweep(folder: Path) -> bool:
+    """Whether a folder is that of a sweep."""
+    return (folder / MANIFEST).is_file()
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a sweep. Raises OutputError if it is none."""
+    path = folder / MANIFEST
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        schema = told.pop("schema")
+        if schema > SCHEMA:
+            raise OutputError(
+                f"{path}: was written by a later rigidmd (version {schema} of the format; this one reads {SCHEMA})"
+            )
+        points = [Point(**point) for point in told.pop("points")]
+        found = Manifest(**told, points=points)
+        names = [point.folder for point in points]
+        if not _is_whole(found):
+            raise ValueError("values of other types")
+        if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
+            raise ValueError("names of folders that a sweep does not give")
+        if any(point.values.keys() != found.keys.keys() for point in points):
+            raise ValueError("points without values of all keys")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from None
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise OutputError(f"{path} is no manifest of a sweep: {error}; --force begins the sweep anew") from None
+    return found
+
+
+def _is_whole(found: Manifest) -> bool:
+    """Whether all that a manifest tells has the types that it should have."""
+    tables = (found.keys, found.fixed, found.common, found.inputs, *(point.values for point in found.points))
+    words = [found.name, found.scene, *(word for point in found.points for word in (point.folder, point.scene_sha256))]
+    perhaps = [word for point in found.points for word in (point.ran_sha256, point.message)]
+    return (
+        all(isinstance(table, dict) for table in tables)
+        and all(isinstance(word, str) for word in words)
+        and all(word is None or isinstance(word, str) for word in perhaps)
+        and all(point.state in (WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED) for point in found.points)
+        and all(isinstance(point.seconds, int | float) for point in found.points)
+        and all(isinstance(together, list) and key in together for key, together in found.keys.items())
+        and all(isinstance(key, str) for together in found.keys.values() for key in together)
+    )
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write sweep.json as a whole. Raises OutputError."""
+    with whole_file(folder / MANIFEST) as temporary:
+        temporary.write_text(json.dumps({"schema": SCHEMA, **asdict(manifest)}, indent=1) + "\n", encoding="utf-8")
+
+
+def check_sweep_folder(folder: Path) -> None:
+    """Raise OutputError if a folder holds what is not of a sweep; changes nothing."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name another folder with -o")
+    if not is_empty(folder) and not is_sweep(folder):
+        raise OutputError(f"{folder} is not empty and holds no sweep; name another folder with -o")
+
+
+def make_sweep_folder(folder: Path) -> None:
+    """Make it, and note the files that a sweep writes there. Raises OutputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be made: {error.strerror}; name another folder with -o") from None
+    add_to_folder(folder, FILES)
+
+
+def clear_sweep(folder: Path, names: Iterable[str]) -> None:
+    """Remove what a sweep wrote: its own files, and those of the runs in folders of these names. Raises OutputError."""
+    for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
+        if not inner.is_dir() or (inner.is_symlink() and inner != folder):
+            continue
+        try:
+            for name in written_by_runs(inner):
+                for own in (name, *(f".{name}{ending}" for ending in OFFSETS)):
+                    (inner / own).unlink(missing_ok=True)
+            (inner / MARKER).unlink(missing_ok=True)
+            if inner != folder:
+                (inner / LOCK).unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # it holds files of others
+                    inner.rmdir()
+        except OSError as error:
+            raise OutputError(f"{inner} cannot be cleared: {error.strerror}") from None
+
+
+def state_on_disk(folder: Path, point: Point) -> str:
+    """What the folder of a point says: finished, interrupted, or waiting if nothing has run there."""
+    own = folder / point.folder
+    try:
+        summary = json.loads((own / SUMMARY).read_text(encoding="utf-8"))
+        ended = summary["interrupted"] is False and point.ran_sha256 in (None, summary["scene_sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        ended = False
+    if ended:
+        return FINISHED
+    return INTERRUPTED if (own / MARKER).is_file() else WAITING

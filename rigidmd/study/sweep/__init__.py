@@ -1,0 +1,1 @@
+"""Sweeps: a scene at many points, a folder each, with one table at the end."""

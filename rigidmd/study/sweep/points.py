@@ -1,0 +1,148 @@
+"""The points of a sweep, each a scene of its own: all are read and checked before the first one runs."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from rigidmd.errors import Faults, RigidMDError, SceneError
+from rigidmd.output.sweep_folder import SEED, Point
+from rigidmd.output.sweep_names import in_words, point_name, short_keys
+from rigidmd.run.provenance import APART, keys_of, plain, scene_digest
+from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.study.sweep.axes import Axis, settings
+
+
+@dataclass
+class Asked:
+    """What is asked for: scenes by points, as `points_of` finds them. See `Manifest` for the rest."""
+
+    name: str
+    source: str
+    keys: dict[str, list[str]]
+    fixed: dict[str, Any]
+    common: dict[str, Any]
+    inputs: dict[str, str]
+    points: list[Point] = field(default_factory=list)
+    is_body: bool = False
+
+
+def points_of(path: str | Path, axes: Sequence[Axis]) -> Asked:
+    """All points of a sweep over a scene file, checked. Raises SceneError with all faults of all points."""
+    swept = [axis for axis in axes if axis.swept]
+    keys = {axis.keys[0]: list(axis.keys) for axis in swept}
+    fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
+    short = short_keys(keys)
+    every = settings(axes)
+    digest, faults = Digests(), _Told(str(path))
+    checked: dict[str, RigidMDError | None] = {}  # values but for the seed -> what is wrong; replicas are built alike
+    asked: Asked | None = None
+    for values in every:
+        overrides = fixed | {key: value for first, value in values.items() for key in keys[first]}
+        told = in_words(values, short)
+        try:
+            scene = Scene.read(path, overrides)
+            kind = json.dumps({key: value for key, value in values.items() if key != SEED}, default=str)
+            if kind not in checked:
+                checked[kind] = _fault_of(scene)
+            if (wrong := checked[kind]) is not None:
+                raise wrong
+        except Faults as error:
+            faults.add(
+                told, [f"{error.where}: {fault}" if error.where != str(path) else fault for fault in error.faults]
+            )
+            continue
+        except RigidMDError as error:
+            faults.add(told, [str(error)])
+            continue
+        if asked is None:
+            apart = [key for together in keys.values() for key in together]
+            common, inputs = common_part(scene, apart, digest)
+            asked = Asked(scene.name, str(path), keys, fixed, common, inputs, is_body=isinstance(scene, BodyScene))
+        asked.points.append(Point(point_name(values, short), values, digest.of(scene)))
+    if faults.any or asked is None:
+        raise SceneError(str(path), faults.in_words(len(every)))
+    return asked
+
+
+def common_part(scene: Scene, apart: Sequence[str], digest: "Digests") -> tuple[dict[str, Any], dict[str, str]]:
+    """Keys of a scene and digests of its inputs, without the swept keys."""
+    keys = keys_of(plain(scene), (*APART, *apart, *scene.inputs, *scene.held))
+    keys = {key: str(value) if value in (inf, -inf) else value for key, value in keys.items()}  # JSON has no infinity
+    inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in apart}
+    return keys, inputs
+
+
+class Digests:
+    """Digests of scenes, for which each file is read once."""
+
+    def __init__(self):
+        self._known: dict[Path, str] = {}
+
+    def inputs(self, scene: Scene) -> dict[str, str]:
+        """SHA-256 of each file that a scene reads, by its dotted key. Raises SceneError."""
+        try:
+            for path in scene.inputs.values():
+                if path not in self._known:
+                    self._known[path] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
+        return {key: self._known[path] for key, path in scene.inputs.items()}
+
+    def of(self, scene: Scene) -> str:
+        """SHA-256 of a scene, as it was read, and of all files that it reads."""
+        told = json.dumps([scene_digest(scene), self.inputs(scene)], sort_keys=True)
+        return hashlib.sha256(told.encode()).hexdigest()
+
+
+def _fault_of(scene: MolecularScene | BodyScene) -> RigidMDError | None:
+    """What only the system of a scene shows to be wrong."""
+    try:
+        _build(scene)
+    except RigidMDError as error:
+        return error
+    return None
+
+
+def _build(scene: MolecularScene | BodyScene) -> None:
+    if isinstance(scene, BodyScene):
+        from rigidmd.assemble.body import build_body
+
+        if not scene.run.is_open:
+            build_body(scene)
+        return
+    from rigidmd.assemble.system import build
+
+    build(scene)
+
+
+class _Told:
+    """Faults with the points that have them."""
+
+    def __init__(self, source: str):
+        self._source = source
+        self._points: dict[str, list[str]] = {}
+
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return bool(self._points)
+
+    def add(self, point: str, faults: Sequence[str]) -> None:
+        """Add those of a point."""
+        for fault in faults:
+            self._points.setdefault(fault, []).append(point)
+
+    def in_words(self, count: int) -> list[str]:
+        """A sentence for each: a fault of all points is that of the scene."""
+        found = []
+        for fault, points in self._points.items():
+            if len(points) == count and count > 1:
+                found.append(fault)
+            else:
+                more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
+                found.append(f"at {points[0]}{more}: {fault}")
+        return found

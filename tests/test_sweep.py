@@ -1,0 +1,661 @@
+"""Sweeps: what is asked for, points in processes of their own, stops of every kind, tables, clusters, bad input."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import rigidmd
+from rigidmd import cli
+from rigidmd.analyse.findings import Curve, Finding, Value
+from rigidmd.analyse.replicas import over_replicas
+from rigidmd.errors import OutputError, SceneError
+from rigidmd.output.folder import FolderLock
+from rigidmd.output.sweep_folder import read_manifest
+from rigidmd.output.sweep_names import point_name, short_keys, value_name
+from rigidmd.scene import Scene
+from rigidmd.study.sweep import sweeping, worker
+from rigidmd.study.sweep.axes import Axis, parse_axis, settings
+from rigidmd.study.sweep.processes import Pool
+from rigidmd.study.sweep.running import Waiting, code_kind, run_points
+from rigidmd.study.sweep.slurm import in_hours, in_ranges
+from rigidmd.study.sweep.table import Row
+
+ARGON = """
+[box]
+lengths_A = 22.0
+
+[[molecules]]
+model = "argon"
+count = 20
+
+[forces]
+cutoff_A = 8.0
+
+[start]
+temperature_K = 90.0
+
+[[stages]]
+duration_ps = 0.5
+timestep_fs = 5
+
+[output]
+trajectory_interval_ps = 0.05
+figure = false
+"""
+GRID = ["--set", "start.temperature_K=90,120", "--set", "seed=1..2"]
+
+
+@pytest.fixture(scope="module")
+def argon(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scenes") / "argon.toml"
+    path.write_text(ARGON)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(argon, tmp_path_factory):
+    """A sweep that has finished: 2 temperatures, 2 seeds."""
+    folder = tmp_path_factory.mktemp("runs") / "sweep"
+    assert cli.main(["sweep", str(argon), *GRID, "-o", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "sweep"))
+
+
+def table(folder):
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def states(folder):
+    return {point["folder"]: point["state"] for point in json.loads((folder / "sweep.json").read_text())["points"]}
+
+
+def written(folder):
+    """The times at which runs ended, by point."""
+    return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/summary.json")}
+
+
+def same_runs(first, second):
+    """Whether two sweeps have the same points, with the same bits in logs and trajectories."""
+    names = sorted(path.parent.name for path in first.glob("*/log.csv"))
+    assert names == sorted(path.parent.name for path in second.glob("*/log.csv"))
+    files = ("log.csv", "trajectory.xtc")
+    return all((first / n / f).read_bytes() == (second / n / f).read_bytes() for n in names for f in files)
+
+
+# What is asked for
+
+
+@pytest.mark.parametrize(
+    ("text", "keys", "values"),
+    [
+        ("seed=1..4", ("seed",), (1, 2, 3, 4)),
+        ("seed=1..3,7", ("seed",), (1, 2, 3, 7)),
+        ("a.b=280, 290.5", ("a.b",), (280, 290.5)),
+        ("a=-2..1", ("a",), (-2, -1, 0, 1)),
+        ("a=spce,tip3p", ("a",), ("spce", "tip3p")),
+        ("a=true,false", ("a",), (True, False)),
+        ("a=[30,30,30],[31,31,31]", ("a",), ([30, 30, 30], [31, 31, 31])),
+        ('a="x,y","z"', ("a",), ("x,y", "z")),
+        ("a={b=1,c=[2,3]},{b=2,c=[4,5]}", ("a",), ({"b": 1, "c": [2, 3]}, {"b": 2, "c": [4, 5]})),
+        ("a,b.c=1,2", ("a", "b.c"), (1, 2)),
+    ],
+)  # fmt: skip
+def test_values_of_a_key(text, keys, values):
+    assert parse_axis(text) == Axis(keys, values)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("a=3", 3), ("a=[1,2]", [1, 2]), ("a=", None), ('a="1,2"', "1,2"), ("a=x.gro", "x.gro")]
+)
+def test_one_value_is_the_same_for_all_points(text, value):
+    assert parse_axis(text) == Axis(("a",), (value,), swept=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("seed", "is not KEY=VALUE"), ("=1,2", "is not KEY=VALUE"), ("a,=1,2", "is not KEY=VALUE"),
+        ("seed=1,,2", "empty value"), ("seed=1,", "empty value"), ("seed=4..1", "the range 4..1 is empty"),
+        ("seed=0.1..0.5", "no range of whole numbers"), ("seed=1..10000000", "more than 100000 values"),
+        ("a=[1,2", "] is missing"), ("a=1]", "] closes nothing"), ('a="x,y', '" is missing'),
+    ],
+)  # fmt: skip
+def test_values_that_are_none(text, expected):
+    with pytest.raises(SceneError, match=re.escape(expected)):
+        parse_axis(text)
+
+
+def test_names_of_points():
+    short = short_keys(["stages.0.temperature_K", "seed"])
+    assert point_name({"stages.0.temperature_K": 280.0, "seed": 1}, short) == "temperature_K=280_seed=1"
+    assert list(short_keys(["stages.0.timestep_fs", "stages.1.timestep_fs"]).values()) == [
+        "0.timestep_fs", "1.timestep_fs",
+    ]  # fmt: skip
+    assert value_name([30, 30.5, 31]) == "30x30.5x31"
+    assert (value_name(True), value_name(1e-5), value_name(0.1), value_name("spce")) == ("true", "1e-05", "0.1", "spce")
+    strange = [value_name(text) for text in ("../../etc", "..", "", "a b", "a/b", "a-b", "x" * 500, "é\n", "-")]
+    assert all(re.fullmatch(r"[\w.+\-]{0,60}", name) and not name.startswith(".") for name in strange)
+    assert len({*strange}) == len(strange)
+    long = [
+        point_name({f"key{k}": f"{'x' * 30}{end}" for k in range(9)}, {f"key{k}": f"key{k}" for k in range(9)})
+        for end in "ab"
+    ]
+    assert long[0] != long[1]
+    assert max(map(len, long)) < 140
+
+
+def test_all_combinations_with_keys_that_go_together():
+    axes = [Axis(("a", "b"), (1, 2)), Axis(("c",), (0,), swept=False), Axis(("seed",), (1, 2))]
+    assert settings(axes) == [{"a": a, "seed": s} for a in (1, 2) for s in (1, 2)]
+
+
+def test_cores_are_full(monkeypatch):
+    monkeypatch.setattr(sweeping, "cores", lambda: 8)
+    assert sweeping.shares(24, None, None, False) == (8, 1)
+    assert sweeping.shares(3, None, None, False) == (3, 2)
+    assert sweeping.shares(24, 2, None, False) == (2, 4)
+    assert sweeping.shares(24, None, 4, False) == (2, 4)
+    assert sweeping.shares(24, 16, None, False) == (16, 1)
+    assert sweeping.shares(3, None, None, True) == (3, 1)
+
+
+# Runs
+
+
+def test_a_sweep_is_a_folder_a_point_a_table_and_a_figure(finished):
+    names = [f"temperature_K={t}_seed={s}" for t in (90, 120) for s in (1, 2)]
+    assert states(finished) == dict.fromkeys(names, "finished")
+    rows = table(finished)
+    assert [(row["start.temperature_K"], row["runs"]) for row in rows] == [("90", "2"), ("120", "2")]
+    for row, temperature in zip(rows, (90, 120), strict=True):
+        found = []
+        for seed in (1, 2):
+            with (finished / f"temperature_K={temperature}_seed={seed}" / "log.csv").open() as file:
+                log = list(csv.DictReader(file))
+            found.append(np.mean([float(line["Temperature (K)"]) for line in log]))
+        assert float(row["Temperature (K)"]) == pytest.approx(np.mean(found), rel=1e-8)
+        error = abs(found[0] - found[1]) / 2  # standard deviation over the root of 2
+        assert float(row["Temperature (K) error"]) == pytest.approx(error, rel=1e-6)
+        assert float(row["Box Volume (nm^3) error"]) == 0
+    assert (finished / "sweep.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_point_has_the_bits_of_a_run(finished, argon, tmp_path, capsys):
+    changes = ["--set", "start.temperature_K=120", "--set", "seed=2"]
+    assert cli.main(["run", str(argon), *changes, "-o", str(tmp_path / "run")]) == 0
+    point = finished / "temperature_K=120_seed=2"
+    assert cli.main(["compare", str(point), str(tmp_path / "run")]) == 0
+    for command in (["report"], ["analyse", "--only", "rdf"]):
+        copy = shutil.copytree(point, tmp_path / command[0])
+        assert cli.main([*command, str(copy)]) == 0
+
+
+def test_what_has_finished_is_not_run_again(copied, argon, capsys):
+    before = written(copied)
+    assert cli.main(["sweep", str(argon), *GRID[2:], *GRID[:2], "-o", str(copied)]) == 0  # keys in any order
+    assert "4 skipped" in capsys.readouterr().out
+    assert written(copied) == before
+    # one value more, of a key that is varied
+    assert cli.main(["sweep", str(argon), *GRID[:2], "--set", "seed=3", "-o", str(copied), "--jobs", "1"]) == 0
+    assert "2 finished, 0 failed, 4 skipped" in capsys.readouterr().out
+    assert {name: time for name, time in written(copied).items() if name in before} == before
+    assert [row["runs"] for row in table(copied)] == ["3", "3"]
+
+
+def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
+    for changes, expected in (
+        ([*GRID, "--set", "forces.cutoff_A=7.5"], "forces.cutoff_A is 7.5, there 8.0"),
+        (GRID[:2], "it varies start.temperature_K and seed, not start.temperature_K"),
+        ([*GRID, "--set", "stages.0.duration_ps=1"], "stages.0.duration_ps is 1.0, there 0.5"),
+    ):
+        assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
+        said = capsys.readouterr().err
+        assert expected in said
+        assert "--force begins it anew" in said
+    assert (copied / "temperature_K=90_seed=1" / "log.csv").exists()
+
+
+def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
+    assert cli.main(["analyse", str(copied), "--only", "rdf,structure_factor"]) == 0
+    assert "over 2 runs" in capsys.readouterr().out
+    mean = copied / "temperature_K=90"
+    own = [np.genfromtxt(copied / f"temperature_K=90_seed={k}" / "rdf.csv", delimiter=",", names=True) for k in (1, 2)]
+    both = np.genfromtxt(mean / "rdf.csv", delimiter=",", names=True)
+    g, error = (name for name in both.dtype.names if name.startswith("g_"))
+    assert both[g] == pytest.approx((own[0][g] + own[1][g]) / 2, abs=1e-7)
+    assert both[error] == pytest.approx(np.abs(own[0][g] - own[1][g]) / 2, abs=1e-7)
+    assert json.loads((mean / "analysis.json").read_text())["analyses"].keys() == {"rdf", "structure_factor"}
+    with (copied / "analysis.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["runs"] for row in rows] == ["2", "2"]
+    assert float(rows[0]["highest peak of S(k) error"]) > 0
+    # --force removes what a sweep and its analyses wrote, and no more
+    (copied / "notes.txt").write_text("mine")
+    (copied / "temperature_K=90_seed=1" / "mine.txt").write_text("mine")
+    with ExitStack() as stack:
+        wanted = sweeping.Wanted(argon, [Axis(("seed",), (1, 2))], copied, force=True)
+        assert sweeping.opened(wanted, stack).left == 2
+    assert [path.name for path in copied.iterdir() if path.is_dir()] == ["temperature_K=90_seed=1"]
+    assert [path.name for path in (copied / "temperature_K=90_seed=1").iterdir()] == ["mine.txt"]
+    assert {path.name for path in copied.iterdir() if path.is_file() and not path.name.startswith(".")} == {
+        "notes.txt", "sweep.json",
+    }  # fmt: skip
+    assert states(copied) == {"seed=1": "waiting", "seed=2": "waiting"}
+
+
+def test_replicas_of_unlike_axes_and_short_runs():
+    def found(x, value):
+        curve = Curve("msd", ("t", x), "MSD", {"MSD": 2 * x}, {"MSD": x})
+        return [Finding("msd", "about", [Value("D", "", value, 9.0)], [curve], ["note"])]
+
+    (mean,) = over_replicas(
+        [found(np.linspace(0, 4, 5), 1.0), found(np.linspace(0, 3, 7), 3.0), found(np.linspace(0, 9, 4), None)]
+    )
+    (curve,), (value,) = mean.curves, mean.values
+    assert curve.axis[1].tolist() == [0, 1, 2, 3]
+    assert curve.columns["MSD"] == pytest.approx([0, 2, 4, 6])
+    assert curve.errors["MSD"] == pytest.approx(0, abs=1e-12)
+    assert (value.value, value.error) == pytest.approx((2.0, 1.0))
+    assert "over 2 runs of 3" in value.note
+    assert mean.notes == ["note"]
+    (alone,) = over_replicas([found(np.linspace(0, 4, 5), 1.0)])
+    assert alone.values[0].error == 9.0
+
+
+def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
+    assert Row({}, {1: {"x": (1.0, 0.5)}, 2: {"x": (3.0, 0.5)}})["x"] == (2.0, pytest.approx(1.0))
+    assert Row({}, {1: {"x": (1.0, 0.5)}, 2: {}})["x"] == (1.0, 0.5)
+    assert Row({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})["x"] == (0.1, 0.0)
+
+
+def test_bodies_and_words(tmp_path, capsys):
+    """A body has no seeds; a key whose values are words has places on the axis."""
+    scene = ROOT / "systems" / "heavy_top_3.toml"
+    fixed = ["--set", "run.duration_s=0.02", "--set", "output.figures=false", "--set", "output.trajectory=false"]
+    arguments = [
+        "sweep",
+        str(scene),
+        *fixed,
+        "--set",
+        "run.integrator=velocity_verlet,kahan_li_8",
+        "--jobs",
+        "1",
+        "-o",
+        str(tmp_path / "s"),
+    ]
+    assert cli.main(arguments) == 0
+    errors = [float(row["energy_error largest"]) for row in table(tmp_path / "s")]
+    assert errors[0] > 100 * errors[1]
+    assert (tmp_path / "s" / "sweep.png").exists()
+    assert cli.main(["sweep", str(scene), "--replicas", "3", "-o", str(tmp_path / "t")]) == 2
+    assert "a single body, whose motion has no seed" in capsys.readouterr().err
+    assert not (tmp_path / "t").exists()
+
+
+def test_from_python(argon, finished, copied):
+    found = rigidmd.sweep(argon, {"start.temperature_K": [90, 120], "seed": range(1, 3)}, copied)
+    assert found["start.temperature_K"].tolist() == [90, 120]
+    assert found["Temperature (K)"] == pytest.approx([float(row["Temperature (K)"]) for row in table(finished)])
+    assert (found.error("Temperature (K)") > 0).all()
+    assert list(found.to_dataframe()["runs"]) == [2, 2]
+    with pytest.raises(KeyError, match="there are"):
+        found["no"]
+
+
+# Stops
+
+
+def long_sweep(argon, folder, **more):
+    """Manifest of a sweep of three points that take a while."""
+    changes = {
+        "stages.0.duration_ps": 150.0,
+        "output.trajectory_interval_ps": 5.0,
+        "output.log_interval_ps": 1.0,
+        "seed": range(1, 4),
+    } | more
+    with ExitStack() as stack:
+        return sweeping.opened(sweeping.Wanted(argon, sweeping.axes_of(changes), folder), stack).manifest
+
+
+@pytest.fixture(scope="module")
+def whole(argon, tmp_path_factory):
+    """Three points that were never stopped."""
+    folder = tmp_path_factory.mktemp("whole") / "sweep"
+    manifest = long_sweep(argon, folder)
+    for point in manifest.points:
+        assert worker.run_task(sweeping.task_of(folder, manifest, point))["state"] == "finished"
+    return folder
+
+
+def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, whole, tmp_path):
+    """The first point that moves is killed, then the sweep is stopped, and goes on later."""
+    folder = tmp_path / "sweep"
+    manifest, pool, killed, died = long_sweep(argon, folder), Pool(2, 1), [], []
+
+    def disturb(name, kind, value):
+        if kind == "died":
+            died.append(name)
+        elif kind == "share" and not killed:
+            killed.append(name)
+            next(worker for worker in pool._busy if worker.task["name"] == name).kill()
+        elif kind == "share" and died:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    outcome = run_points(folder, manifest, pool, hear=disturb)
+    assert outcome.failed == killed
+    assert outcome.signal == signal.SIGTERM
+    assert outcome.left
+    failed = next(point for point in read_manifest(folder).points if point.folder == killed[0])
+    assert "was killed" in failed.message
+    assert set(states(folder).values()) <= {"interrupted", "waiting", "finished", "failed"}
+    again = run_points(folder, long_sweep(argon, folder), Pool(2, 1))
+    assert not again.left
+    assert killed[0] in again.finished
+    assert same_runs(folder, whole)
+
+
+def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
+    """A time step that is far too long ends a run; a wall time that is over leaves the rest."""
+    folder = tmp_path / "sweep"
+    arguments = ["sweep", str(argon), "--set", "stages.0.timestep_fs=5,100000", "--set", "stages.0.duration_ps=1000",
+                 "--set", "watch.stable_step=false", "-o", str(folder), "--walltime", "0:00:06"]  # fmt: skip
+    code = cli.main(arguments)
+    said = capsys.readouterr()
+    assert code in (1, 75), said.err
+    assert states(folder)["timestep_fs=100000"] == "failed"
+    assert "failed: timestep_fs=100000" in said.out
+    assert "the same command goes on" in said.out
+    assert code == (75 if states(folder)["timestep_fs=5"] == "interrupted" else 1)
+
+
+def test_two_sweeps_do_not_share_a_folder(copied, argon, capsys):
+    lock = FolderLock(copied)
+    lock.take()
+    try:
+        assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
+    finally:
+        lock.release()
+    assert "another run is writing" in capsys.readouterr().err
+
+
+def test_a_point_waits_for_a_run_that_is_about_to_stop(tmp_path):
+    lock = FolderLock(tmp_path)
+    lock.take()
+    with pytest.raises(OutputError, match="did not end within"):
+        worker.wait_for_others(tmp_path, 0.1)
+    lock.release()
+    worker.wait_for_others(tmp_path, 0.1)
+
+
+def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
+    manifest = long_sweep(argon, tmp_path / "sweep")
+    point = manifest.points[0]
+    point.scene_sha256 = "other"
+    ended = worker.run_task(sweeping.task_of(tmp_path / "sweep", manifest, point))
+    assert ended["state"] == "failed"
+    assert "has changed since the sweep began" in ended["message"]
+
+
+def test_one_point_of_a_kind_compiles_before_the_others(argon, tmp_path):
+    manifest = long_sweep(argon, tmp_path / "sweep", **{"stages.0.integrator": ["velocity_verlet", "pefrl"]})
+    waiting = Waiting(manifest, manifest.points)
+    first = waiting.next()
+    assert first is not None
+    assert waiting.next() is None  # the code of the first is not there yet, and one compiles at a time
+    waiting.compiled(first)
+    others = [waiting.next() for _ in range(3)]
+    kinds = [point.values["stages.0.integrator"] for point in others]
+    assert kinds == ["velocity_verlet", "velocity_verlet", "pefrl"] or kinds[0] == "pefrl"
+    assert waiting.next() is None
+    scenes = [
+        Scene.read(argon, {"seed": 2, "start.temperature_K": 50}),
+        Scene.read(argon),
+        Scene.read(argon, {"precision": "mixed"}),
+    ]
+    kinds = [code_kind(scene) for scene in scenes]
+    assert kinds[0] == kinds[1] != kinds[2]
+
+
+@pytest.mark.slow
+def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
+    """3 temperatures, 8 seeds, two workers; parent and workers are killed in the middle."""
+    arguments = [str(argon), "--set", "start.temperature_K=90,100,110", "--set", "seed=1..8", "--set",
+                 "stages.0.duration_ps=100", "--jobs", "2"]  # fmt: skip
+    command = [sys.executable, "-m", "rigidmd", "sweep", *arguments, "-o", str(tmp_path / "parts")]
+    parent = subprocess.Popen(command, start_new_session=True)
+    while sum(state == "finished" for state in states_or_none(tmp_path / "parts").values()) < 6:
+        time.sleep(0.1)
+    children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True).stdout.split()
+    assert len(children) == 2
+    for number in (parent.pid, *map(int, children)):
+        os.kill(number, signal.SIGKILL)
+    parent.wait()
+    done = written(tmp_path / "parts")
+    assert 6 <= len(done) < 24
+    assert cli.main(["sweep", *arguments, "-o", str(tmp_path / "parts")]) == 0
+    assert {name: when for name, when in written(tmp_path / "parts").items() if name in done} == done
+    assert cli.main(["sweep", *arguments, "-o", str(tmp_path / "whole")]) == 0
+    assert same_runs(tmp_path / "parts", tmp_path / "whole")
+    assert (tmp_path / "parts" / "sweep.csv").read_bytes() == (tmp_path / "whole" / "sweep.csv").read_bytes()
+
+
+def states_or_none(folder):
+    return states(folder) if (folder / "sweep.json").exists() else {}
+
+
+# Clusters
+
+
+def test_points_run_on_a_cluster_of_dask(argon, finished, tmp_path, capsys):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        arguments = ["sweep", str(argon), "--set", "seed=1..1", "--set", "start.temperature_K=120"]
+        arguments += ["-o", str(tmp_path / "sweep"), "--scheduler", cluster.scheduler_address]
+        assert cli.main(arguments) == 0
+    assert "1 finished" in capsys.readouterr().out
+    ours, theirs = tmp_path / "sweep" / "seed=1", finished / "temperature_K=120_seed=1"
+    assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
+    pytest.importorskip("distributed")
+    from rigidmd.study.sweep.cluster import Cluster
+
+    folder = tmp_path / "sweep"
+
+    def stop(name, kind, value):
+        if kind == "share":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    manifest = long_sweep(argon, folder)
+    outcome = run_points(folder, manifest, Cluster("local", 2, 1, folder, Path.cwd()), hear=stop)
+    assert outcome.left
+    assert not outcome.failed
+    assert not run_points(folder, long_sweep(argon, folder), Pool(2, 1)).left
+    assert same_runs(folder, whole)
+
+
+def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
+    from rigidmd.study.sweep import cluster
+
+    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    arguments = ["sweep", str(argon), *GRID, "-o", str(tmp_path / "sweep"), "--scheduler"]
+    if "distributed" in sys.modules:
+        assert cli.main([*arguments, "tcp://127.0.0.1:9"]) == 2
+        assert "no scheduler of dask.distributed answers" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert cli.main([*arguments, "local"]) == 2
+    assert "pip install 'rigidmd[dask]'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """A working directory, and a stub of sbatch that runs an array at once."""
+    (tmp_path / "bin").mkdir()
+    stub = f"""#!{sys.executable}
+import os, re, subprocess, sys
+script = sys.argv[-1]
+told = [a.partition("=")[2] for a in sys.argv[1:] if a.startswith("--array=")]
+spec = told[0] if told else re.search("--array=(.*)", open(script).read())[1]
+print("sbatch", spec, file=open("jobs", "a"))
+for part in spec.split(","):
+    first, _, last = part.partition("-")
+    for k in range(int(first), int(last or first) + 1):
+        subprocess.run(["bash", script], env=os.environ | {{"SLURM_ARRAY_TASK_ID": str(k)}})
+"""
+    for name, text in (("sbatch", stub), ("rigidmd", f'#!/bin/bash\nexec {sys.executable} -m rigidmd "$@"\n')):
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(Path(rigidmd.__file__).parents[1]))
+
+
+def test_a_script_for_slurm(argon, finished, slurm, capsys):
+    arguments = ["sweep", str(argon), "--set", "seed=1..1", "--set", "start.temperature_K=120", "-o", "my sweep"]
+    assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:10:00"]) == 0
+    script = Path("my sweep/sweep.sbatch")
+    text = script.read_text()
+    assert "#SBATCH --array=0\n" in text
+    assert "#SBATCH --time=0:10:00\n" in text
+    assert not list(Path("my sweep").glob("*/log.csv"))
+    subprocess.run(["sbatch", str(script.absolute())], check=True)
+    assert cli.main(["sweep", str(argon), "-o", "my sweep", "--collect"]) == 0
+    assert "1 of them finished" in capsys.readouterr().out
+    ours, theirs = Path("my sweep") / "seed=1", finished / "temperature_K=120_seed=1"
+    assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
+    assert cli.main([*arguments[:3], "seed=1..3", *arguments[4:], "--to", "slurm", "--walltime", "0:10:00"]) == 0
+    assert "#SBATCH --array=1-2\n" in script.read_text()
+
+
+@pytest.mark.slow
+def test_slurm_jobs_submit_themselves_again(argon, slurm):
+    """Jobs whose time is up, until their points have finished."""
+    arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=400", "-o", "sweep"]
+    assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:00:08"]) == 0
+    subprocess.run(["sbatch", "sweep/sweep.sbatch"], check=True)
+    assert len(Path("jobs").read_text().splitlines()) > 2
+    assert cli.main(["sweep", str(argon), "-o", "sweep", "--collect"]) == 0
+    assert cli.main([*arguments[:-1], "whole"]) == 0
+    assert same_runs(Path("sweep"), Path("whole"))
+
+
+def test_words_for_slurm():
+    assert in_ranges([0, 1, 2, 5, 7, 8]) == "0-2,5,7-8"
+    assert in_hours(3661.9) == "1:01:01"
+    assert in_hours(100 * 3600) == "100:00:00"
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "no key has several values"),
+        (["--set", "seed=3"], "no key has several values"),
+        (["--set", "seed=1..3", "--set", "seed=5,6"], "seed is set 2 times"),
+        (["--set", "seed=4..1", "--set", "a=1,,2"], "2 faults"),
+        (["--set", "seed=1,1"], "seed: 1 is there 2 times"),
+        (["--set", "start.temperature_K=90,90.0"], "90 is there 2 times"),
+        (["--set", "sed=1..3"], "did you mean seed?"),
+        (["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"], "these are 1000000 points"),
+        (["--replicas", "3", "--set", "seed=1..3"], "leave out one of them"),
+        (["--set", "seed=1..3", "--to", "slurm"], "needs --walltime"),
+        (["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"], "do not go together"),
+        (["--set", "seed=1..3", "--trust", "nothing.py"], "there is no such file"),
+    ],
+)  # fmt: skip
+def test_bad_input(arguments, expected, argon, tmp_path, capsys):
+    assert cli.main(["sweep", str(argon), *arguments, "-o", str(tmp_path / "sweep")]) == 2
+    assert expected in capsys.readouterr().err
+    assert not (tmp_path / "sweep").exists()
+
+
+def test_all_faults_of_all_points_at_once(argon, tmp_path, capsys):
+    arguments = ["--set", "start.temperature_K=-5,100,cold", "--set", "forces.cutoff_A=8,12", "-o", str(tmp_path / "s")]
+    assert cli.main(["sweep", str(argon), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert "3 faults" in said
+    assert "at temperature_K = -5, cutoff_A = 8 and 1 more points: --set start.temperature_K: is -5" in said
+    assert "at temperature_K = 100, cutoff_A = 12: forces.cutoff_A = 12 is longer than half" in said
+    assert "at temperature_K = cold" in said
+    assert (
+        cli.main(["sweep", str(argon), "--set", "seed=1,2", "--set", "forces.cutoff_A=12", "-o", str(tmp_path / "s")])
+        == 2
+    )
+    assert capsys.readouterr().err.startswith(f"rigidmd: {argon}: forces.cutoff_A = 12")
+    assert not (tmp_path / "s").exists()
+
+
+def test_folders_that_are_none(argon, tmp_path, copied, capsys):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("")
+    for name, expected in (("file", "is a file"), ("full", "holds no sweep")):
+        for more in ([], ["--force"]):
+            assert cli.main(["sweep", str(argon), *GRID, "-o", str(tmp_path / name), *more]) == 2
+            assert expected in capsys.readouterr().err
+    assert cli.main(["sweep", str(argon), "-o", str(tmp_path / "none"), "--collect"]) == 2
+    assert "holds no sweep" in capsys.readouterr().err
+    assert cli.main(["sweep", str(argon), "-o", str(copied), "--point", "4"]) == 2
+    assert "has points 0 to 3, not 4" in capsys.readouterr().err
+    assert cli.main(["report", str(copied)]) == 2
+    assert "is the folder of a sweep; name one of the runs in it" in capsys.readouterr().err
+    for text in (
+        "",
+        "{}",
+        "[]",
+        '{"schema": 1}',
+        '{"schema": 99}',
+        "{",
+        '{"schema": 1, "points": [{"folder": "../x"}]}',
+    ):
+        (copied / "sweep.json").write_text(text)
+        assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
+        assert "sweep.json" in capsys.readouterr().err
+        assert cli.main(["analyse", str(copied)]) == 2
+        assert "sweep.json" in capsys.readouterr().err
+
+
+def test_a_manifest_names_no_folder_outside(copied, argon, capsys):
+    told = json.loads((copied / "sweep.json").read_text())
+    for name in ("../outside", "..", "/tmp/x", ""):
+        told["points"][0]["folder"] = name
+        (copied / "sweep.json").write_text(json.dumps(told))
+        assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
+        assert "names of folders that a sweep does not give" in capsys.readouterr().err
+
+
+def test_a_manifest_of_a_stranger_is_held_against_what_it_should_be(copied, argon, capsys):
+    whole = json.loads((copied / "sweep.json").read_text())
+    for change in (
+        {"keys": []}, {"keys": {"seed": ["other"], "start.temperature_K": ["start.temperature_K"]}}, {"fixed": "x"},
+        {"common": 3}, {"name": None}, {"points": 3}, {"points": [3]}, {"trust": ["evil.py"]},
+        {"points": [whole["points"][0] | {"state": "done"}]}, {"points": [whole["points"][0] | {"values": {}}]},
+        {"points": [whole["points"][0] | {"seconds": "long"}]}, {"points": whole["points"][:1] * 2},
+    ):  # fmt: skip
+        (copied / "sweep.json").write_text(json.dumps(whole | change))
+        for command in (["sweep", str(argon), *GRID, "-o"], ["analyse"]):
+            assert cli.main([*command, str(copied)]) == 2, change
+            assert "is no manifest of a sweep" in capsys.readouterr().err, change
