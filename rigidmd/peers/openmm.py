@@ -1,6 +1,7 @@
 """An engine that lets OpenMM compute, on one of its platforms.
 
-Two contexts hold the system: one moves it, the other evaluates, so that looks leave no trace in the motion. OpenMM has
+Two contexts hold the system: one moves it, the other evaluates term by term, so that looks leave no trace in the motion
+and what moves may compute several terms at once. OpenMM has
 no virial; that of molecules follows from energies at centres of mass that are moved apart and together.
 """
 
@@ -41,7 +42,6 @@ class Held(NamedTuple):
     drawn: Portrait
     particles: parts.Layout
     bodies: Bodies
-    made: "openmm.System"
 
     def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
@@ -51,12 +51,15 @@ class Held(NamedTuple):
         velocity[self.particles.mass == 0] = 0.0
         return at, velocity
 
+    def made(self, state: State, apart: bool) -> "openmm.System":
+        """OpenMM's system in the cell of a state; see `openmm_system`."""
+        return parts.openmm_system(self.drawn, self.particles, state.cell, apart)
 
-def held(drawn: Portrait, state: State) -> Held:
-    """A system in OpenMM with the cell of a state."""
+
+def held(drawn: Portrait) -> Held:
+    """How a system is held in OpenMM."""
     particles = parts.layout(drawn)
-    bodies = Bodies(drawn.system, particles.points)
-    return Held(drawn, particles, bodies, parts.openmm_system(drawn, particles, state.cell))
+    return Held(drawn, particles, Bodies(drawn.system, particles.points))
 
 
 def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
@@ -87,20 +90,20 @@ class OpenmmEngine:
             raise EngineError(f"{system.scene.source}: OpenMM cannot run this scene: {'; '.join(faults)}")
         where, properties = platform_of(platform, system)
         self._system, self._stage = system, system.scene.stages[stage]
-        self._held = held(drawn, system.state)
+        self._held = held(drawn)
         #: Whether forces are computed in double precision.
         self._double = platform == "Reference" or properties.get("Precision") == "double"
         self._integrator = integrator_of(drawn, stage, tolerance(platform, properties))
         rest = mm.VerletIntegrator(0.001)
         try:
-            # the one that evaluates comes first: a barostat is for the other one only
-            self._seer = mm.Context(self._held.made, rest, where, properties)
+            seen, moved = (self._held.made(system.state, apart) for apart in (True, False))
             for mover in movers(drawn, stage):
-                self._held.made.addForce(mover)
-            self._mover = mm.Context(self._held.made, self._integrator, where, properties)
+                moved.addForce(mover)
+            self._seer = mm.Context(seen, rest, where, properties)
+            self._mover = mm.Context(moved, self._integrator, where, properties)
         except mm.OpenMMException as error:
             raise EngineError(f"OpenMM cannot hold this system on {platform}: {error}") from None
-        self._groups = {force.getForceGroup() for force in self._held.made.getForces()}
+        self._groups = {force.getForceGroup() for force in seen.getForces()}
         if drawn.has_waves:
             self._groups.add(parts.RECIPROCAL)
         self._has: State | None = None  # the state that the mover has
