@@ -68,7 +68,7 @@ def agree(ours, theirs, state, tolerance, of_loads=None):
         assert counted[name].energy == pytest.approx(tally.energy, rel=tolerance), name
     for mine, its in zip(load, other, strict=True):
         assert difference(its[moving], mine[moving]) < (of_loads or tolerance)
-    return (np.diag(sum(t.virial for t in found.values())) for found in (tallies, counted))
+    return (sum(t.virial for t in found.values()) for found in (tallies, counted))
 
 
 def system_moves(engine):
@@ -197,10 +197,20 @@ def test_damped_shifted_force():
 def test_a_leaning_box_with_parameters_of_pairs():
     pairs = [{"sites": ["OW", "AR"], "sigma_A": 3.3, "epsilon_kJ_mol": 0.9}]
     box = {"lengths_A": [15.0, 14.0, 14.5], "angles_deg": [75.0, 80.0, 100.0]}
-    scene = small_scene({"spce": 12, "argon": 6}, 1.0, box=box, forces={"cutoff_A": 6.0, "pairs": pairs})
-    system, ours, state = shaken(build(scene), 3)
-    mine, its = agree(ours, OpenmmEngine(system, platform="Reference"), state, 1e-10)
-    assert difference(its, mine) < 1e-5  # from differences of energies
+    for tensor in (True, False):
+        scene = small_scene(
+            {"spce": 12, "argon": 6},
+            1.0,
+            box=box,
+            forces={"cutoff_A": 6.0, "pairs": pairs},
+            output={"pressure_tensor": tensor},
+        )
+        system, ours, state = shaken(build(scene), 3)
+        mine, its = agree(ours, OpenmmEngine(system, platform="Reference"), state, 1e-10)
+        # from differences of energies
+        assert its.trace() == pytest.approx(mine.trace(), rel=1e-5)
+        if tensor:
+            assert difference(its, (mine + mine.T) / 2) < 1e-5
 
 
 def test_pme_with_ions_and_frozen_molecules():
@@ -212,9 +222,7 @@ def test_pme_with_ions_and_frozen_molecules():
     ]  # fmt: skip
     system, ours, state = shaken(build(small_scene({}, 13.0, molecules=molecules, forces=forces)), 3, 0.2)
     state.position[-3:], state.rotation[-3:] = system.state.position[-3:], system.state.rotation[-3:]
-    mine, its = agree(ours, OpenmmEngine(system, platform="Reference"), state, 1e-6)
-    # rigidmd's own virial counts the interactions of frozen molecules, which OpenMM is not asked for
-    assert np.isfinite(its).all() and len(mine) == 3
+    agree(ours, OpenmmEngine(system, platform="Reference"), state, 1e-6)
     single = OpenmmEngine(system, platform="CPU")
     agree(ours, single, state, 1e-4)
 
@@ -316,14 +324,16 @@ def test_thermostats_keep_the_temperature_of_both_motions(kind):
 
 @pytest.mark.slow
 def test_the_barostat_gives_the_volume_of_an_ideal_gas():
-    """(N + 1) kT/P, of bodies that hardly touch: the sites of a pair exclude 0.1 Å³, of 140 for each molecule."""
+    """(N + 1) kT/P, of bodies that hardly touch: the sites of a pair exclude 0.02 Å³, of 140 for each molecule.
+
+    The cut-off is short because OpenMM's largest change of the volume is a part of what that was, not of what it is."""
     stage = {"duration_ps": 1000.0, "timestep_fs": 2.0} | THERMOSTATS["npt"] | {"pressure_bar": 300.0}
     sites = [
-        {"name": name, "element": "N", "position_A": [x, 0.0, 0.0], "sigma_A": 1.0, "epsilon_kJ_mol": 1e-6}
+        {"name": name, "element": "N", "position_A": [x, 0.0, 0.0], "sigma_A": 0.3, "epsilon_kJ_mol": 1e-6}
         for name, x in (("N1", -0.5), ("N2", 0.5))
     ]
     gas = {"name": "gas", "count": 20, "sites": [site | {"mass_u": 14.0} for site in sites]}
-    system = build(small_scene({}, 14.0, molecules=[gas], stages=[stage], forces={"cutoff_A": 3.0}))
+    system = build(small_scene({}, 14.0, molecules=[gas], stages=[stage], forces={"cutoff_A": 0.5}))
     engine, row = OpenmmEngine(system, platform="Reference"), system.scene.stages[0].scheme
     state, found = engine.begin(system.state, row), []
     for k in range(1, 20001):

@@ -140,11 +140,12 @@ class OpenmmEngine:
         self._has = state.copy()
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, and each term's energy; the virial of all of them, its diagonal, stands with
-        the first."""
+        """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
         if self._seen is None or not _same(self._seen[0], state):
-            tallies = self._tallies(state)
-            self._seen = state.copy(), self._load(state), tallies
+            position, force = self._forces(state)
+            load = self._held.bodies.load(state, position, force)
+            virial = self._virial(state, self._held.bodies.within(position, force))
+            self._seen = state.copy(), load, self._tallies(state, virial)
         _, load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
@@ -156,7 +157,11 @@ class OpenmmEngine:
 
     def memory(self) -> dict[str, np.ndarray]:
         """What OpenMM itself keeps of its context: particles, random numbers, its thermostat."""
-        kept = np.frombuffer(self._mover.createCheckpoint(), np.uint8).copy() if self._has else np.zeros(0, np.uint8)
+        kept = (
+            np.frombuffer(self._mover.createCheckpoint(), np.uint8).copy()
+            if self._has is not None
+            else np.zeros(0, np.uint8)
+        )
         return {"context": kept, "heat": np.array([self._books, self._chain])}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
@@ -177,7 +182,8 @@ class OpenmmEngine:
 
     def close(self) -> None:
         """Let OpenMM's memory go."""
-        del self._mover, self._seer, self._integrator
+        for name in ("_mover", "_seer", "_integrator"):
+            self.__dict__.pop(name, None)
 
     def _give(self, state: State) -> None:
         """Let OpenMM have a state, unless it has it already; its thermostat goes on."""
@@ -230,17 +236,16 @@ class OpenmmEngine:
         groups = group if isinstance(group, set) else {group}
         return KJ_PER_MOL * self._seer.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
 
-    def _load(self, state: State) -> Load:
-        """Forces and torques on bodies; OpenMM gives the forces on virtual sites to the mass points that place them."""
+    def _forces(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Positions of mass points (p, 3) and the forces on them, in which those on virtual sites are."""
         self._put(self._seer, state)
         acting = self._groups - {parts.STEP_LENNARD_JONES, parts.STEP_COULOMB}
         force = self._seer.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
-        position, _ = self._held.bodies.points(state)
-        return self._held.bodies.load(state, position, force[self._held.particles.point] * FORCE)
+        return self._held.bodies.points(state)[0], force[self._held.particles.point] * FORCE
 
-    def _tallies(self, state: State) -> dict[str, Tally]:
+    def _tallies(self, state: State, virial: np.ndarray) -> dict[str, Tally]:
         """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
-        drawn, virial = self._held.drawn, self._virial(state)
+        drawn = self._held.drawn
         self._put(self._seer, state)
         found = {"lennard_jones": self._energy(parts.LENNARD_JONES)} if parts.LENNARD_JONES in self._groups else {}
         law = drawn.coulomb
@@ -272,19 +277,37 @@ class OpenmmEngine:
             total += intramolecular_energy(drawn.charge[still] * COULOMB_CHARGE, position, alpha)
         return total
 
-    def _virial(self, state: State) -> np.ndarray:
-        """The diagonal (3, 3) of the virial of molecules: how the energy falls as their centres move apart along an
-        axis, from energies that are continuous at the cut-off. 0 without a box."""
+    def _virial(self, state: State, within: np.ndarray) -> np.ndarray:
+        """The virial of molecules (3, 3), its symmetric part: how the energy falls as their centres move apart, from
+        energies that are continuous at the cut-off. 0 without a box.
+
+        within : sum of F (x) d over mass points; the virial of all sites, which is symmetric, has it besides
+
+        Where the scene asks for no tensor of pressures, only its trace, of which each axis gets a third: that takes two
+        energies in place of twelve, and every look has to wait for them.
+        """
         virial, strain = np.zeros((3, 3)), STRAIN[self._double]
         if not self._held.drawn.boxed:
             return virial
         groups = self._groups - {parts.TAIL}
-        for k in range(3):
+
+        def slope(along: np.ndarray) -> float:
+            """Of the energy with a strain of centres and cell along a matrix."""
+            energy = []
             for sign in (-1, 1):
-                stretch = np.ones(3)
-                stretch[k] += sign * strain
-                self._put(self._seer, state._replace(position=state.position * stretch, cell=state.cell * stretch))
-                virial[k, k] -= self._energy(groups) * sign / (2 * strain)
+                by = np.eye(3) + sign * strain * along
+                self._put(self._seer, state._replace(position=state.position @ by, cell=state.cell @ by))
+                energy.append(self._energy(groups))
+            return (energy[1] - energy[0]) / (2 * strain)
+
+        output = self._system.scene.output
+        if not (output.pressure_tensor or output.pressure_tensor_interval_ps):
+            return -slope(np.eye(3)) / 3 * np.eye(3)
+        for row, column in zip(*np.tril_indices(3), strict=True):  # the cell keeps its form
+            along = np.zeros((3, 3))
+            along[row, column] = 1.0
+            apart = -slope(along) + (within[column, row] - within[row, column]) / 2
+            virial[row, column] = virial[column, row] = apart
         return virial
 
 
