@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from rigidmd.analyse import commands as analysing
 from rigidmd.analyse.commands import time_ps
 from rigidmd.looking import commands as looking
+from rigidmd.study import handing_over
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
@@ -116,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "--resume", action="store_true",
         help="go on from the last checkpoint in that folder, to the same bits; without one, begin",
     )  # fmt: skip
+    _engines(run)
     _going_on(run)
 
     resume = _command(
@@ -162,6 +164,8 @@ def _parser() -> argparse.ArgumentParser:
         commands, "check", _check, "describe a run without running it", "rigidmd check systems/water_nitrogen.toml"
     )
     _scene_arguments(check)
+    _engines(check)
+    handing_over.add_commands(partial(_command, commands), _scene_arguments, _read_scene)
 
     precision = _command(
         commands,
@@ -302,6 +306,15 @@ def _trusting(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _engines(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--engine", choices=["rigidmd", "lammps", "openmm"],
+        help="who computes the run: the key engine.name of the scene (default: the scene's, or rigidmd)",
+    )  # fmt: skip
+    parser.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
+    parser.add_argument("--platform", metavar="NAME", help="of openmm: CPU, Reference, CUDA, OpenCL (default: CPU)")
+
+
 def _going_on(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(writes=True)
     parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
@@ -333,6 +346,9 @@ def _read_scene(options: argparse.Namespace, **more):
         for path in options.trust:
             trust(path)
     overrides = dict(parse_override(text) for text in options.overrides)
+    for option, key in (("engine", "name"), ("ranks", "ranks"), ("platform", "platform")):
+        if (value := getattr(options, option, None)) is not None:
+            overrides[f"engine.{key}"] = value
     return Scene.read(options.scene, overrides | more)
 
 
@@ -508,10 +524,15 @@ def _body_energy(scene: "BodyScene", options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     from rigidmd.assemble.describe import describe
     from rigidmd.measure.stable_step import long_steps
-    from rigidmd.scene import BodyScene
+    from rigidmd.scene import BodyScene, MolecularScene
 
     scene = _read_scene(options)
     print(describe(scene))
+    if isinstance(scene, MolecularScene) and scene.engine.is_other:
+        from rigidmd.assemble.system import build
+        from rigidmd.peers.engines import refuse
+
+        refuse(build(scene))
     for warning in [] if isinstance(scene, BodyScene) else long_steps(scene):
         _warn(warning)
     return 0

@@ -30,6 +30,7 @@ CHAPTERS = (
     "notebook",
     "measuring",
     "ase",
+    "engines",
     "extending",
     "manual",
     "benchmarks",

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from rigidmd.assemble.cells import basis_in_words, edges_in_words
+from rigidmd.assemble.handover import resolved_stage
 from rigidmd.core.schemes import RK4, SOLVERS
 from rigidmd.forces.pairs.space import Space, Triclinic, cell_of
 from rigidmd.forces.waves.errors import (
@@ -101,7 +102,7 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
     tables = {
         "forces": scene.forces.model_copy(update=numbers),
         "output": _output(scene.output),
-        "stages": tuple(stage.resolved for stage in scene.stages),
+        "stages": tuple(resolved_stage(scene, stage) for stage in scene.stages),
     }
     if scene.structure is not None:
         tables["structure"] = scene.structure.model_copy(update={"topology": scene.topology})

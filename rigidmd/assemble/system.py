@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_terms, fields_left_out
+from rigidmd.assemble.handover import handed_over
 from rigidmd.assemble.momenta import Freedom, freedom_of, kept_momentum, mobile
 from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.resolve import Facts, resolve, resolve_momentum
@@ -161,6 +162,7 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
 
     bare : leave out what users add, their code too; for looking at a run that has ended
     """
+    scene, handover_notes = handed_over(scene)
     species = species_of(scene)
     arrangement = arrange(scene, species)
     space, number = space_of(arrangement.cell), residue_numbers(arrangement)
@@ -197,7 +199,7 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
         from_lattice=scene.structure is None,
         left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
         force_error=acting.force_error,
-        notes=[*acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
+        notes=[*handover_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )
     if not bare:
         if scene.from_python != scene.own.names:

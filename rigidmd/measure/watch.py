@@ -172,6 +172,8 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
         kinetic = max(kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom.total)
         share = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
+    if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
+        return None
     scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
     if abs(drift) * share <= limits.energy * scale:
         return None

@@ -71,11 +71,10 @@ class Bodies:
     def load(self, state: State, position: np.ndarray, force: np.ndarray) -> Load:
         """Forces and torques on bodies from those on sites (s, 3)."""
         arm = position - self._mean(position)[self._molecule]
-        total = np.where(self._frozen[:, None], 0.0, self._sum(force))
         if not len(state.rotation):
-            return Load(total, np.zeros((0, 3)))
+            return Load(self._sum(force), np.zeros((0, 3)))
         torque = np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force)))
-        return Load(total, np.where(self._frozen[:, None] | (self._inertia == 0), 0.0, torque))
+        return Load(self._sum(force), torque)
 
     def within(self, position: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Sum (3, 3) of F (x) d, d from the centre of mass: the virial of sites less this is that of molecules."""
@@ -96,12 +95,11 @@ class Bodies:
         left, _, right = np.linalg.svd(overlap.reshape(-1, 3, 3))
         left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
         found = left @ right
-        if self._linear.any():
-            axis = left[:, :, 0][self._linear]  # of the lab, to which `along` of the body points
-            along = right[:, 0][self._linear]
-            found[self._linear] = _tilted(
-                before[self._linear], np.einsum("nij,nj->ni", before[self._linear], along), axis
-            )
+        if (line := self._linear).any():
+            axis = left[line, :, 0]  # in the lab, of what is `along` in the body
+            along = right[line, 0]
+            was = np.einsum("nij,nj->ni", before[line], along)
+            found[line] = _tilted(before[line], was, axis)
         return found
 
 

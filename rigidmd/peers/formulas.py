@@ -1,6 +1,6 @@
-"""Pair laws as formulas of r in the language of Lepton, which LAMMPS and OpenMM read; the numbers are those of the laws.
+"""Pair laws as formulas of r with the numbers of the laws, where an engine has no form of its own with the same ending.
 
-They serve where an engine has no form of its own with the same ending. `max`, `erfc` and powers are Lepton's.
+They are in the language of Lepton, which OpenMM reads: x^2, max, erfc, and definitions behind semicolons.
 """
 
 from rigidmd.forces.laws.coulomb import ReactionField
@@ -36,10 +36,9 @@ def _ended(formula: str, shape: Shape, end: tuple[float, ...]) -> str:
     constant, linear, quadratic, cubic = (float(part) for part in end)
     whole = f"{formula}+({constant!r})" if constant else formula
     if isinstance(shape, Bent):
-        return (
-            f"{whole}-(x*({linear!r})+x^3*({quadratic / 3!r})+x^4*({cubic / 4!r})); x=max(0,r-{float(shape.start)!r})"
-        )
-    if type(shape) in SWITCHES:
+        added = f"x*({linear!r})+x^3*({quadratic / 3!r})+x^4*({cubic / 4!r})"
+        return f"{whole}-({added}); x=max(0,r-{float(shape.start)!r})"
+    if isinstance(shape, Switched | SmoothlySwitched):
         width = float(shape.cutoff - shape.start)
         return f"({whole})*({SWITCHES[type(shape)]}); t=max(0,(r-{float(shape.start)!r})/{width!r})"
     return whole

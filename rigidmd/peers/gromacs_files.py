@@ -14,7 +14,6 @@ from scipy.special import erfc
 
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
-from rigidmd.errors import EngineError
 from rigidmd.forces.laws.coulomb import ReactionField
 from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.waves.mesh import Pme
@@ -105,10 +104,7 @@ def _body(molecule: Molecule) -> MassPoints:
 
 
 def write_gromacs(folder: Path, portrait: Portrait, state: State) -> list[str]:
-    """Write the files for a system that begins at a state; their names. Raises EngineError, with all that GROMACS
-    cannot do, and OutputError."""
-    if found := faults(portrait):
-        raise EngineError(f"{portrait.system.scene.source}: GROMACS cannot run this scene: {'; '.join(found)}")
+    """Write the files for a system that begins at a state; their names. Raises OutputError."""
     bodies = [_body(m) for m in portrait.system.species]
     stages = [(k, stage) for k, stage in enumerate(portrait.system.scene.stages) if not stage.is_minimisation]
     names = [f"{n}_{re.sub('[^A-Za-z0-9]+', '_', stage.label)}" for n, (_, stage) in enumerate(stages, 1)]

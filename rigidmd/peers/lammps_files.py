@@ -1,15 +1,17 @@
 """Input files of LAMMPS, in its units real, for a system: atoms, settings, and the stages of a run."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import inf, pi
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
-from rigidmd.forces.laws.screened import DampedShiftedForce
+from rigidmd.forces.laws.endings import Plain
+from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.peers.formulas import coulomb_formula, lennard_jones_formula
 from rigidmd.peers.portrait import Portrait, strange
 from rigidmd.peers.tables import table
@@ -49,13 +51,8 @@ class PairStyle(NamedTuple):
     name: str
     arguments: str
     coefficients: dict[tuple[int, int], str]  # kinds from 0, the smaller one first
-    formulas: dict[tuple[int, int], str] = {}  # of tables: energy, kcal/mol
+    formulas: Mapping[tuple[int, int], str] = MappingProxyType({})  # of tables: energy, kcal/mol
     modify: str = ""
-
-    @property
-    def is_table(self) -> bool:
-        """Whether its coefficients name tables."""
-        return self.name == "table"
 
 
 def faults(portrait: Portrait) -> list[str]:
@@ -115,27 +112,32 @@ def write_data(path: Path, portrait: Portrait, state: State) -> None:
         low, high = np.zeros(3), state.cell.diagonal()
         lines += _bounds(low, high)
         tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])
-        lines += ["{:.17g} {:.17g} {:.17g} xy xz yz".format(*tilt)] if any(tilt) else []
+        lines += [f"{' '.join(map(_n, tilt))} xy xz yz"] if any(tilt) else []
     else:
         lines += _bounds(position.min(axis=0) - 1, position.max(axis=0) + 1)
     lines += ["", "Masses", ""]
-    lines += [f"{k + 1} {kind.mass or NO_MASS:.17g} # {kind.name}" for k, kind in enumerate(portrait.kinds)]
+    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {kind.name}" for k, kind in enumerate(portrait.kinds)]
     lines += ["", "Atoms # full", ""]
     charge = portrait.charge
     rows = zip(system.sites.molecule + 1, portrait.kind + 1, charge, position, image, strict=True)
     lines += [
-        f"{i} {m} {k} {q:.17g} {x:.17g} {y:.17g} {z:.17g} {nx} {ny} {nz}"
+        f"{i} {m} {k} {_n(q)} {_n(x)} {_n(y)} {_n(z)} {nx} {ny} {nz}"
         for i, (m, k, q, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1)
     ]
     per_fs = velocity * 1e-3  # Å/ps to Å/fs
     lines += ["", "Velocities", ""]
-    lines += [f"{i} {x:.17g} {y:.17g} {z:.17g}" for i, (x, y, z) in enumerate(per_fs, 1)]
+    lines += [f"{i} {_n(x)} {_n(y)} {_n(z)}" for i, (x, y, z) in enumerate(per_fs, 1)]
     with whole_file(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def _n(number: Any) -> str:
+    """The shortest digits that give a number back."""
+    return repr(float(number))
+
+
 def _bounds(low: np.ndarray, high: np.ndarray) -> list[str]:
-    return [f"{a:.17g} {b:.17g} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
+    return [f"{_n(a)} {_n(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
 
 
 def settings(portrait: Portrait, data: str = DATA) -> list[str]:
@@ -160,7 +162,7 @@ def settings(portrait: Portrait, data: str = DATA) -> list[str]:
         way = "pppm" if forces.electrostatics == "pme" else "ewald"
         lines += [
             f"kspace_style {way} {accuracy(portrait):.3g}",
-            f"kspace_modify gewald {forces.ewald_alpha_per_A:.17g}",
+            f"kspace_modify gewald {_n(forces.ewald_alpha_per_A)}",
         ]
     lines += [f"neighbor 2.0 {'bin' if portrait.boxed else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
     lines += ["neigh_modify exclude molecule/intra all"]
@@ -205,17 +207,18 @@ def _lennard_jones(portrait: Portrait) -> PairStyle | None:
         return None
     name = STYLES[portrait.truncation] if law.cutoff < inf else "lj/cut"
     pairs = [(i, j) for i, j in np.argwhere(portrait.epsilon > 0) if i <= j]
-    cutoff = f"{_cutoff(law.cutoff):.17g}"
+    cutoff = _n(_cutoff(law.cutoff))
     if name == "table":
         formulas = {}
         for i, j in pairs:
-            six = portrait.sigma[i, j] ** 6
-            c6 = 4 * portrait.epsilon[i, j] * six
+            six = float(portrait.sigma[i, j]) ** 6
+            c6 = 4 * float(portrait.epsilon[i, j]) * six
             formulas[(i, j)] = lennard_jones_formula(law, c6 * six, c6, KCAL)
         return _tables("lj", formulas, cutoff)
-    two = name in ("lj/gromacs", "lj/mdf")
-    arguments = f"{law.shape.start:.17g} {cutoff}" if two else cutoff
-    coefficients = {(i, j): f"{portrait.epsilon[i, j] / KCAL:.17g} {portrait.sigma[i, j]:.17g}" for i, j in pairs}
+    arguments = cutoff
+    if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.shape, Plain):
+        arguments = f"{_n(law.shape.start)} {cutoff}"
+    coefficients = {(i, j): f"{_n(portrait.epsilon[i, j] / KCAL)} {_n(portrait.sigma[i, j])}" for i, j in pairs}
     shifts = f"pair_modify pair {name} shift yes" if portrait.truncation == "shift" and law.cutoff < inf else ""
     return PairStyle(name, arguments, coefficients, modify=shifts)
 
@@ -227,13 +230,13 @@ def _coulomb(portrait: Portrait) -> PairStyle | None:
     charge = [kind.charge for kind in portrait.kinds]
     charged = [k for k, q in enumerate(charge) if q != 0]
     pairs = [(i, j) for i in charged for j in charged if i <= j]
-    cutoff = f"{_cutoff(law.cutoff):.17g}"
-    if portrait.has_waves:
+    cutoff = _n(_cutoff(law.cutoff))
+    if isinstance(law, ScreenedCoulomb):
         return PairStyle("coul/long", cutoff, dict.fromkeys(pairs, ""), modify="pair_modify pair coul/long table 0")
     if law.cutoff == inf:
         return PairStyle("coul/cut", cutoff, dict.fromkeys(pairs, ""))
     if isinstance(law, DampedShiftedForce):
-        return PairStyle("coul/dsf", f"{law.alpha:.17g} {cutoff}", dict.fromkeys(pairs, ""))
+        return PairStyle("coul/dsf", f"{_n(law.alpha)} {cutoff}", dict.fromkeys(pairs, ""))
     of_pairs = {(i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs}
     return _tables("coulomb", of_pairs, cutoff)
 
@@ -309,12 +312,12 @@ def _of_points(portrait: Portrait, stage: Stage, seed: int, alone: bool) -> list
 def _chain(stage: Stage) -> str:
     """Temperatures and damping time, fs: LAMMPS gives the inverse of an angular frequency, a scene its period."""
     first, last = stage.temperatures
-    return f"temp {first:.17g} {last:.17g} {1e3 * stage.thermostat_time / (2 * pi):.17g}"
+    return f"temp {_n(first)} {_n(last)} {_n(1e3 * stage.thermostat_time / (2 * pi))}"
 
 
 def _langevin(stage: Stage, seed: int) -> str:
     first, last = stage.temperatures
-    return f"{first:.17g} {last:.17g} {1e3 / stage.frictions[0]:.17g} {seed}"
+    return f"{_n(first)} {_n(last)} {_n(1e3 / stage.frictions[0])} {seed}"
 
 
 def _box(portrait: Portrait, stage: Stage) -> str:
@@ -324,9 +327,22 @@ def _box(portrait: Portrait, stage: Stage) -> str:
     first, last = ([(bar * BAR - beyond) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
     damping = 1e3 * stage.barostat_time
     if stage.pressure_coupling == "isotropic":
-        return f"iso {np.mean(first):.17g} {np.mean(last):.17g} {damping:.17g}"
-    axes = " ".join(f"{axis} {a:.17g} {b:.17g} {damping:.17g}" for axis, a, b in zip("xyz", first, last, strict=True))
+        return f"iso {_n(np.mean(first))} {_n(np.mean(last))} {_n(damping)}"
+    axes = " ".join(f"{axis} {_n(a)} {_n(b)} {_n(damping)}" for axis, a, b in zip("xyz", first, last, strict=True))
     return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
+
+
+def _thermo(portrait: Portrait) -> list[str]:
+    """Columns of the log."""
+    columns = "step time temp pe ke etotal press vol density"
+    constant = portrait.system.constants.get("coulomb_intramolecular")
+    if constant is None:
+        return [f"thermo_style custom {columns}"]
+    return [
+        "# pe counts pairs within molecules in the sum over waves, a constant of rigid ones; this one does not",
+        f"variable potential equal pe+({_n(constant / KCAL)})",
+        f"thermo_style custom {columns} v_potential",
+    ]
 
 
 def input_script(portrait: Portrait) -> str:
@@ -338,7 +354,7 @@ def input_script(portrait: Portrait) -> str:
         "",
         f"include {SETTINGS}",
         "",
-        "thermo_style custom step time temp pe ke etotal press vol density",
+        *_thermo(portrait),
         "thermo_modify format float %.10g flush yes",
     ]
     for k, stage in enumerate(system.scene.stages):
@@ -347,7 +363,7 @@ def input_script(portrait: Portrait) -> str:
         every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
         frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
         fixes = movers(portrait, k)
-        lines += ["", f"# {stage.label}: {stage.duration:g} ps", f"timestep {stage.timestep_fs:.17g}", *fixes]
+        lines += ["", f"# {stage.label}: {stage.duration:g} ps", f"timestep {_n(stage.timestep_fs)}", *fixes]
         lines += [f"thermo {every}"]
         if output.trajectory:
             lines += [f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"]
@@ -355,3 +371,13 @@ def input_script(portrait: Portrait) -> str:
         lines += [f"run {stage.steps}"]
         lines += [f"unfix {fix.split()[1]}" for fix in fixes] + (["undump frames"] if output.trajectory else [])
     return "\n".join([*lines, "", "write_data final.lammps", ""])
+
+
+def write_lammps(folder: Path, portrait: Portrait, state: State) -> list[str]:
+    """All files of a run in a folder. Returns their names. Raises OutputError."""
+    write_data(folder / DATA, portrait, state)
+    for name, text in ((SETTINGS, "\n".join([*settings(portrait), ""])), (INPUT, input_script(portrait))):
+        with whole_file(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    tables = [TABLES] if write_tables(folder / TABLES, portrait) else []
+    return [INPUT, SETTINGS, DATA, *tables]

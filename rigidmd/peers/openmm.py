@@ -12,6 +12,7 @@ import numpy as np
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
+from rigidmd.dynamics.advance import Model
 from rigidmd.engines import Tally
 from rigidmd.engines.cpu import NotFiniteError, keep_time
 from rigidmd.errors import EngineError, SimulationError
@@ -78,18 +79,19 @@ def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
 class OpenmmEngine:
     """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
 
-    Raises EngineError, with all that OpenMM cannot do, or if it is not there.
+    `openmm_system.faults` tells what OpenMM cannot do. Raises EngineError if it is not here.
     """
 
-    moves = (0, 0)
+    moves: tuple[int, int] = (0, 0)
+    lengths_to = 2.0**-24  # SETTLE has its distances in single precision, on all platforms
 
     def __init__(self, system: System, stage: int = 0, platform: str = "CPU"):
         mm = parts.library()
         drawn = portrait(system)
-        if faults := parts.faults(drawn):
-            raise EngineError(f"{system.scene.source}: OpenMM cannot run this scene: {'; '.join(faults)}")
         where, properties = platform_of(platform, system)
+        self.made_by = f"OpenMM {mm.__version__} on {platform}"
         self._system, self._stage = system, system.scene.stages[stage]
+        self.counts_heat = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._held = held(drawn)
         #: Whether forces are computed in double precision.
         self._double = platform == "Reference" or properties.get("Precision") == "double"
@@ -108,8 +110,6 @@ class OpenmmEngine:
             self._groups.add(parts.RECIPROCAL)
         self._has: State | None = None  # the state that the mover has
         self._books = 0.0  # heat in the books of a state that it was given, less what it had counted by then
-        #: What the thermostat's chain held when last asked, kJ/mol; before its first step OpenMM cannot be asked.
-        self._chain, self._stepped = 0.0, False
         self._moved: State | None = None
         self._seen: tuple[State, Load, dict[str, Tally]] | None = None
 
@@ -128,7 +128,6 @@ class OpenmmEngine:
         self._integrator.setStepSize(dt)
         try:
             step(self._integrator, steps)
-            self._stepped = True
         except parts.library().OpenMMException as error:
             if "NaN" in str(error):
                 raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan))) from None
@@ -162,18 +161,18 @@ class OpenmmEngine:
             if self._has is not None
             else np.zeros(0, np.uint8)
         )
-        return {"context": kept, "heat": np.array([self._books, self._chain])}
+        return {"context": kept, "heat": np.array([self._books])}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         """Go on from a state with what `memory` gave for it. Raises ValueError if they do not fit."""
         kept = memory["context"]
-        self._has, self._stepped = None, False
+        self._has = None
         if len(kept):
             try:
                 self._mover.loadCheckpoint(kept.tobytes())
             except parts.library().OpenMMException as error:
                 raise ValueError(f"OpenMM cannot go on from its checkpoint: {error}") from None
-            self._has, (self._books, self._chain) = state.copy(), memory["heat"].tolist()
+            self._has, (self._books,) = state.copy(), memory["heat"].tolist()
         self._moved = state
 
     def forget(self) -> None:
@@ -219,17 +218,21 @@ class OpenmmEngine:
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
 
+    def rotor(self, model: Model) -> None:
+        """None: OpenMM turns bodies by keeping distances."""
+        return None
+
     def _heat(self, state: State) -> float:
-        """What the thermostat has put in, up to a constant, u Å²/ps²."""
-        if self._stage.thermostat_kind == "nose_hoover" and not self._stage.has_barostat:
-            if self._stepped:
-                self._chain = self._integrator.computeHeatBathEnergy()._value
-            return -KJ_PER_MOL * self._chain
-        if self._stage.has_thermostat:  # friction, noise and moves of the box are not counted: what the energy gained
-            groups = integration_groups(self._held.drawn, self._stage)
-            energy = self._mover.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
-            return KJ_PER_MOL * energy + sum(kinetic_energies(self._system, state))
-        return 0.0
+        """What a thermostat has put in, up to a constant, u Å²/ps²: what the energy has gained.
+
+        OpenMM counts the energy of a Nosé-Hoover chain, but has velocities half a step off with it, and so no conserved
+        energy at any one time.
+        """
+        if self.counts_heat:
+            return 0.0
+        groups = integration_groups(self._held.drawn, self._stage)
+        energy = self._mover.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
+        return KJ_PER_MOL * energy + sum(kinetic_energies(self._system, state))
 
     def _energy(self, group: int | set[int]) -> float:
         """Energy of some groups where the evaluating context is, u Å²/ps²."""

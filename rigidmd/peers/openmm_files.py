@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
-from rigidmd.errors import EngineError
 from rigidmd.peers import openmm_system as parts
 from rigidmd.peers.openmm import Held, held
 from rigidmd.peers.openmm_stages import KICK, MOVES, TOLERANCES, integrator_of, movers
@@ -80,11 +79,9 @@ with open("final.xml", "w") as file:
 
 
 def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
-    """Write the folder for a system that begins at a state; the names of its files. Raises EngineError, with all that
-    OpenMM cannot do, or if it is not there, and OutputError."""
+    """Write the folder for a system that begins at a state; the names of its files. Raises EngineError if OpenMM is not
+    here, and OutputError."""
     mm = parts.library()
-    if found := parts.faults(portrait):
-        raise EngineError(f"{portrait.system.scene.source}: OpenMM cannot run this scene: {'; '.join(found)}")
     holds = held(portrait)
     position, velocity = (values * parts.NM for values in holds.positions(state))
     made = holds.made(state, apart=False)

@@ -5,7 +5,7 @@ once. What no other engine can express is refused here.
 """
 
 from math import inf
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -97,7 +97,7 @@ def portrait(system: System) -> Portrait:
             first.setdefault(mark, name)
     kinds = [SiteKind(first[mark], *mark[:3]) for mark in known]
     of_species = [np.array([order[mark] for mark in own]) for own in marks]
-    law = _law(system, "lennard_jones")
+    law = _law(system, "lennard_jones", LennardJones)
     sigma, epsilon = _pairs([mark[3] for mark in known], law)
     return Portrait(
         system=system,
@@ -107,7 +107,9 @@ def portrait(system: System) -> Portrait:
         sigma=sigma,
         epsilon=epsilon,
         lennard_jones=law,
-        coulomb=_law(system, "coulomb") or _law(system, "coulomb_real"),
+        coulomb=_law(system, "coulomb", ReactionField)
+        or _law(system, "coulomb", DampedShiftedForce)
+        or _law(system, "coulomb_real", ScreenedCoulomb),
     )
 
 
@@ -125,18 +127,21 @@ def strange(system: System) -> list[str]:
     return found
 
 
-def _law(system: System, name: str):
+Law = TypeVar("Law")
+
+
+def _law(system: System, name: str, kind: type[Law]) -> Law | None:
     term = system.terms.get(name)
-    return term.law if isinstance(term, PairForces) else None
+    return term.law if isinstance(term, PairForces) and isinstance(term.law, kind) else None
 
 
 def _kinds_of_law(system: System) -> list[list[int]]:
     """For each species the kind in the Lennard-Jones law of each of its sites; -1 for none."""
     found = [[-1] * len(m.masses) for m in system.species]
-    term = system.terms.get("lennard_jones")
-    if not isinstance(term, PairForces):
+    term, law = system.terms.get("lennard_jones"), _law(system, "lennard_jones", LennardJones)
+    if law is None or not isinstance(term, PairForces):
         return found
-    sites, law = term.sites, term.law
+    sites = term.sites
     for k, m in enumerate(system.species):
         members = np.flatnonzero(system.model.species == k)
         if len(members) == 0:

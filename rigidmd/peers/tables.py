@@ -1,6 +1,6 @@
 """Tables of pair laws, from formulas of r: energy and force, the force by differentiation."""
 
-import re
+from typing import Any
 
 import numpy as np
 import sympy
@@ -21,9 +21,9 @@ def _functions(formula: str):
     """Functions of arrays of r: energy, and force -dU/dr."""
     r = sympy.Symbol("r", positive=True)
     text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
-    names = {"r": r, "max": sympy.Max}
+    names: dict[str, Any] = {"r": r, "max": sympy.Max}
     for definition in reversed(definitions):
-        name, value = re.fullmatch(r"(\w+)=(.*)", definition).groups()
-        names[name] = sympy.sympify(value, locals=names)
-    energy = sympy.sympify(text, locals=names)
+        name, _, value = definition.partition("=")
+        names[name] = sympy.parse_expr(value, names)
+    energy = sympy.parse_expr(text, names)
     return (sympy.lambdify(r, part, ["numpy", "scipy"]) for part in (energy, -sympy.diff(energy, r)))

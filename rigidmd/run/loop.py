@@ -233,7 +233,9 @@ class Simulation(Base):
         results = Results(self.system, self.state, self._samples())
         results.interrupted, results.signal = self._interrupted, self._signal
         results.out_of_time = self._out_of_time
-        results.summary = provenance(self.scene, self.threads, self._inputs) | self._summary(results.samples, costs)
+        results.summary = provenance(self.scene, self.threads, self._inputs, self.made_by) | self._summary(
+            results.samples, costs
+        )
         for observer in observers:
             observer.end(self, results)
         if self.folder is not None:
@@ -249,6 +251,7 @@ class Simulation(Base):
     threads: int
     stretch: Stretch  # the present one
     time_unit = ""
+    made_by = "rigidmd"  # what moves the bodies
 
     @abstractmethod
     def introduction(self) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
+from rigidmd.engines.cpu import Engine
 from rigidmd.measure import watch
 from rigidmd.measure.samples import Samples
 from rigidmd.output.checkpoint import Checkpoint
@@ -187,10 +188,10 @@ class StepWatch(Observer):
 
     def see(self, moment: Moment) -> None:
         """Raise a `Finding` if the step exceeds a limit."""
-        run, load = self._run, self._run.engine.load
-        if load is None:
+        run, engine = self._run, self._run.engine
+        if not isinstance(engine, Engine) or engine.load is None:
             return  # no force has been evaluated yet
-        if finding := self._check.finding(run.state, load, run.scene.stages[moment.stage]):
+        if finding := self._check.finding(run.state, engine.load, run.scene.stages[moment.stage]):
             raise finding
 
 

@@ -16,7 +16,7 @@ from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
-from rigidmd.errors import SceneError, SimulationError
+from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.measure import watch
 from rigidmd.measure.accuracy import accuracy
 from rigidmd.measure.meanings import meanings
@@ -52,6 +52,8 @@ from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_
 if TYPE_CHECKING:
     import ase
 
+    from rigidmd.peers.engines import OtherEngine
+
 
 class MolecularSimulation(Simulation):
     """A scene of molecules, ready to run. Besides the parameters of `Simulation`:
@@ -67,7 +69,7 @@ class MolecularSimulation(Simulation):
 
     scene: MolecularScene
     system: System
-    engine: Engine
+    engine: "Engine | OtherEngine"
 
     def __init__(
         self,
@@ -105,8 +107,18 @@ class MolecularSimulation(Simulation):
         """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
         self._reset()
         with interruptible():
-            self._prepare()
+            self._relieve()
         return self._relief
+
+    def settle(self) -> State:
+        """Go to the state from which time passes, after relief of overlaps and the minimisations that come first."""
+        self.start()
+        for k, stage in enumerate(self.scene.stages):
+            if not stage.is_minimisation:
+                break
+            self._enter_minimisation(k)
+            self._minimise(False)
+        return self.state
 
     def _reset(self) -> None:
         self.system = self._built  # an earlier run may have chosen an integrator
@@ -116,7 +128,16 @@ class MolecularSimulation(Simulation):
         numba.set_num_threads(self.threads)
 
     def _prepare(self) -> None:
-        """Compile, and relieve overlaps of a lattice."""
+        """Relieve overlaps, and compile the steps or see that another engine computes the same."""
+        self._relieve()
+        if self.scene.engine.is_other:
+            self._check_other()
+        else:
+            self._compile()
+        self.engine.forget()
+
+    def _relieve(self) -> None:
+        """Compile the forces, and relieve overlaps of a lattice."""
         self._say("compiling (kept on disk: the next run starts at once)")
         with told_plainly(self.system):
             _, tallies = self.engine.evaluate(self.state)
@@ -146,11 +167,6 @@ class MolecularSimulation(Simulation):
                         ],
                     )
         check_forces(self.system, self.state)
-        with told_plainly(self.system):
-            for k, stage in enumerate(self.scene.stages):
-                if not (stage.is_open or stage.is_minimisation):
-                    row = row_of_stage(self.system, k)
-                    self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
         self.engine.forget()
         self._relief = relief
         self._choices: dict[int, str] = {}
@@ -160,6 +176,37 @@ class MolecularSimulation(Simulation):
         self._origins: dict[int, float] = {}
         self._stage = 0
         self._conserved: float | None = None
+
+    def _compile(self) -> None:
+        """Compile the steps of every stage."""
+        with told_plainly(self.system):
+            for k, stage in enumerate(self.scene.stages):
+                if not (stage.is_open or stage.is_minimisation):
+                    row = row_of_stage(self.system, k)
+                    self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
+
+    def _check_other(self) -> None:
+        """Let the other engine of the scene compute the start too. Raises EngineError where the two part."""
+        from rigidmd.peers.checking import compare_at, in_words
+        from rigidmd.peers.engines import other_engine
+
+        other = other_engine(self.system)
+        self.made_by = other.made_by
+        lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
+        other.close()
+        if not all(line.agrees for line in lines):
+            title = self.scene.engine.name
+            raise EngineError(
+                f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{in_words(lines, title)}"
+            )
+
+    def _engine_of(self, k: int) -> "Engine | OtherEngine":
+        """The engine of stage k; rigidmd's own minimises."""
+        if not self.scene.engine.is_other or self.scene.stages[k].is_minimisation:
+            return self.system.engine()
+        from rigidmd.peers.engines import other_engine
+
+        return other_engine(self.system, k)
 
     def _memory(self) -> dict[str, Any]:
         return {
@@ -199,7 +246,7 @@ class MolecularSimulation(Simulation):
         self._origins = dict(told["origins"])
         self._stage, self._conserved = told["stage"], told["conserved"]
         self._warnings.extend(told["notes"])
-        self.engine = self.system.engine()
+        self.engine = self._engine_of(self._stage)
         self.engine.recall(self.state, kept.of("engine").arrays)
 
     def _reenter(self, k: int) -> Stretch:
@@ -222,7 +269,7 @@ class MolecularSimulation(Simulation):
         self._estimate(k)
         # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
         # bit.
-        self.engine = self.system.engine()
+        self.engine = self._engine_of(k)
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
         self.state = self.engine.begin(self.state, row)
         self.state.begin_stretch()
@@ -305,6 +352,8 @@ class MolecularSimulation(Simulation):
         angles = angles_deg(cell) if boxed else np.full(3, nan)
         tensor = seen.pressure_tensor_bar
         mass = float(self.system.model.mass[self.system.model.species].sum())
+        # another engine may not tell what its thermostat takes out
+        known = not stage.is_minimisation and getattr(self.engine, "counts_heat", True)
         return Sample(
             step=moment.step,
             time=moment.time,
@@ -320,7 +369,7 @@ class MolecularSimulation(Simulation):
             temperature_translation_unbiased=seen.temperature_translation_unbiased,
             temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
             pressure_bar=seen.pressure_bar,
-            drift=nan if stage.is_minimisation else conserved - self._origins.setdefault(moment.stage, conserved),
+            drift=conserved - self._origins.setdefault(moment.stage, conserved) if known else nan,
             momentum=float(np.linalg.norm(seen.momentum)),
             orthogonality=seen.orthogonality,
             a=float(edges[0]),
@@ -347,7 +396,9 @@ class MolecularSimulation(Simulation):
         interval = output.log_interval_ps
         check = watch.StepCheck(self.system, self.scene.watch)
         self._sampler = Sampler(self, interval, check)
-        observers: list[Observer] = [self._sampler, StepWatch(self, check)]
+        observers: list[Observer] = [self._sampler]
+        if not self.scene.engine.is_other:  # others look after their own steps
+            observers.append(StepWatch(self, check))
         files: list[Observer] = []
         if output.trajectory:
             velocities = bool(output.velocities)
@@ -401,7 +452,8 @@ class MolecularSimulation(Simulation):
         measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
         """
         relief = self.start()
-        seen = observe(self.system, self.engine, self.state)
+        moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
+        seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state)
         force, molecule = seen.largest_force
         found = {
             "unit": unit,

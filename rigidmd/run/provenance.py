@@ -29,12 +29,14 @@ def computed_with() -> dict[str, Any]:
     }
 
 
-def provenance(scene: Scene, threads: int, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """The first part of summary.json: `computed_with`, and what went in. inputs : `input_digests` at the start."""
+def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: str) -> dict[str, Any]:
+    """The first part of summary.json: `computed_with`, and what went in. inputs : `input_digests` at the
+    start. engine : what moved the bodies"""
     molecular = isinstance(scene, MolecularScene)
     return {
         "scene": scene.name,
         **computed_with(),
+        "engine": engine,
         "threads": threads,
         "seed": scene.seed if molecular else None,
         "precision": scene.precision if molecular else "double",

@@ -10,6 +10,7 @@ from rigidmd.core.toml_text import shortened
 from rigidmd.errors import SceneError
 from rigidmd.molecules import SIZES
 from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.own import Own, not_given
@@ -96,6 +97,7 @@ class Settings(TypedDict, total=False):
     seed: int
     precision: Literal["double", "mixed"]
     threads: int
+    engine: dict[str, Any]
     structure: dict[str, Any]
     box: dict[str, Any]
     forces: dict[str, Any]
@@ -118,6 +120,7 @@ class MolecularScene(Scene):
     """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in double"""
     threads: Count | None = None
     """Number of threads; default: all cores. Results do not depend on it"""
+    engine: EngineChoice = EngineChoice()
     structure: Structure | None = None
     box: Box = Box()
     molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)

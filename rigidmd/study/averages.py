@@ -33,6 +33,14 @@ SETTLING = 0.2
 LOOK_PS, MOST_LOOKS = 0.02, 4000
 
 
+def check_is_at_home(scene: MolecularScene | BodyScene) -> None:
+    """Raise SceneError if another engine computes a scene: what is measured are rigidmd's own integrators."""
+    if isinstance(scene, MolecularScene) and scene.engine.is_other:
+        raise SceneError(
+            scene.source, [f"engine.name = {scene.engine.name!r}: precision measures rigidmd; leave it out"]
+        )
+
+
 def averages(
     scene: MolecularScene | BodyScene,
     methods: list[str] | None = None,
@@ -49,6 +57,7 @@ def averages(
     """
     if isinstance(scene, BodyScene):
         raise SceneError(scene.source, ["--averages is for molecules; a single body has no thermostat"])
+    check_is_at_home(scene)
     stage = _with_thermostat(scene)
     told = [_method(name, stage) for name in methods] if methods else _usual(stage)
     if not (sample > 0 and all(step > 0 for step in timesteps or [])):

@@ -8,7 +8,7 @@ from rigidmd.measure.accuracy import rounding
 from rigidmd.measure.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
 from rigidmd.measure.trials import Precision, Subject, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.study.averages import start_of_last_stage
+from rigidmd.study.averages import check_is_at_home, start_of_last_stage
 from rigidmd.validation import meant
 
 #: Default integrators: the common one, the best of each kind, and for a body the textbook solvers.
@@ -42,6 +42,7 @@ def precision(
     span : ps or s. averages : ps over which molecules' temperatures, energy and pressure are also averaged. Molecules
     start where the last stage starts, after the earlier stages have run; no thermostat acts.
     """
+    check_is_at_home(scene)
     known = (*SCHEMES, *COMPARATORS)
     integrators = list(dict.fromkeys(_named(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:

@@ -1,0 +1,72 @@
+"""The commands `export` and `verify`, by which a scene goes to another engine. They print and never compute."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+#: Of `verify`, whose exit code tells whether the engines agree.
+AGREES, PARTS = 0, 1
+
+
+def add_commands(
+    add: Callable[..., argparse.ArgumentParser],
+    scene_arguments: Callable[[argparse.ArgumentParser], None],
+    read_scene: Callable[..., Any],
+) -> None:
+    """Add them with `add(name, function, about, example)`; scenes are read by `read_scene(options, key=value)`."""
+    export = add(
+        "export",
+        _export,
+        "write a scene as a folder that runs on another engine by itself",
+        "rigidmd export systems/water_pme.toml --to lammps -o water_lammps",
+    )
+    scene_arguments(export)
+    export.add_argument("--to", required=True, choices=["lammps", "openmm", "gromacs"], help="the engine")
+    export.add_argument("-o", "--output", metavar="DIR", help="the folder (default: NAME-ENGINE)")
+    export.add_argument("--force", action="store_true", help="replace an earlier export in that folder")
+    export.set_defaults(writes=True, read_scene=read_scene)
+
+    verify = add(
+        "verify",
+        _verify,
+        "compute a scene on two engines and hold them against each other: energies by term, forces, virial, a short "
+        "run; exit code 0 if they agree, else 1",
+        "rigidmd verify systems/water_pme.toml --engine lammps --ranks 2",
+    )
+    scene_arguments(verify)
+    verify.add_argument(
+        "--engine", choices=["lammps", "openmm"], help="the other engine (default: the scene's, or lammps)"
+    )
+    verify.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
+    verify.add_argument("--platform", metavar="NAME", help="of openmm: its platform (default: Reference)")
+    verify.add_argument("--json", action="store_true", help="print JSON")
+    verify.set_defaults(read_scene=read_scene)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from rigidmd.study.export import export
+
+    scene = options.read_scene(options)
+    folder = Path(options.output or f"{scene.name}-{options.to}")
+    done = export(scene, options.to, folder, options.force)
+    print(f"{scene.name} for {done.title} in {folder}: {', '.join(done.files)}")
+    for note in done.notes:
+        print(f"  {note}")
+    print(f"next:\n  cd {folder} && {done.command}")
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    import json
+
+    from rigidmd.study.verify import verify
+
+    if options.engine is None and not options.read_scene(options).engine.is_other:
+        options.engine = "lammps"
+    if options.engine == "openmm" and options.platform is None:
+        options.platform = "Reference"
+    scene = options.read_scene(options)
+    found = verify(scene)
+    print(json.dumps(found.told(), indent=2) if options.json else found.in_words())
+    return AGREES if found.agrees else PARTS

@@ -1,0 +1,297 @@
+"""LAMMPS as an engine: both compute the same, a run comes back into the same folder, and what cannot be is refused."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT, built, small_scene
+from engine_scenes import PME, SCENES
+
+from rigidmd import cli
+from rigidmd.assemble.system import build
+from rigidmd.core.state import HEAT, NOW
+from rigidmd.errors import EngineError, SimulationError
+from rigidmd.measure.summary import mean
+from rigidmd.molecules import available_models
+from rigidmd.output.record import read_record
+from rigidmd.peers import lammps, lammps_files
+from rigidmd.peers.bodies import Bodies
+from rigidmd.peers.checking import compare_at, in_words
+from rigidmd.peers.lammps import LammpsEngine
+from rigidmd.run import Simulation
+from rigidmd.study.verify import verify
+
+pytest.importorskip("lammps")
+
+THERE = {"engine": {"name": "lammps"}}
+
+
+def both(counts, sections, seed=1, edge=15.0, **more):
+    """A system for LAMMPS, a state of it off the lattice, and the lines of a comparison there."""
+    system, _, state = built(counts, edge, seed, 0.2, **THERE | sections | more)
+    engine = LammpsEngine(system)
+    lines = compare_at(system, state, system.engine_of(system.terms, "double"), engine)
+    return system, state, engine, lines
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_both_engines_compute_the_same(name):
+    _, _, engine, lines = both(*SCENES[name])
+    assert all(line.agrees for line in lines), in_words(lines, "LAMMPS")
+    plain = [line for line in lines if line.name == "lennard jones"]
+    assert all(line.apart <= 1e-8 * abs(line.here) for line in plain)
+    engine.close()
+
+
+@pytest.mark.parametrize("truncation", ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"])
+def test_every_ending_is_the_same(truncation):
+    """Each has a style of LAMMPS, or a table: then splines decide how near it comes."""
+    forces = {"cutoff_A": 6.0, "truncation": truncation}
+    _, _, engine, lines = both({"nitrogen": 20, "argon": 4}, {"forces": forces}, edge=13.0)
+    for line in lines:
+        assert line.apart <= 2e-7 * abs(line.here), in_words(lines, "LAMMPS")
+    engine.close()
+
+
+def test_charges_within_a_cutoff_and_without_a_box():
+    forces = {"cutoff_A": 6.0, "electrostatics": "damped_shifted_force"}
+    for edge, own in ((13.0, forces), (None, {})):
+        _, _, engine, lines = both({"spce": 6}, {"forces": own}, edge=edge)
+        assert all(line.agrees for line in lines), in_words(lines, "LAMMPS")
+        engine.close()
+
+
+def test_an_error_of_the_forces_is_found(monkeypatch):
+    """Charges larger by a thousandth are seen in the terms of the start, and stop a run before its first step."""
+    wrong = lammps_files.COULOMB_REAL * 1.001
+    monkeypatch.setattr(lammps_files, "COULOMB_REAL", wrong)
+    _, _, engine, lines = both({"spce": 12}, {"forces": {"cutoff_A": 6.0}}, edge=13.0)
+    assert {"coulomb", "potential energy", "rms force on a molecule"} <= {x.name for x in lines if not x.agrees}
+    engine.close()
+
+
+def test_all_models_in_one_box():
+    counts = dict.fromkeys(available_models(), 1)
+    _, _, engine, lines = both(counts, {"forces": PME | {"cutoff_A": 9.0}}, edge=32.0)
+    assert all(line.agrees for line in lines), in_words(lines, "LAMMPS")
+    engine.close()
+
+
+def test_a_short_run_is_the_same_on_two_ranks(tmp_path):
+    """Both turn bodies by the same composition of rotations: what is left is the constants of LAMMPS."""
+    scene = small_scene({"spce": 20, "nitrogen": 4, "argon": 2}, 15.0, forces={"cutoff_A": 7.0},
+                        engine={"name": "lammps", "ranks": 2})  # fmt: skip
+    found = verify(scene)
+    assert found.agrees, found.in_words()
+    assert found.run[0].apart < 1e-6 and found.run[0].here > 0.1
+    assert "they agree" in found.in_words()
+    assert json.loads(json.dumps(found.told()))["agrees"] is True
+
+
+def test_states_come_back_as_they_went():
+    """Bodies of all kinds, from the positions and velocities of their sites."""
+    counts = {"spce": 5, "nitrogen": 5, "argon": 3, "benzene_opls": 2, "methane_opls": 3, "tip5p": 2}
+    system, _, state = built(counts, 24.0, 3)
+    state.velocity[:] = np.random.default_rng(0).standard_normal(state.velocity.shape)
+    there = state.copy()
+    turning = system.model.inertia[system.model.species] > 0
+    there.angular_momentum_body[:] = np.random.default_rng(1).standard_normal(turning.shape) * turning
+    bodies = Bodies(system)
+    back = bodies.state(state, system.site_positions(there), system.site_velocities(there), there.cell)
+    np.testing.assert_allclose(back.position, there.position, atol=1e-13)
+    np.testing.assert_allclose(back.velocity, there.velocity, atol=1e-13)
+    np.testing.assert_allclose(back.angular_momentum_body, there.angular_momentum_body, atol=1e-12)
+    np.testing.assert_allclose(back.rotation, there.rotation, atol=1e-12)
+    np.testing.assert_allclose(system.site_positions(back), system.site_positions(there), atol=1e-12)
+
+
+def test_chunks_are_the_whole_and_a_state_given_again_goes_on():
+    system, _, state = built({"spce": 12}, 13.0, 1, 0.1, **THERE, forces={"cutoff_A": 6.0})
+    engine, row = LammpsEngine(system), None
+    whole = engine.begin(state, row)
+    engine.advance(whole, row, 0.001, 20)
+    parts = engine.begin(state, row)
+    for until in (5, 12, 20):
+        engine.advance(parts, row, 0.001, until)
+        if until == 12:
+            engine.forget()  # it is given the state anew: rounding
+    np.testing.assert_allclose(parts.position, whole.position, atol=1e-10)
+    assert parts.step[NOW] == 20 and parts.time[NOW] == pytest.approx(0.02) and parts.books[HEAT] == 0
+    assert engine.snapshot().position.tobytes() == parts.position.tobytes()
+    engine.close()
+
+
+WATER = """
+[box]
+lengths_A = 13.0
+[[molecules]]
+model = "spce"
+count = 20
+[forces]
+cutoff_A = 6.0
+[[stages]]
+ensemble = "nvt"
+temperature_K = 300
+duration_ps = 0.04
+[[stages]]
+duration_ps = 0.04
+timestep_fs = 1
+[output]
+log_interval_ps = 0.01
+trajectory_interval_ps = 0.01
+checkpoint_minutes = 1
+"""
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    path = tmp_path / "water.toml"
+    path.write_text(WATER)
+    return path
+
+
+def test_a_run_on_two_ranks_is_a_run_like_any_other(scene, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert cli.main(["run", str(scene), "--engine", "lammps", "--ranks", "2", "-o", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "computed by LAMMPS on 2 ranks" in said
+    assert "stages.0: thermostat nose_hoover, because lammps has no velocity_rescaling" in said
+    record = read_record(folder)
+    assert list(record.columns["step"]) == [0, 5, 10, 15, 20, 30, 40, 50, 60]
+    drift = record.columns["drift"]
+    assert np.isnan(drift[1:5]).all() and np.abs(drift[5:]).max() < 0.1  # kJ/mol, of 20 molecules
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["engine"].startswith("LAMMPS 20") and summary["stages"][0]["drift_kJ_mol_ns_per_molecule"] is None
+    for command in ("view", "report", "analyse"):
+        assert cli.main([command, str(folder), *(["--only", "rdf"] if command == "analyse" else [])]) == 0
+    capsys.readouterr()
+    assert cli.main(["compare", str(folder), str(folder)]) == 0
+    # the folder knows its engine: it goes on there, from the state of the end
+    assert cli.main(["resume", str(folder), "--until", "0.1ps"]) == 0
+    assert read_record(folder).columns["step"][-1] == 80
+
+
+def test_an_exported_folder_runs_by_itself(tmp_path):
+    text = WATER.replace("cutoff_A = 6.0", 'cutoff_A = 6.0\nelectrostatics = "pme"')
+    (tmp_path / "water.toml").write_text(text)
+    folder = tmp_path / "there"
+    export = ["export", str(tmp_path / "water.toml"), "--to", "lammps", "-o", str(folder)]
+    assert cli.main(export) == 0
+    program = lammps.command(1)[0]
+    done = subprocess.run([program, "-in", "in.lammps"], cwd=folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout[-2000:]
+    head, first = re.search(r"( *Step .*)\n(.*)\n", done.stdout).groups()
+    row = dict(zip(head.split(), map(float, first.split()), strict=True))
+    system = build(small_scene({"spce": 20}, 13.0, forces=PME | {"cutoff_A": 6.0}))  # for its constants
+    assert row["v_potential"] == pytest.approx(_start_potential(tmp_path / "water.toml") / 4.184, abs=0.02)
+    assert system.constants
+    assert (folder / "final.lammps").is_file() and (folder / "trajectory_1.lammpstrj").is_file()
+    assert cli.main(export) == 2  # nothing is overwritten
+    assert cli.main([*export, "--force"]) == 0
+    assert cli.main(["check", str(folder / "scene.toml")]) == 0
+
+
+def _start_potential(scene: Path) -> float:
+    from rigidmd import Scene, Simulation
+
+    found = Simulation(Scene.read(scene)).start_energy(100.0, "kJ/mol")
+    return found["potential"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (["stages.0.thermostat=velocity_rescaling"], "stages.0.thermostat = 'velocity_rescaling': LAMMPS has nose_h"),
+        (["stages.1.integrator=srkn_4"], "stages.1.integrator = 'srkn_4': LAMMPS moves rigid bodies by velocity_ver"),
+        (["fields.electric_V_per_nm=[0,0,0.1]"], "electric field: a field is left to rigidmd"),
+        (["forces.electrostatics=pme", "forces.ewald_truncation=shift"], "LAMMPS has no shift of the real-space"),
+        (
+            ["stages.0.ensemble=npt", "stages.0.pressure_bar=1", "stages.0.barostat=monte_carlo"],
+            "has its own for rigid",
+        ),
+        (["engine.platform=CUDA"], "platform would do nothing with engine.name = 'lammps'"),
+        (["engine.ranks=0"], "engine.ranks"),
+        (["engine.nam=lammps"], "engine.nam: unknown key"),
+    ],
+)
+def test_what_lammps_cannot_do_is_refused(changes, words, scene, tmp_path, capsys):
+    sets = [part for change in changes for part in ("--set", change)]
+    for command in (["check"], ["run", "-o", str(tmp_path / "run")]):
+        assert cli.main([command[0], str(scene), "--engine", "lammps", *sets, *command[1:]]) == 2
+        said = capsys.readouterr().err
+        assert words in said and "Traceback" not in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_body_has_no_other_engine(capsys, tmp_path):
+    top = str(ROOT / "systems" / "heavy_top_3.toml")
+    for command in (
+        ["verify", top, "--engine", "lammps"],
+        ["export", top, "--to", "lammps", "-o", str(tmp_path / "x")],
+        ["run", top, "--engine", "lammps", "-o", str(tmp_path / "x")],
+    ):
+        assert cli.main(command) == 2
+        assert "Traceback" not in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, capsys):
+    system, _, state = built({"spce": 12}, 13.0, 1, 0.1, **THERE, forces={"cutoff_A": 6.0})
+    engine = LammpsEngine(system)
+    engine._movers = ["fix bodies bodies rigid/none molecule"]
+    with pytest.raises(EngineError, match=r"LAMMPS stopped: ERROR.*rigid/none"):
+        engine.evaluate(state)
+    engine = LammpsEngine(system)
+    engine.evaluate(state)
+    os.killpg(engine._process._process.pid, signal.SIGKILL)
+    with pytest.raises(SimulationError, match="LAMMPS stopped: exit code -9"):
+        engine.advance(state, None, 0.002, 200)
+    state.position[1] = state.position[0] + 0.05
+    with pytest.raises(EngineError, match=r"LAMMPS stopped: ERROR.*Pair distance < table inner cutoff"):
+        LammpsEngine(system).evaluate(state)
+    monkeypatch.setattr(shutil, "which", lambda name, path=None: None)
+    assert cli.main(["run", str(scene), "--engine", "lammps", "-o", str(tmp_path / "run")]) == 2
+    assert "LAMMPS is not here: pip install 'rigidmd[lammps]'" in capsys.readouterr().err
+
+
+def test_a_process_ends_with_its_engine():
+    system, _, state = built({"argon": 12}, 15.0, 1, 0.1, **THERE, forces={"cutoff_A": 6.0})
+    engine = LammpsEngine(system)
+    engine.evaluate(state)
+    process, folder = engine._process._process, engine._process.folder
+    assert process.poll() is None and folder.is_dir()
+    del engine
+    assert process.poll() is not None and not folder.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ensemble", ["nve", "nvt", "npt"])
+def test_means_are_those_of_rigidmd(ensemble):
+    """216 SPC/E: potential energy, temperatures, pressure and density within errors, of runs that share their start."""
+    warm = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 10.0, "thermostat": "nose_hoover"}
+    last = {"ensemble": ensemble, "duration_ps": 60.0}
+    last |= {"temperature_K": 300.0, "thermostat": "nose_hoover"} if ensemble != "nve" else {}
+    last |= {"pressure_bar": 1.0} if ensemble == "npt" else {}
+    forces = {"cutoff_A": 9.0, "electrostatics": "pme", "tail_correction": True}
+    settings = {"forces": forces, "stages": [warm], "box": {"density_g_cm3": 0.998}, "output": {"trajectory": False}}
+    liquid = Simulation(small_scene({"spce": 216}, 18.6, **settings))
+    liquid.run()
+    found = {}
+    for engine in ("rigidmd", "lammps"):
+        stages = {"stages": [last], "engine": {"name": engine}}
+        simulation = Simulation(small_scene({"spce": 216}, 18.6, **settings | stages))
+        simulation.start_from(liquid.state)
+        samples = simulation.run().samples
+        late = slice(len(samples.rows) // 6, None)
+        names = ("potential", "temperature_translation", "temperature_rotation", "pressure_bar", "density")
+        found[engine] = {name: mean(list(samples[name][late])) for name in names}
+    for name, (here, error) in found["rigidmd"].items():
+        there, other_error = found["lammps"][name]
+        if ensemble == "npt" or name != "density":
+            assert abs(here - there) < 4 * np.hypot(error, other_error), (name, found)
