@@ -106,11 +106,19 @@ class Bodies:
 def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Rotations followed by the shortest ones that bring unit vectors old (n, 3) to new (n, 3).
 
-    Source: Rodrigues' formula for the rotation by the angle between the two about their cross product.
+    Source: Rodrigues' formula for the rotation by the angle between the two about their cross product. By more than a
+    right angle it comes after half a turn about an axis across, so that opposite vectors are no exception. What comes
+    out is made orthogonal, or rounding would grow from call to call.
     """
+    across = np.cross(old, np.eye(3)[np.abs(old).argmin(axis=1)])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    back = (np.einsum("ni,ni->n", old, new) < 0)[:, None]
+    half_turn = np.where(back[:, None], 2 * np.einsum("ni,nj->nij", across, across) - np.eye(3), np.eye(3))
+    old = np.where(back, -old, old)
     cross, cosine = np.cross(old, new), np.einsum("ni,ni->n", old, new)
     hat = np.zeros((len(old), 3, 3))
     for (i, j), k in {(2, 1): 0, (0, 2): 1, (1, 0): 2}.items():
         hat[:, i, j], hat[:, j, i] = cross[:, k], -cross[:, k]
     step = np.eye(3) + hat + hat @ hat / (1 + cosine)[:, None, None]
-    return step @ rotation
+    left, _, right = np.linalg.svd(step @ half_turn @ rotation)
+    return left @ right

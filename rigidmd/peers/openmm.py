@@ -1,6 +1,7 @@
 """An engine that lets OpenMM compute, on one of its platforms.
 
-Two contexts hold the system: one moves it, the other evaluates, so that looks leave no trace in the motion. OpenMM has
+Two contexts hold the system: one moves it, the other evaluates term by term, so that looks leave no trace in the motion
+and what moves may compute several terms at once. OpenMM has
 no virial; that of molecules follows from energies at centres of mass that are moved apart and together.
 """
 
@@ -42,7 +43,6 @@ class Held(NamedTuple):
     drawn: Portrait
     particles: parts.Layout
     bodies: Bodies
-    made: "openmm.System"
 
     def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
@@ -52,12 +52,15 @@ class Held(NamedTuple):
         velocity[self.particles.mass == 0] = 0.0
         return at, velocity
 
+    def made(self, state: State, apart: bool) -> "openmm.System":
+        """OpenMM's system in the cell of a state; see `openmm_system`."""
+        return parts.openmm_system(self.drawn, self.particles, state.cell, apart)
 
-def held(drawn: Portrait, state: State) -> Held:
-    """A system in OpenMM with the cell of a state."""
+
+def held(drawn: Portrait) -> Held:
+    """How a system is held in OpenMM."""
     particles = parts.layout(drawn)
-    bodies = Bodies(drawn.system, particles.points)
-    return Held(drawn, particles, bodies, parts.openmm_system(drawn, particles, state.cell))
+    return Held(drawn, particles, Bodies(drawn.system, particles.points))
 
 
 def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
@@ -89,20 +92,20 @@ class OpenmmEngine:
         self.made_by = f"OpenMM {mm.__version__} on {platform}"
         self._system, self._stage = system, system.scene.stages[stage]
         self.counts_heat = not (self._stage.has_thermostat or self._stage.has_barostat)
-        self._held = held(drawn, system.state)
+        self._held = held(drawn)
         #: Whether forces are computed in double precision.
         self._double = platform == "Reference" or properties.get("Precision") == "double"
         self._integrator = integrator_of(drawn, stage, tolerance(platform, properties))
         rest = mm.VerletIntegrator(0.001)
         try:
-            # the one that evaluates comes first: a barostat is for the other one only
-            self._seer = mm.Context(self._held.made, rest, where, properties)
+            seen, moved = (self._held.made(system.state, apart) for apart in (True, False))
             for mover in movers(drawn, stage):
-                self._held.made.addForce(mover)
-            self._mover = mm.Context(self._held.made, self._integrator, where, properties)
+                moved.addForce(mover)
+            self._seer = mm.Context(seen, rest, where, properties)
+            self._mover = mm.Context(moved, self._integrator, where, properties)
         except mm.OpenMMException as error:
             raise EngineError(f"OpenMM cannot hold this system on {platform}: {error}") from None
-        self._groups = {force.getForceGroup() for force in self._held.made.getForces()}
+        self._groups = {force.getForceGroup() for force in seen.getForces()}
         if drawn.has_waves:
             self._groups.add(parts.RECIPROCAL)
         self._has: State | None = None  # the state that the mover has
@@ -136,11 +139,12 @@ class OpenmmEngine:
         self._has = state.copy()
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, and each term's energy; the virial of all of them, its diagonal, stands with
-        the first."""
+        """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
         if self._seen is None or not _same(self._seen[0], state):
-            tallies = self._tallies(state)
-            self._seen = state.copy(), self._load(state), tallies
+            position, force = self._forces(state)
+            load = self._held.bodies.load(state, position, force)
+            virial = self._virial(state, self._held.bodies.within(position, force))
+            self._seen = state.copy(), load, self._tallies(state, virial)
         _, load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
@@ -152,7 +156,11 @@ class OpenmmEngine:
 
     def memory(self) -> dict[str, np.ndarray]:
         """What OpenMM itself keeps of its context: particles, random numbers, its thermostat."""
-        kept = np.frombuffer(self._mover.createCheckpoint(), np.uint8).copy() if self._has else np.zeros(0, np.uint8)
+        kept = (
+            np.frombuffer(self._mover.createCheckpoint(), np.uint8).copy()
+            if self._has is not None
+            else np.zeros(0, np.uint8)
+        )
         return {"context": kept, "heat": np.array([self._books])}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
@@ -173,7 +181,8 @@ class OpenmmEngine:
 
     def close(self) -> None:
         """Let OpenMM's memory go."""
-        del self._mover, self._seer, self._integrator
+        for name in ("_mover", "_seer", "_integrator"):
+            self.__dict__.pop(name, None)
 
     def _give(self, state: State) -> None:
         """Let OpenMM have a state, unless it has it already; its thermostat goes on."""
@@ -230,17 +239,16 @@ class OpenmmEngine:
         groups = group if isinstance(group, set) else {group}
         return KJ_PER_MOL * self._seer.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
 
-    def _load(self, state: State) -> Load:
-        """Forces and torques on bodies; OpenMM gives the forces on virtual sites to the mass points that place them."""
+    def _forces(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Positions of mass points (p, 3) and the forces on them, in which those on virtual sites are."""
         self._put(self._seer, state)
         acting = self._groups - {parts.STEP_LENNARD_JONES, parts.STEP_COULOMB}
         force = self._seer.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
-        position, _ = self._held.bodies.points(state)
-        return self._held.bodies.load(state, position, force[self._held.particles.point] * FORCE)
+        return self._held.bodies.points(state)[0], force[self._held.particles.point] * FORCE
 
-    def _tallies(self, state: State) -> dict[str, Tally]:
+    def _tallies(self, state: State, virial: np.ndarray) -> dict[str, Tally]:
         """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
-        drawn, virial = self._held.drawn, self._virial(state)
+        drawn = self._held.drawn
         self._put(self._seer, state)
         found = {"lennard_jones": self._energy(parts.LENNARD_JONES)} if parts.LENNARD_JONES in self._groups else {}
         law = drawn.coulomb
@@ -272,19 +280,37 @@ class OpenmmEngine:
             total += intramolecular_energy(drawn.charge[still] * COULOMB_CHARGE, position, alpha)
         return total
 
-    def _virial(self, state: State) -> np.ndarray:
-        """The diagonal (3, 3) of the virial of molecules: how the energy falls as their centres move apart along an
-        axis, from energies that are continuous at the cut-off. 0 without a box."""
+    def _virial(self, state: State, within: np.ndarray) -> np.ndarray:
+        """The virial of molecules (3, 3), its symmetric part: how the energy falls as their centres move apart, from
+        energies that are continuous at the cut-off. 0 without a box.
+
+        within : sum of F (x) d over mass points; the virial of all sites, which is symmetric, has it besides
+
+        Where the scene asks for no tensor of pressures, only its trace, of which each axis gets a third: that takes two
+        energies in place of twelve, and every look has to wait for them.
+        """
         virial, strain = np.zeros((3, 3)), STRAIN[self._double]
         if not self._held.drawn.boxed:
             return virial
         groups = self._groups - {parts.TAIL}
-        for k in range(3):
+
+        def slope(along: np.ndarray) -> float:
+            """Of the energy with a strain of centres and cell along a matrix."""
+            energy = []
             for sign in (-1, 1):
-                stretch = np.ones(3)
-                stretch[k] += sign * strain
-                self._put(self._seer, state._replace(position=state.position * stretch, cell=state.cell * stretch))
-                virial[k, k] -= self._energy(groups) * sign / (2 * strain)
+                by = np.eye(3) + sign * strain * along
+                self._put(self._seer, state._replace(position=state.position @ by, cell=state.cell @ by))
+                energy.append(self._energy(groups))
+            return (energy[1] - energy[0]) / (2 * strain)
+
+        output = self._system.scene.output
+        if not (output.pressure_tensor or output.pressure_tensor_interval_ps):
+            return -slope(np.eye(3)) / 3 * np.eye(3)
+        for row, column in zip(*np.tril_indices(3), strict=True):  # the cell keeps its form
+            along = np.zeros((3, 3))
+            along[row, column] = 1.0
+            apart = -slope(along) + (within[column, row] - within[row, column]) / 2
+            virial[row, column] = virial[column, row] = apart
         return virial
 
 

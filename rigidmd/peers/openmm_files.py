@@ -82,13 +82,14 @@ def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
     """Write the folder for a system that begins at a state; the names of its files. Raises EngineError if OpenMM is not
     here, and OutputError."""
     mm = parts.library()
-    holds = held(portrait, state)
+    holds = held(portrait)
     position, velocity = (values * parts.NM for values in holds.positions(state))
-    context = mm.Context(holds.made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
+    made = holds.made(state, apart=False)
+    context = mm.Context(made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
     context.setPositions(position)
     context.setVelocities(velocity)
     text = {
-        SYSTEM: mm.XmlSerializer.serialize(holds.made),
+        SYSTEM: mm.XmlSerializer.serialize(made),
         STATE: mm.XmlSerializer.serialize(context.getState(positions=True, velocities=True)),
     }
     rows = []
