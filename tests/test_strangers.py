@@ -26,7 +26,7 @@ from rigidmd.scene import Scene
 from rigidmd.scene.molecules import MolecularScene
 
 DEEP = "[" * 1000 + "]" * 1000
-AT_ONCE = 5.0  # s
+AT_ONCE = 5.0  # s of computing
 
 
 def refusal(capsys, tmp_path, text, *arguments, commands=("check",)):
@@ -34,9 +34,9 @@ def refusal(capsys, tmp_path, text, *arguments, commands=("check",)):
     (tmp_path / "scene.toml").write_text(text)
     messages = set()
     for command in commands:
-        begin = time.perf_counter()
+        begin = time.process_time()
         assert main([command, str(tmp_path / "scene.toml"), *arguments]) == 2
-        assert time.perf_counter() - begin < AT_ONCE
+        assert time.process_time() - begin < AT_ONCE
         messages.add(capsys.readouterr().err)
     assert len(messages) == 1
     return messages.pop()
