@@ -175,6 +175,7 @@ def test_a_run_on_two_ranks_is_a_run_like_any_other(scene, tmp_path, capsys):
     # the folder knows its engine: it goes on there, from the state of the end
     assert cli.main(["resume", str(folder), "--until", "0.1ps"]) == 0
     assert read_record(folder).columns["step"][-1] == 80
+    assert json.loads((folder / "summary.json").read_text())["engine"].startswith("LAMMPS 20")
 
 
 def test_an_exported_folder_runs_by_itself(tmp_path):

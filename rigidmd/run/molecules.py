@@ -129,10 +129,14 @@ class MolecularSimulation(Simulation):
 
     def _prepare(self) -> None:
         """Relieve overlaps, and compile the steps or see that another engine computes the same."""
-        self._relieve()
         if self.scene.engine.is_other:
-            self._check_other()
+            from rigidmd.peers.engines import other_engine
+
+            other = other_engine(self.system)  # first: one that is not here says so before anything is compiled
+            self._relieve()
+            self._check(other)
         else:
+            self._relieve()
             self._compile()
         self.engine.forget()
 
@@ -185,13 +189,10 @@ class MolecularSimulation(Simulation):
                     row = row_of_stage(self.system, k)
                     self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
 
-    def _check_other(self) -> None:
-        """Let the other engine of the scene compute the start too. Raises EngineError where the two part."""
+    def _check(self, other: "OtherEngine") -> None:
+        """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""
         from rigidmd.peers.checking import compare_at, in_words
-        from rigidmd.peers.engines import other_engine
 
-        other = other_engine(self.system)
-        self.made_by = other.made_by
         lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
         other.close()
         if not all(line.agrees for line in lines):
@@ -206,7 +207,9 @@ class MolecularSimulation(Simulation):
             return self.system.engine()
         from rigidmd.peers.engines import other_engine
 
-        return other_engine(self.system, k)
+        other = other_engine(self.system, k)
+        self.made_by = other.made_by
+        return other
 
     def _memory(self) -> dict[str, Any]:
         return {
