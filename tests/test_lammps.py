@@ -20,6 +20,7 @@ from rigidmd.errors import EngineError, SimulationError
 from rigidmd.measure.summary import mean
 from rigidmd.molecules import available_models
 from rigidmd.output.record import read_record
+from rigidmd.output.report import energy_figure
 from rigidmd.peers import lammps, lammps_files
 from rigidmd.peers.bodies import Bodies
 from rigidmd.peers.checking import compare_at, in_words
@@ -176,6 +177,14 @@ def test_a_run_on_two_ranks_is_a_run_like_any_other(scene, tmp_path, capsys):
     assert cli.main(["resume", str(folder), "--until", "0.1ps"]) == 0
     assert read_record(folder).columns["step"][-1] == 80
     assert json.loads((folder / "summary.json").read_text())["engine"].startswith("LAMMPS 20")
+
+
+def test_a_stage_without_a_drift_draws_none():
+    stage = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.02}
+    settings = {"forces": {"cutoff_A": 6.0}, "stages": [stage], "output": {"log_interval_ps": 0.005}}
+    results = Simulation(small_scene({"spce": 12}, 13.0, **THERE | settings)).run()
+    assert len(energy_figure(results.system, results.samples, results.summary).axes) == 2
+    assert results.summary["stages"][0]["drift_kJ_mol_ns_per_molecule"] is None
 
 
 def test_an_exported_folder_runs_by_itself(tmp_path):

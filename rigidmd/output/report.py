@@ -15,6 +15,7 @@ from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, thin_seri
 from rigidmd.scene.stage import Stage
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
@@ -182,6 +183,17 @@ def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> 
         save_figure(energy_figure(system, samples, summary), temporary, dpi=150)
 
 
+def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: dict) -> None:
+    """The conserved energy of a stage, kJ/mol per molecule, with the line of its drift."""
+    axis.plot(*thin_series(time, drift), color=COOL, lw=0.9)
+    gradient, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
+    if len(time) > 2 and gradient is not None:
+        axis.plot(time, drift.mean() + gradient / 1000 * (time - time.mean()), color=WARM, lw=1.4)
+        title = f"{stage['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule"
+        axis.set_title(title, loc="left", fontsize=9, color=WARM)
+    axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
+
+
 def energy_figure(system: System, samples: Samples, summary: dict) -> "Figure":
     """The drift of the last stage on its own scale; energies and temperatures of the whole run."""
     from rigidmd.output.picture import Picture  # Matplotlib is slow to import
@@ -191,20 +203,13 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Figure":
     shown = drawn(stages, samples)
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
-    figure = Picture(figsize=(8, 7), layout="constrained")
-    drift, parts, temperature = figure.subplots(3, 1, height_ratios=(1.2, 1, 1))
     own = stage == stage[-1]
-    drift.plot(*thin_series(time[own], column["drift"][own] / n), color=COOL, lw=0.9)
-    last = summary["stages"][stage[-1]]
-    if own.sum() > 2 and last["drift_kJ_mol_ns_per_molecule"] is not None:
-        gradient, error = last["drift_kJ_mol_ns_per_molecule"], last["drift_error_kJ_mol_ns_per_molecule"]
-        fitted = (column["drift"][own] / n).mean() + gradient / 1000 * (time[own] - time[own].mean())
-        drift.plot(time[own], fitted, color=WARM, lw=1.4)
-        drift.set_title(
-            f"{last['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule",
-            loc="left", fontsize=9, color=WARM,
-        )  # fmt: skip
-    drift.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
+    known = bool(np.isfinite(column["drift"][own]).any())  # another engine may tell no conserved energy
+    figure = Picture(figsize=(8, 7), layout="constrained")
+    axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :])
+    *_, parts, temperature = axes
+    if known:
+        _draw_drift(axes[0], time[own], column["drift"][own] / n, summary["stages"][stage[-1]])
     for name, color in (("potential", COOL), ("kinetic", WARM)):
         parts.plot(*thin_series(time, (column[name] - column[name][-1]) / n), color=color, lw=0.9, label=name)
     parts.set_ylabel("energies less\ntheir last values\n(kJ/mol per molecule)")
@@ -216,7 +221,7 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Figure":
             temperature.plot(*thin_series(time, column[name]), color=color, lw=0.9, label=label)
     temperature.set_ylabel("temperature (K)")
     temperature.set_xlabel("time (ps)")
-    for axis in (drift, parts, temperature):
+    for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
         axis.margins(x=0)
         axis.yaxis.label.set_fontsize(9)
