@@ -40,6 +40,17 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_engine(
+    parser: argparse.ArgumentParser, known: str = "rigidmd, lammps or openmm", default: str = "the scene's"
+) -> None:
+    """Add the options that set the table [engine] of a scene. known : its names, in words; default : in words"""
+    parser.add_argument(
+        "--engine", metavar="NAME", help=f"who computes, {known}: the key engine.name of the scene (default: {default})"
+    )
+    parser.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
+    parser.add_argument("--platform", metavar="NAME", help="of openmm: CPU, Reference, CUDA, OpenCL or HIP")
+
+
 def say(sentence: str) -> None:
     """Announce something that takes a moment."""
     print(f"  {sentence} ...", file=sys.stderr, flush=True)

@@ -17,6 +17,7 @@ from rigidmd.arguments import (
     FAILED,
     INTERRUPTED,
     OUT_OF_TIME,
+    add_engine,
     add_trust,
     say,
     seconds,
@@ -25,7 +26,7 @@ from rigidmd.arguments import (
 )
 from rigidmd.looking import commands as looking
 from rigidmd.study import commands as studying
-from rigidmd.study import handing_over
+from rigidmd.study import engine_commands
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
@@ -122,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
         "--resume", action="store_true",
         help="go on from the last checkpoint in that folder, to the same bits; without one, begin",
     )  # fmt: skip
-    _engines(run)
+    add_engine(run)
     _going_on(run)
 
     resume = _command(
@@ -169,8 +170,8 @@ def _parser() -> argparse.ArgumentParser:
         commands, "check", _check, "describe a run without running it", "rigidmd check systems/water_nitrogen.toml"
     )
     _scene_arguments(check)
-    _engines(check)
-    handing_over.add_commands(partial(_command, commands), _scene_arguments, _read_scene)
+    add_engine(check)
+    engine_commands.add_commands(partial(_command, commands), _scene_arguments, _read_scene)
 
     precision = _command(
         commands,
@@ -299,15 +300,6 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         "removes the key; may be repeated",
     )
     add_trust(parser)
-
-
-def _engines(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--engine", choices=["rigidmd", "lammps", "openmm"],
-        help="who computes the run: the key engine.name of the scene (default: the scene's, or rigidmd)",
-    )  # fmt: skip
-    parser.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
-    parser.add_argument("--platform", metavar="NAME", help="of openmm: CPU, Reference, CUDA, OpenCL (default: CPU)")
 
 
 def _going_on(parser: argparse.ArgumentParser) -> None:

@@ -200,7 +200,9 @@ def test_an_exported_folder_runs_by_itself(tmp_path):
     row = dict(zip(head.split(), map(float, first.split()), strict=True))
     system = build(small_scene({"spce": 20}, 13.0, forces=PME | {"cutoff_A": 6.0}))  # for its constants
     assert row["v_potential"] == pytest.approx(_start_potential(tmp_path / "water.toml") / 4.184, abs=0.02)
-    assert system.constants
+    assert row["v_potential"] - row["PotEng"] == pytest.approx(
+        system.constants["coulomb_intramolecular"] / 418.4, abs=1e-3
+    )
     assert (folder / "final.lammps").is_file() and (folder / "trajectory_1.lammpstrj").is_file()
     assert cli.main(export) == 2  # nothing is overwritten
     assert cli.main([*export, "--force"]) == 0
@@ -243,6 +245,7 @@ def test_a_body_has_no_other_engine(capsys, tmp_path):
     top = str(ROOT / "systems" / "heavy_top_3.toml")
     for command in (
         ["verify", top, "--engine", "lammps"],
+        ["verify", top],
         ["export", top, "--to", "lammps", "-o", str(tmp_path / "x")],
         ["run", top, "--engine", "lammps", "-o", str(tmp_path / "x")],
     ):

@@ -18,11 +18,10 @@ from typing import IO, NamedTuple, cast
 import numpy as np
 
 from rigidmd.assemble.system import System
-from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.advance import Model
 from rigidmd.engines import Tally
-from rigidmd.engines.cpu import NotFiniteError, keep_time
+from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.laws.screened import DampedShiftedForce
 from rigidmd.forces.waves.corrections import background, self_energy
@@ -30,8 +29,8 @@ from rigidmd.measure.observables import kinetic_energies
 from rigidmd.mechanics.rotor import NONE, SplitRotor
 from rigidmd.peers import lammps_files as files
 from rigidmd.peers.bodies import Bodies
+from rigidmd.peers.engines import OtherEngine, same
 from rigidmd.peers.lammps_dump import read_dump
-from rigidmd.peers.portrait import portrait
 from rigidmd.validation import settled
 
 #: Begins a line with figures, which also ends an answer.
@@ -63,21 +62,16 @@ def command(ranks: int) -> list[str]:
     return [launcher, "-n", str(ranks), program]
 
 
-class LammpsEngine:
+class LammpsEngine(OtherEngine):
     """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
 
     `lammps_files.faults` tells what LAMMPS cannot do. Raises EngineError if it is not here.
     """
 
-    moves: tuple[int, int] = (0, 0)
-    lengths_to = 0.0
-
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
-        drawn = portrait(system)
-        self._system, self._portrait, self._stage = system, drawn, system.scene.stages[stage]
-        self._styles = files.pair_styles(drawn)
-        self._movers = files.movers(drawn, stage)
-        self.counts_heat = not (self._stage.has_thermostat or self._stage.has_barostat)
+        super().__init__(system, stage)
+        self._styles = files.pair_styles(self._portrait)
+        self._movers = files.movers(self._portrait, stage)
         self._bodies = Bodies(system)
         self._process = Process(command(ranks))
         date, there = self._process.say(f'print "{FIGURES} $(version) $(extract_setting(world_size))"')
@@ -88,40 +82,16 @@ class LammpsEngine:
                 "put its own mpirun on the PATH, or take 1 rank"
             )
         self.made_by = f"LAMMPS {date:.0f}"
-        self._has: State | None = None  # the state that LAMMPS has
-        self._books = 0.0  # of heat, when it was given a state
-        self._moved: State | None = None
 
-    def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state; what thermostats and barostats evolve is LAMMPS' own."""
-        return state.copy()._replace(bath=np.zeros(0))
-
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
-        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
-        keep_time(state, dt)
-        self._give(state)
-        self._moved = state
-        steps = until - int(state.step[NOW])
-        if steps <= 0:
-            return
+    def _run(self, state: State, steps: int, dt: float) -> None:
         ramp = f" start 0 stop {self._stage.steps}" if self._stage.ramps else ""
         self._process.say(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
-        self._take(state)
-        state.step[NOW] = until
-        state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
-        self._has = state.copy()
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
         self._give(state)
         load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
-
-    def snapshot(self) -> State:
-        """A copy of the state that was last moved."""
-        if self._moved is None:
-            raise ValueError("this engine has moved no state yet")
-        return self._moved.copy()
 
     def memory(self) -> dict[str, np.ndarray]:
         """Nothing: LAMMPS is given the state anew when a run is resumed, its thermostat and barostat at rest."""
@@ -130,10 +100,6 @@ class LammpsEngine:
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         """Go on from a state."""
         self.forget()
-
-    def forget(self) -> None:
-        """Declare that positions were changed from outside since the last step."""
-        self._has = None
 
     def rotor(self, model: Model) -> "NamedTuple | None":
         """That of LAMMPS' fix rigid/nve: half a turn about the axes with the largest and the middle moment, a whole one
@@ -160,8 +126,7 @@ class LammpsEngine:
 
     def _give(self, state: State) -> None:
         """Let LAMMPS have a state, unless it has it already."""
-        has = self._has
-        if has is not None and all(np.array_equal(mine, its) for mine, its in zip(state[:5], has[:5], strict=True)):
+        if same(self._has, state):
             return
         drawn, folder = self._portrait, self._process.folder
         files.write_data(folder / files.DATA, drawn, state)

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rigidmd.assemble.system import System
-from rigidmd.core.schemes import Scheme, Solver
-from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
+from rigidmd.core.state import HEAT, Load, State
 from rigidmd.dynamics.advance import Model
 from rigidmd.engines import Tally
-from rigidmd.engines.cpu import NotFiniteError, keep_time
+from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.waves.corrections import background, intramolecular_energy, self_energy
 from rigidmd.measure.observables import kinetic_energies
 from rigidmd.peers import openmm_system as parts
 from rigidmd.peers.bodies import Bodies
+from rigidmd.peers.engines import OtherEngine, same
 from rigidmd.peers.openmm_stages import integration_groups, integrator_of, movers, step, tolerance
-from rigidmd.peers.portrait import Portrait, portrait
+from rigidmd.peers.portrait import Portrait
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -76,22 +76,20 @@ def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
     return mm.Platform.getPlatformByName(name), {} if name == "Reference" else {"Precision": scene.precision}
 
 
-class OpenmmEngine:
+class OpenmmEngine(OtherEngine):
     """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
 
     `openmm_system.faults` tells what OpenMM cannot do. Raises EngineError if it is not here.
     """
 
-    moves: tuple[int, int] = (0, 0)
     lengths_to = 2.0**-24  # SETTLE has its distances in single precision, on all platforms
 
     def __init__(self, system: System, stage: int = 0, platform: str = "CPU"):
         mm = parts.library()
-        drawn = portrait(system)
+        super().__init__(system, stage)
+        drawn = self._portrait
         where, properties = platform_of(platform, system)
         self.made_by = f"OpenMM {mm.__version__} on {platform}"
-        self._system, self._stage = system, system.scene.stages[stage]
-        self.counts_heat = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._held = held(drawn)
         #: Whether forces are computed in double precision.
         self._double = platform == "Reference" or properties.get("Precision") == "double"
@@ -108,23 +106,9 @@ class OpenmmEngine:
         self._groups = {force.getForceGroup() for force in seen.getForces()}
         if drawn.has_waves:
             self._groups.add(parts.RECIPROCAL)
-        self._has: State | None = None  # the state that the mover has
-        self._books = 0.0  # heat in the books of a state that it was given, less what it had counted by then
-        self._moved: State | None = None
         self._seen: tuple[State, Load, dict[str, Tally]] | None = None
 
-    def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state; what thermostats and barostats evolve is OpenMM's own."""
-        return state.copy()._replace(bath=np.zeros(0))
-
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
-        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
-        keep_time(state, dt)
-        self._give(state)
-        self._moved = state
-        steps = until - int(state.step[NOW])
-        if steps <= 0:
-            return
+    def _run(self, state: State, steps: int, dt: float) -> None:
         self._integrator.setStepSize(dt)
         try:
             step(self._integrator, steps)
@@ -132,27 +116,16 @@ class OpenmmEngine:
             if "NaN" in str(error):
                 raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan))) from None
             raise SimulationError(f"OpenMM stopped: {error}") from None
-        self._take(state)
-        state.step[NOW] = until
-        state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
-        state.books[HEAT] = self._books + self._heat(state)
-        self._has = state.copy()
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
-        if self._seen is None or not _same(self._seen[0], state):
+        if self._seen is None or not same(self._seen[0], state):
             position, force = self._forces(state)
             load = self._held.bodies.load(state, position, force)
             virial = self._virial(state, self._held.bodies.within(position, force))
             self._seen = state.copy(), load, self._tallies(state, virial)
         _, load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
-
-    def snapshot(self) -> State:
-        """A copy of the state that was last moved."""
-        if self._moved is None:
-            raise ValueError("this engine has moved no state yet")
-        return self._moved.copy()
 
     def memory(self) -> dict[str, np.ndarray]:
         """What OpenMM itself keeps of its context: particles, random numbers, its thermostat."""
@@ -175,18 +148,14 @@ class OpenmmEngine:
             self._has, (self._books,) = state.copy(), memory["heat"].tolist()
         self._moved = state
 
-    def forget(self) -> None:
-        """Declare that positions were changed from outside since the last step."""
-        self._has = None
-
     def close(self) -> None:
         """Let OpenMM's memory go."""
         for name in ("_mover", "_seer", "_integrator"):
-            self.__dict__.pop(name, None)
+            vars(self).pop(name, None)
 
     def _give(self, state: State) -> None:
         """Let OpenMM have a state, unless it has it already; its thermostat goes on."""
-        if self._has is not None and _same(self._has, state):
+        if same(self._has, state):
             return
         self._put(self._mover, state)
         velocity = self._held.positions(state)[1]
@@ -217,6 +186,7 @@ class OpenmmEngine:
             found.position[:] -= np.rint(moved) @ cell
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
+        state.books[HEAT] = self._books + self._heat(state)
 
     def rotor(self, model: Model) -> None:
         """None: OpenMM turns bodies by keeping distances."""
@@ -312,8 +282,3 @@ class OpenmmEngine:
             apart = -slope(along) + (within[column, row] - within[row, column]) / 2
             virial[row, column] = virial[column, row] = apart
         return virial
-
-
-def _same(one: State, other: State) -> bool:
-    """Whether two states are the same to the bit, but for time and books."""
-    return all(np.array_equal(mine, its) for mine, its in zip(one[:5], other[:5], strict=True))

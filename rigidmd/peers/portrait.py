@@ -1,7 +1,7 @@
 """A system as other engines see it: kinds of sites, parameters between kinds, laws in words and numbers.
 
 Everything is taken from the terms that rigidmd itself runs, so that mixing rules, special pairs and endings are decided
-once. What no other engine can express is refused here.
+once. `strange` names what no other engine can express.
 """
 
 from math import inf

@@ -193,8 +193,10 @@ class MolecularSimulation(Simulation):
         """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""
         from rigidmd.peers.checking import compare_at, in_words
 
-        lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
-        other.close()
+        try:
+            lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
+        finally:
+            other.close()
         if not all(line.agrees for line in lines):
             title = self.scene.engine.name
             raise EngineError(

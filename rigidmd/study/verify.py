@@ -36,7 +36,6 @@ class Verified(NamedTuple):
     other: str  # with its version
     start: list[Line]
     run: list[Line]
-    notes: list[str]
 
     @property
     def agrees(self) -> bool:
@@ -46,7 +45,7 @@ class Verified(NamedTuple):
     def in_words(self) -> str:
         """As text."""
         name = self.other.split()[0]
-        parts = [f"{self.scene}: rigidmd and {self.other} at the start", *(f"  {note}" for note in self.notes)]
+        parts = [f"{self.scene}: rigidmd and {self.other} at the start"]
         parts += [in_words(self.start, name), f"after {STEPS} steps of {STEP:g} fs at constant energy"]
         parts += [in_words(self.run, name), "they agree" if self.agrees else "they do NOT agree"]
         return "\n".join(parts)
@@ -54,7 +53,7 @@ class Verified(NamedTuple):
     def told(self) -> dict[str, Any]:
         """As JSON has it."""
         lines = {part: [line._asdict() for line in getattr(self, part)] for part in ("start", "run")}
-        return {"scene": self.scene, "engine": self.other, "agrees": self.agrees, **lines, "notes": self.notes}
+        return {"scene": self.scene, "engine": self.other, "agrees": self.agrees, **lines}
 
 
 def verify(scene: Scene) -> Verified:
@@ -74,13 +73,13 @@ def verify(scene: Scene) -> Verified:
     try:
         start = compare_at(system, state, system.engine_of(system.terms, "double"), other)
         run = _short_run(system, state, other)
-        return Verified(scene.name, other.made_by, start, run, [])
+        return Verified(scene.name, other.made_by, start, run)
     finally:
         other.close()
 
 
 def _short_run(system: System, state: State, other: OtherEngine) -> list[Line]:
-    """Both engines from the state on: where sites are, and how the energy has changed."""
+    """Both engines from the state on: how far sites have moved, and how far apart they are then."""
     rotor, span = other.rotor(system.model), STEPS * STEP * FEMTOSECOND
     here = replace(system, model=system.model._replace(rotor=rotor)) if rotor is not None else system
     own = here.engine_of(here.terms, "double")

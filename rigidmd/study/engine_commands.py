@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rigidmd.arguments import add_engine
+
 #: Of `verify`, whose exit code tells whether the engines agree.
 AGREES, PARTS = 0, 1
 
@@ -35,11 +37,7 @@ def add_commands(
         "rigidmd verify systems/water_pme.toml --engine lammps --ranks 2",
     )
     scene_arguments(verify)
-    verify.add_argument(
-        "--engine", choices=["lammps", "openmm"], help="the other engine (default: the scene's, or lammps)"
-    )
-    verify.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
-    verify.add_argument("--platform", metavar="NAME", help="of openmm: its platform (default: Reference)")
+    add_engine(verify, "lammps or openmm", "the scene's, or lammps; openmm on its platform Reference")
     verify.add_argument("--json", action="store_true", help="print JSON")
     verify.set_defaults(read_scene=read_scene)
 
@@ -60,13 +58,15 @@ def _export(options: argparse.Namespace) -> int:
 def _verify(options: argparse.Namespace) -> int:
     import json
 
+    from rigidmd.scene import MolecularScene
     from rigidmd.study.verify import verify
 
-    if options.engine is None and not options.read_scene(options).engine.is_other:
-        options.engine = "lammps"
     if options.engine == "openmm" and options.platform is None:
         options.platform = "Reference"
     scene = options.read_scene(options)
+    if options.engine is None and isinstance(scene, MolecularScene) and not scene.engine.is_other:
+        options.engine = "lammps"
+        scene = options.read_scene(options)
     found = verify(scene)
     print(json.dumps(found.told(), indent=2) if options.json else found.in_words())
     return AGREES if found.agrees else PARTS
