@@ -217,10 +217,28 @@ def jump_to(typing, address, content, block):
     return types.void(types.intp, types.intp, types.intp), emit
 
 
+@intrinsic
+def _next(typing, taken):
+    """The number in a parcel, to which 1 is added at the same time, whichever thread asks."""
+
+    def emit(context, builder, signature, arguments):
+        whole = ir.IntType(64)
+        count = builder.bitcast(arguments[0], whole.as_pointer())
+        return builder.atomic_rmw("add", count, whole(1), "monotonic")
+
+    return types.int64(taken), emit
+
+
 @kernel(parallel=True)
-def _jump_threaded(address, parcel, blocks):
-    for block in numba.prange(blocks):
-        _jump(address, parcel, block)
+def _jump_threaded(address, parcel, taken, blocks):
+    # Each thread takes the next block as soon as it has done one: a thread that shares its core with another program
+    # does fewer, and the others do not wait for its share. Its first turn of this loop takes blocks until there are
+    # none; the other turns find none.
+    for _ in numba.prange(blocks):
+        block = _next(taken)
+        while block < blocks:
+            _jump(address, parcel, block)
+            block = _next(taken)
 
 
 @kernel
@@ -228,7 +246,7 @@ def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
         _jump(address, parcel, 0)
     else:
-        _jump_threaded(address, parcel, blocks)
+        _jump_threaded(address, parcel, packed(0), blocks)
 
 
 def call(code, name, parcel):
