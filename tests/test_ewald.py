@@ -15,9 +15,18 @@ from scipy.special import erfc, hyp1f1
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.system import build
 from rigidmd.cli import main
+from rigidmd.compile import PAIR_FLAGS, kernel, lanes
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
-from rigidmd.forces.laws.screened import screening
+from rigidmd.forces.laws.screened import (
+    INTERVALS,
+    TABLE_ERROR,
+    TabledScreening,
+    force_table,
+    screened,
+    screening,
+    screening_of_lanes,
+)
 from rigidmd.forces.pairs.space import Triclinic, cell_of
 from rigidmd.forces.waves.ewald import sum_of
 from rigidmd.forces.waves.vectors import waves
@@ -89,6 +98,73 @@ def test_fewer_terms_where_single_precision_may_leave_an_error(error):
     t = cut.scale * r**2 - 1
     off = (r * np.abs(np.polyval(cut.force[::-1], t) - np.polyval(whole.force[::-1], t))).max()
     assert 0.003 * error < off < error
+
+
+def screened_force(alpha, r):
+    """Force of erf(alpha r)/r over r, 1/Å³."""
+    return 4 * alpha**3 / (3 * np.sqrt(np.pi)) * hyp1f1(1.5, 2.5, -((alpha * r) ** 2))
+
+
+@pytest.mark.parametrize("x", [1.0, 2.0, 2.77, 3.1, 4.0, 5.0])
+@pytest.mark.parametrize("cutoff", [6.0, 9.0, 12.3])
+def test_a_table_is_as_accurate_as_it_says(x, cutoff):
+    """Every interval in single precision, up to the largest r² below the cut-off."""
+    alpha = x / cutoff
+    density, table, off = force_table(alpha, cutoff)
+    last = np.nextafter(np.float32(cutoff**2), np.float32(0))
+    r2 = np.append(np.linspace(0, last, 5001)[:-1], last).astype(np.float32)
+    s = density * r2
+    k = s.astype(np.int32)
+    assert s.dtype == table.dtype == np.float32
+    assert set(k) == set(range(INTERVALS))
+    value = np.polyval(list(table[::-1, k]), s - k.astype(np.float32))
+    assert value.dtype == np.float32
+    r = np.sqrt(r2.astype(float))
+    error = r * np.abs(value - screened_force(alpha, r))
+    rounding = 4e-7 * r * screened_force(alpha, r)
+    assert (error < 1.02 * off + rounding).all()
+    assert error.max() > 0.3 * off
+    jumps = table.astype(float).sum(0)[:-1] - table[0, 1:]
+    assert np.abs(jumps * np.sqrt(np.arange(1, INTERVALS) / density)).max() < 2.1 * off
+
+
+def test_a_table_serves_where_it_is_accurate_enough():
+    cutoff = 9.0
+    for x in np.arange(0.5, 5.1, 0.1):
+        alpha = x / cutoff
+        *_, off = force_table(alpha, cutoff)
+        allowed = TABLE_ERROR * cutoff * screened_force(alpha, 0.0)
+        assert (off < allowed) == (x < 3.25)
+        for error in (0.0, 0.9 * off, 1.1 * off):
+            found = screening_of_lanes(alpha, cutoff, np.float32, error)
+            assert isinstance(found, TabledScreening) == (lanes.HAS_PICKED and off < max(error, allowed))
+            assert found.energy == screening(alpha, cutoff, np.float32).energy
+        assert screening_of_lanes(alpha, cutoff, np.float64) == screening(alpha, cutoff)
+
+
+@kernel(fastmath=PAIR_FLAGS, outer=True)
+def screened_pairs(law, r2, energy, force):
+    for i in range(0, len(r2), lanes.width_of(r2)):
+        at = lanes.load(r2, i)
+        u, w = screened(law, lanes.inverse_root(at), at)
+        lanes.store(energy, i, u)
+        lanes.store(force, i, w)
+
+
+@pytest.mark.parametrize("x", [1.0, 2.0, 2.77, 3.1, 4.0, 5.0])
+@pytest.mark.parametrize(("dtype", "rounding"), [(np.float64, 2e-14), (np.float32, 1.5e-6)])
+def test_vectors_of_pairs_have_the_forces_of_erfc(x, dtype, rounding):
+    """Rounding is relative to the parts that nearly cancel at large distances: a pair of charges, and the screening."""
+    cutoff = 9.0
+    alpha = x / cutoff
+    r2 = np.linspace(1.0, cutoff**2, 1600, endpoint=False).astype(dtype)
+    energy, force = np.zeros_like(r2), np.zeros_like(r2)
+    screened_pairs(screening_of_lanes(alpha, cutoff, dtype), r2, energy, force)
+    r = np.sqrt(r2.astype(float))
+    u = erfc(alpha * r) / r
+    w = u / r2 + 2 * alpha / np.sqrt(np.pi) * np.exp(-((alpha * r) ** 2)) / r2
+    assert (np.abs(energy - u) < rounding * (1 / r + alpha)).all()
+    assert (np.abs(force - w) < rounding * (1 / r**3 + screened_force(alpha, 0.0))).all()
 
 
 def test_damped_shifted_force_is_fennell_and_gezelter():

@@ -59,6 +59,46 @@ def test_vectors_compute_as_arrays_do(dtype):
     assert sums[3] == 3
 
 
+@kernel(outer=True)
+def part(x, out):
+    width = lanes.width_of(x)
+    whole, rest = lanes.parted(lanes.load(x, 0))
+    lanes.store(out, 0, rest)
+    lanes.store(out, width, lanes.select(whole < fives(x), lanes.load(x, 0), 0.0))
+
+
+@kernel(inline=True)
+def fives(x):
+    five, _ = lanes.parted(lanes.fill(5.0, x))
+    return five
+
+
+def test_numbers_are_parted_into_whole_and_rest():
+    width = lanes.lane_count(np.float32)
+    x = np.random.default_rng(1).uniform(-10, 10, width).astype(np.float32)
+    x[:3] = 5.0, np.nextafter(np.float32(5), np.float32(0)), -7.0
+    out = np.zeros(2 * width, np.float32)
+    part(x, out)
+    assert np.array_equal(out[:width], x - np.trunc(x))
+    assert np.array_equal(out[width:], np.where(np.trunc(x) < 5, x, 0))
+
+
+@kernel(outer=True)
+def pick(table, x, out):
+    k, _ = lanes.parted(lanes.load(x, 0))
+    lanes.store(out, 0, lanes.picked(lanes.load(table, 0), lanes.load(table, 16), k))
+
+
+@pytest.mark.skipif(not lanes.HAS_PICKED, reason="an instruction of AVX-512")
+def test_numbers_are_picked_from_two_vectors():
+    rng = np.random.default_rng(2)
+    table = rng.normal(size=32).astype(np.float32)
+    for x in (np.arange(16), np.arange(16, 32), rng.integers(0, 1000, 16), np.arange(-16, 0)):
+        out = np.zeros(16, np.float32)
+        pick(table, x.astype(np.float32), out)
+        assert np.array_equal(out, table[x % 32])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_pair_loops_of_water_are_vectorised(precision):

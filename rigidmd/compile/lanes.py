@@ -24,6 +24,10 @@ from rigidmd.compile import (
     lane_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
 )
 from rigidmd.compile.lane_types import COUNT, FLAGS, Lanes, Mask, filled
+from rigidmd.compile.machine import PROCESSOR_FEATURES
+
+#: Whether this machine has `picked`.
+HAS_PICKED = SIMD_BITS == 512 and "avx512f" in PROCESSOR_FEATURES
 
 
 def lane_count(dtype) -> int:
@@ -473,3 +477,36 @@ def _narrowed(x, array):
     if array.dtype == types.float32:
         return lambda x, array: single(x)
     return lambda x, array: x
+
+
+@intrinsic
+def parted(typing, x):
+    """(whole, rest) of float32 lanes: integers, rounded towards 0, and x less these; undefined from 2^31 on."""
+    if not isinstance(x, Lanes) or x.dtype != types.float32:
+        return None
+    whole = Lanes(types.int32, x.count)
+    pair = types.Tuple((whole, x))
+
+    def emit(context, builder, signature, arguments):
+        step = builder.fptosi(arguments[0], context.get_value_type(whole))
+        rest = builder.fsub(arguments[0], builder.sitofp(step, arguments[0].type), flags=FLAGS)
+        return context.make_tuple(builder, pair, (step, rest))
+
+    return pair(x), emit
+
+
+@intrinsic
+def picked(typing, low, high, index):
+    """In each lane, one of 32 numbers: 0 to 15 are the lanes of `low`, 16 to 31 those of `high`, all float32.
+
+    Only the last five bits of an index count. This is one instruction of AVX-512, see HAS_PICKED: a table in registers.
+    """
+    if (low, high, index) != (Lanes(types.float32, 16), Lanes(types.float32, 16), Lanes(types.int32, 16)):
+        return None
+
+    def emit(context, builder, signature, arguments):
+        first, second, place = arguments
+        name = "llvm.x86.avx512.vpermi2var.ps.512"
+        return _call(builder, name, first.type, first, place, second, flags=())
+
+    return low(low, high, index), emit

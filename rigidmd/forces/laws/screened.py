@@ -3,6 +3,10 @@
 The pair loop computes neither erfc nor exp. The screening part erf(alpha r)/r is a smooth function of r², and so is its
 force over r. Each is a polynomial in r², fitted when the law is created, with as many terms as the cut-off, alpha and
 the precision of the loop require. A vector of pairs then costs one inverse square root and one multiply-add per term.
+
+In vectors of 16 float32 the force is rather a cubic for each of 32 intervals of r²: a lookup takes one instruction,
+which runs beside the multiply-adds. For PME with a cut-off of 9 Å the loop takes 5 % less time than with the ten terms
+that it would need there, and the force is 30 times as accurate; the loop without any screening takes 14 to 20 % less.
 """
 
 from math import exp, pi, sqrt
@@ -12,7 +16,7 @@ import numpy as np
 from scipy.special import erfc, ive
 
 from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
-from rigidmd.compile.lanes import inverse_root, load, polynomial, zeros
+from rigidmd.compile.lanes import HAS_PICKED, inverse_root, load, parted, picked, polynomial, zeros
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.units import COULOMB_CHARGE
 
@@ -21,6 +25,10 @@ from rigidmd.units import COULOMB_CHARGE
 FIT_ERROR = {np.dtype(np.float64): 2e-16, np.dtype(np.float32): 3e-8}
 #: The number of terms is a multiple of this.
 STEP = {np.dtype(np.float64): 4, np.dtype(np.float32): 2}
+#: Intervals of a table, and coefficients of each.
+INTERVALS, TERMS = 32, 4
+#: Largest error of a table, relative as FIT_ERROR: the rounding error of the polynomial that it replaces.
+TABLE_ERROR = 1.5e-7
 
 
 class Screening(NamedTuple):
@@ -47,6 +55,58 @@ def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: floa
         tuple(map(kind.type, strength * energy)),
         tuple(map(kind.type, strength * 2 * alpha**2 * force)),
     )
+
+
+class TabledScreening(NamedTuple):
+    """The same, but the force over r is a cubic in x = s - k from s = k to k + 1, with s = density r²."""
+
+    scale: float  # as that of Screening
+    energy: tuple[float, ...]
+    density: float  # intervals per Å²
+    table: np.ndarray  # (TERMS INTERVALS,) float32, 1/Å³: coefficients of x^0 for all intervals, then of x^1, ...
+
+
+def screening_of_lanes(alpha: float, cutoff: float, dtype: type, error: float = 0.0) -> Screening | TabledScreening:
+    """What serves lanes of a NumPy dtype best: a table, where this machine has them and it is accurate enough.
+
+    A table has an error that grows with alpha times the cut-off, and is used up to about 3.2, or more if `error` (see
+    `screening`) allows it.
+    """
+    found = screening(alpha, cutoff, dtype, error)
+    if not HAS_PICKED or dtype != np.float32:
+        return found
+    density, table, off = force_table(alpha, cutoff)
+    at_zero = 4 * alpha**3 / (3 * sqrt(pi))
+    if off > max(error, TABLE_ERROR * at_zero * cutoff):
+        return found
+    kept = zeros(table.size, np.float32)
+    kept[:] = table.ravel()
+    return TabledScreening(found.scale, found.energy, density, kept)
+
+
+def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, float]:
+    """Density, coefficients (TERMS, INTERVALS) in single precision, and largest error of the force, 1/Å².
+
+    Each cubic meets the function at four Chebyshev nodes of its interval. Neighbours differ at the knot between them by
+    up to twice the error.
+    """
+    # The last interval ends a little beyond the cut-off: a pair that rounding puts there must not get the first cubic.
+    density = np.float32(INTERVALS / cutoff**2 * (1 - 8 * np.finfo(np.float32).eps))
+    node, weight = np.polynomial.legendre.leggauss(64 + int(8 * alpha * cutoff))
+    s, weight = 0.5 * (1 + node), 0.5 * weight
+
+    def exact(x):
+        """Force over r, (..., INTERVALS), at places x within all intervals."""
+        r2 = np.add.outer(x, np.arange(INTERVALS)) / float(density)
+        return 4 * alpha**3 / sqrt(pi) * (np.exp(-np.multiply.outer(r2, (alpha * s) ** 2)) @ (weight * s**2)), r2
+
+    nodes = 0.5 + 0.5 * np.cos(pi * (np.arange(TERMS) + 0.5) / TERMS)
+    powers = np.vander(nodes, increasing=True)
+    table = np.linalg.solve(powers, exact(nodes)[0]).astype(np.float32)
+    x = np.linspace(0, 1, 33)
+    force, r2 = exact(x)
+    off = np.abs(np.vander(x, TERMS, increasing=True) @ table.astype(float) - force) * np.sqrt(r2)
+    return density, table, float(off.max())
 
 
 def _cut(series: np.ndarray, error: float, kind: np.dtype) -> np.ndarray:
@@ -81,13 +141,14 @@ class ScreenedCoulomb(NamedTuple):
     alpha: float  # 1/Å
     shift: float  # 1/Å
     error: float  # allowed for forces between unit charges in single precision, 1/Å²
-    screening: Screening
+    screening: Screening | TabledScreening
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
     def room(self, slots: int, dtype: type) -> "ScreenedCoulomb":
         """The law with room for the charges in slots, in the precision of lanes."""
         error = self.error if dtype == np.float32 else 0.0
-        return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype, error))
+        fitted = screening_of_lanes(self.alpha, self.cutoff, dtype, error)
+        return self._replace(charge=zeros(slots, dtype), screening=fitted)
 
 
 def screened_coulomb(
@@ -112,14 +173,15 @@ class DampedShiftedForce(NamedTuple):
 
     cutoff: float  # Å
     alpha: float  # 1/Å
-    screening: Screening
+    screening: Screening | TabledScreening
     slope: float  # 1/Å²
     shift: float  # 1/Å, the constant part
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
     def room(self, slots: int, dtype: type) -> "DampedShiftedForce":
         """The law with room for the charges in slots, in the precision of lanes."""
-        return self._replace(charge=zeros(slots, dtype), screening=screening(self.alpha, self.cutoff, dtype))
+        fitted = screening_of_lanes(self.alpha, self.cutoff, dtype)
+        return self._replace(charge=zeros(slots, dtype), screening=fitted)
 
 
 def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> DampedShiftedForce:
@@ -130,13 +192,43 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
     return DampedShiftedForce(cutoff, alpha, screening(alpha, cutoff), slope, shift, charge_e * COULOMB_CHARGE)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
 def screened(screening, inverse, r2):
-    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r and r², scalars or vectors."""
-    t = screening.scale * r2 - 1.0
-    u = inverse - polynomial(screening.energy, t)
-    w = inverse * inverse * inverse - polynomial(screening.force, t)
-    return u, w
+    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r and r²; vectors, or scalars without a table.
+
+    Valid up to the cut-off.
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(screened, PAIR_FLAGS, inline=True)
+def _screened(screening, inverse, r2):
+    if is_a(screening, Screening):
+
+        def by_polynomials(screening, inverse, r2):
+            t = screening.scale * r2 - 1.0
+            u = inverse - polynomial(screening.energy, t)
+            w = inverse * inverse * inverse - polynomial(screening.force, t)
+            return u, w
+
+        return by_polynomials
+    if not is_a(screening, TabledScreening):
+        return None
+
+    def by_table(screening, inverse, r2):
+        u = inverse - polynomial(screening.energy, screening.scale * r2 - 1.0)
+        k, x = parted(screening.density * r2)
+        force = _coefficient(screening.table, 3, k)
+        for term in (2, 1, 0):
+            force = force * x + _coefficient(screening.table, term, k)
+        return u, inverse * inverse * inverse - force
+
+    return by_table
+
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _coefficient(table, term, k):
+    """Coefficients of x^term in intervals k."""
+    return picked(load(table, INTERVALS * term), load(table, INTERVALS * term + 16), k)
 
 
 @implements(pairs.pair, PAIR_FLAGS, inline=True)
