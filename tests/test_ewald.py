@@ -137,7 +137,7 @@ def test_a_table_serves_where_it_is_accurate_enough():
         assert (off < allowed) == (x < 3.25)
         for error in (0.0, 0.9 * off, 1.1 * off):
             found = screening_of_lanes(alpha, cutoff, np.float32, error)
-            assert isinstance(found, TabledScreening) == (lanes.HAS_PICKED and off < max(error, allowed))
+            assert isinstance(found, TabledScreening) == (lanes.HAS_AVX512 and off < max(error, allowed))
             assert found.energy == screening(alpha, cutoff, np.float32).energy
         assert screening_of_lanes(alpha, cutoff, np.float64) == screening(alpha, cutoff)
 
@@ -146,7 +146,7 @@ def test_a_table_serves_where_it_is_accurate_enough():
 def screened_pairs(law, r2, energy, force):
     for i in range(0, len(r2), lanes.width_of(r2)):
         at = lanes.load(r2, i)
-        u, w = screened(law, lanes.inverse_root(at), at)
+        u, w = screened(law, lanes.inverse_root(at), lanes.inverse_cube(at), at)
         lanes.store(energy, i, u)
         lanes.store(force, i, w)
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
-from rigidmd.compile.lanes import inverse_root, load, zeros
-from rigidmd.forces.laws.endings import SWITCHES, Name, Polynomial, Shape, ended, ending, shape_of
+from rigidmd.compile.lanes import inverse_cube, inverse_root, load, zeros
+from rigidmd.forces.laws.endings import SWITCHES, Name, Plain, Polynomial, Shape, ended, ending, shape_of
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.units import COULOMB_CHARGE
 
@@ -47,12 +47,24 @@ def reaction_field(
     return ReactionField(cutoff, shape, end, field, charge_e * COULOMB_CHARGE)
 
 
+def _cube(shape, inverse, r2):
+    """1/r³; without an ending from r² alone, so that forces need no 1/r."""
+    raise TypeError("compiled code only")
+
+
+@implements(_cube, PAIR_FLAGS, inline=True)
+def _cube_of(shape, inverse, r2):
+    if is_a(shape, Plain):
+        return lambda shape, inverse, r2: inverse_cube(r2)
+    return lambda shape, inverse, r2: inverse * inverse * inverse
+
+
 @kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
     inverse = inverse_root(r2)
     u = inverse + law.field * r2 + law.end[0]
-    w = inverse * inverse * inverse - 2 * law.field
+    w = _cube(law.shape, inverse, r2) - 2 * law.field
     return ended(law.shape, law.end, r2 * inverse, inverse, u, w)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import erfc, ive
 
 from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
-from rigidmd.compile.lanes import HAS_PICKED, inverse_root, load, parted, picked, polynomial, zeros
+from rigidmd.compile.lanes import HAS_AVX512, inverse_cube, inverse_root, load, parted, picked, polynomial, zeros
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.units import COULOMB_CHARGE
 
@@ -73,7 +73,7 @@ def screening_of_lanes(alpha: float, cutoff: float, dtype: type, error: float = 
     `screening`) allows it.
     """
     found = screening(alpha, cutoff, dtype, error)
-    if not HAS_PICKED or dtype != np.float32:
+    if not HAS_AVX512 or dtype != np.float32:
         return found
     density, table, off = force_table(alpha, cutoff)
     at_zero = 4 * alpha**3 / (3 * sqrt(pi))
@@ -192,8 +192,8 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
     return DampedShiftedForce(cutoff, alpha, screening(alpha, cutoff), slope, shift, charge_e * COULOMB_CHARGE)
 
 
-def screened(screening, inverse, r2):
-    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r and r²; vectors, or scalars without a table.
+def screened(screening, inverse, cube, r2):
+    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r, 1/r³ and r²; scalars only without a table.
 
     Valid up to the cut-off.
     """
@@ -201,26 +201,26 @@ def screened(screening, inverse, r2):
 
 
 @implements(screened, PAIR_FLAGS, inline=True)
-def _screened(screening, inverse, r2):
+def _screened(screening, inverse, cube, r2):
     if is_a(screening, Screening):
 
-        def by_polynomials(screening, inverse, r2):
+        def by_polynomials(screening, inverse, cube, r2):
             t = screening.scale * r2 - 1.0
             u = inverse - polynomial(screening.energy, t)
-            w = inverse * inverse * inverse - polynomial(screening.force, t)
+            w = cube - polynomial(screening.force, t)
             return u, w
 
         return by_polynomials
     if not is_a(screening, TabledScreening):
         return None
 
-    def by_table(screening, inverse, r2):
+    def by_table(screening, inverse, cube, r2):
         u = inverse - polynomial(screening.energy, screening.scale * r2 - 1.0)
         k, x = parted(screening.density * r2)
         force = _coefficient(screening.table, 3, k)
         for term in (2, 1, 0):
             force = force * x + _coefficient(screening.table, term, k)
-        return u, inverse * inverse * inverse - force
+        return u, cube - force
 
     return by_table
 
@@ -237,7 +237,7 @@ def _pair(law, i, j, r2):
 
         def ewald_pair(law, i, j, r2):
             qq = law.charge[i] * load(law.charge, j)
-            u, w = screened(law.screening, inverse_root(r2), r2)
+            u, w = screened(law.screening, inverse_root(r2), inverse_cube(r2), r2)
             return qq * (u - law.shift), qq * w
 
         return ewald_pair
@@ -247,7 +247,7 @@ def _pair(law, i, j, r2):
     def shifted_pair(law, i, j, r2):
         qq = law.charge[i] * load(law.charge, j)
         inverse = inverse_root(r2)
-        u, w = screened(law.screening, inverse, r2)
+        u, w = screened(law.screening, inverse, inverse * inverse * inverse, r2)
         return qq * (u + law.slope * (r2 * inverse) + law.shift), qq * (w - law.slope * inverse)
 
     return shifted_pair

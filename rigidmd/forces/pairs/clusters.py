@@ -30,7 +30,6 @@ class Clusters(NamedTuple):
     square: np.ndarray  # (3 slots,) squared distances from the origins when sorted, Å²; later scratch for others
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved: np.ndarray  # (slots,) displacement of each site since then, Å
-    moved_most: np.ndarray  # (clusters,) the largest of those in each cluster, Å
     farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
     extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
 
@@ -52,7 +51,6 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
         square=zeros(3 * slots, dtype),
         reference=zeros(3 * slots, dtype),
         moved=zeros(slots, dtype),
-        moved_most=np.zeros(count, dtype),
         extent=np.zeros((blocks, 6)),
         farthest=np.zeros(blocks),
     )
@@ -210,7 +208,6 @@ def settle_block(clusters, cell, sites, state, group, block):
             reference[at], reference[at + width], reference[at + 2 * width] = x, y, z
         for k in range(3):
             origin[4 * c + k] = 0.5 * (low[k] + high[k])
-        clusters.moved_most[c] = 0.0
         _pair_up(order, reference, width, width * c, min(width * (c + 1), len(clusters.slot)))
         for slot in range(width * c, width * (c + 1)):
             i = order[slot]
@@ -257,7 +254,6 @@ def settle_again(clusters):
         for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
             clusters.local[n] = clusters.reference[n]
             clusters.square[slot] += clusters.local[n] ** 2
-    clusters.moved_most[:] = 0.0
     clusters.farthest[:] = 0.0
 
 
@@ -292,6 +288,5 @@ def follow_block(clusters, limit, block):
         dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
         moved = root(dx * dx + dy * dy + dz * dz)
         store(clusters.moved, width * c, moved)
-        clusters.moved_most[c] = largest(moved)
-        worst = max(worst, clusters.moved_most[c]) if bits(moved <= limit) == full else inf
+        worst = max(worst, largest(moved)) if bits(moved <= limit) == full else inf
     clusters.farthest[block] = worst

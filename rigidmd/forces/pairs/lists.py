@@ -4,8 +4,8 @@ A row is two sites near one another, so whatever is loaded of a cluster serves b
 
 A list is valid until some site has moved more than half the skin since it was built, by translation or rotation of its
 body. The engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. The clusters
-of each row are sorted into shells by distance. The displacements since the build tell how many shells can matter, and
-which clusters in them, so the loop works through a list as if it had hardly a skin.
+of each row are sorted into shells by distance. The displacements since the build tell how many shells can matter, so
+the loop works through a new list as if it had no skin.
 
 Each pair of clusters is stored once, in a row of the cluster behind, with the clusters taken as a ring. The list is
 divided into blocks of rows, and any thread may fill any block: the list, and every sum over it, has the same bits for
@@ -30,7 +30,6 @@ IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # enough for all images of a box within reach
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first: inside the cut-off when the list is built; the others divide the skin
-FINE = 18  # parts of a shell, in which distances beyond the cut-off are kept; 14 shells of them fit into a byte
 MOST_BEYOND = 2**16 - 1
 LONGEST_SKIN = 0.45  # of the smallest edge
 ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
@@ -59,7 +58,6 @@ class PairList(NamedTuple):
     row: np.ndarray  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
     beyond: np.ndarray  # (rows, SHELLS) uint16 how many entries at the end of a row are beyond shell k
     entries: np.ndarray  # (blocks, capacity) int32
-    beyond_by: np.ndarray  # (blocks, capacity) uint8 distance of each entry beyond the cut-off, in parts of a shell
     special: np.ndarray  # (rows,) int32 end of each row in masked[b]
     masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
     needed: np.ndarray  # (blocks, 3) room expected or needed: entries, masked entries, clusters from the first on
@@ -105,7 +103,6 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         row=np.zeros(rows, np.int32),
         beyond=np.zeros((rows, SHELLS), np.uint16),
         entries=np.empty((blocks, room), np.int32),
-        beyond_by=np.empty((blocks, room), np.uint8),
         special=np.zeros(rows, np.int32),
         masked=np.empty((blocks, ceil(1.5 * rows / blocks), 2), np.int32),  # measured per row: argon 1.1, water 1.5
         needed=needed,
@@ -190,8 +187,7 @@ def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
     blocks = len(pairs.needed)
     entries, masked, _ = pairs.needed.max(axis=0)
     if entries > pairs.entries.shape[1]:
-        room = (blocks, int(1.1 * entries) + 16)
-        pairs = pairs._replace(entries=np.empty(room, np.int32), beyond_by=np.empty(room, np.uint8))
+        pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.int32))
     if masked > pairs.masked.shape[1]:
         pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
     return pairs
@@ -218,32 +214,9 @@ def farthest(pairs):
 @kernel(inline=True)
 def end_of_row(pairs, r, farthest):
     """End of the entries of row r that can hold a site inside the cut-off; `farthest` as above, Å."""
-    shell = min(SHELLS - 1, ceil((row_moved(pairs, r) + farthest) * pairs.shells_per_A))
+    moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
+    shell = min(SHELLS - 1, ceil((moved + farthest) * pairs.shells_per_A))
     return pairs.row[r] - pairs.beyond[r, shell]
-
-
-@kernel(inline=True)
-def row_moved(pairs, r):
-    """The largest displacement of the sites of row r since the list was built, Å."""
-    return max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
-
-
-@kernel(inline=True)
-def pick(pairs, block, r, first, end, picked):
-    """Write to `picked` the entries first ... end - 1 of row r that can hold a site inside the cut-off; their number.
-
-    No branch depends on an entry: it would often be mispredicted.
-    """
-    entries, beyond_by = pairs.entries[block], pairs.beyond_by[block]
-    inside = max(first, min(end, pairs.row[r] - pairs.beyond[r, 0]))
-    for n in range(first, inside):
-        picked[n - first] = entries[n]
-    count = inside - first
-    moved, parts = row_moved(pairs, r), FINE * pairs.shells_per_A
-    for n in range(inside, end):
-        picked[count] = entries[n]
-        count += beyond_by[n] <= (moved + pairs.clusters.moved_most[cluster_of(entries[n])]) * parts
-    return count
 
 
 @kernel(inline=True)

@@ -43,22 +43,18 @@ from rigidmd.forces.pairs.lists import (
     lanes_of_first,
     lanes_of_second,
     most_needed,
-    pick,
 )  # fmt: skip
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
 from rigidmd.forces.pairs.update import list_code, refill, update_list
 from rigidmd.forces.terms import Setup
-
-PICKED = 512  # entries that are worked on at a time; a row seldom has more
 
 
 class Sums(NamedTuple):
     """Sums of forces and energies."""
 
     own: np.ndarray  # (3 slots,) force on each site from its own row, then from all rows; stored as Clusters.local
-    others: np.ndarray  # (blocks, room) minus the forces of a block's rows on the clusters from its first one on
+    others: np.ndarray  # (blocks, room) forces of a block's rows on the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
-    picked: np.ndarray  # (blocks, PICKED) int32 entries of a row that matter
 
 
 class PairForces(NamedTuple):
@@ -78,7 +74,6 @@ class PairForces(NamedTuple):
             own=pairs.clusters.square,  # no list is built while forces are summed
             others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
             tallies=np.zeros((blocks, TALLY_SIZE)),
-            picked=np.zeros((blocks, PICKED), np.int32),
         )
         return PairWorkspace(law, law.room(slots, setup.dtype), sites, pairs, sums)
 
@@ -243,13 +238,13 @@ def _hand_over(parcel, block):
 @task(fastmath=PAIR_FLAGS, counted=False)
 def _forces(parcel, block):
     law, pairs, sums = opened(parcel)
-    block_forces(law, pairs, sums, None, block)
+    block_forces(law, pairs, sums.own, sums.others, None, block)
 
 
 @task(fastmath=PAIR_FLAGS, counted=False)
 def _forces_and_energies(parcel, block):
     law, pairs, sums = opened(parcel)
-    block_forces(law, pairs, sums, sums.tallies, block)
+    block_forces(law, pairs, sums.own, sums.others, sums.tallies, block)
 
 
 @task(fastmath=PAIR_FLAGS, counted=False)
@@ -259,15 +254,16 @@ def _gather(parcel, block):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
-def block_forces(law, pairs, added, tallies, block):
-    """Forces from the rows of one block: on their own sites into `own`, minus those on other sites into `others`."""
-    clusters, own = pairs.clusters, added.own
+def block_forces(law, pairs, own, others, tallies, block):
+    """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`."""
+    clusters = pairs.clusters
     width = width_of(clusters.local)
-    others = added.others[block]
+    others = others[block]
     others[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
     if tallies is not None:
         tallies[block] = 0.0
-    masked, picked = pairs.masked[block], added.picked[block]
+    entries = pairs.entries[block]
+    masked = pairs.masked[block]
     zero = fill(0.0, clusters.local)
     moved = farthest(pairs)
     first_entry = first_special = 0
@@ -284,25 +280,24 @@ def block_forces(law, pairs, added, tallies, block):
                 between = _displacements(pairs, c, here, masked[n, 0])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
                 sums = _meet(law, pairs, block, i, masked[n, 0], between, masks, others, sums, tallies)
-            last_entry = end_of_row(pairs, i // 2, moved)
-            for first in range(first_entry, last_entry, PICKED):
-                last = pick(pairs, block, i // 2, first, min(first + PICKED, last_entry), picked) - 1
-                # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
-                # processor's queues before those of the next entry could enter.
-                entry = picked[0]
-                between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
-                if last >= 0:
-                    between = _displacements(pairs, c, here, entry)
-                for n in range(last + 1):
-                    ahead = picked[min(n + 1, last)]
-                    after = _displacements(pairs, c, here, ahead)
-                    sums = _meet(law, pairs, block, i, entry, between, (None, None), others, sums, tallies)
-                    entry, between = ahead, after
+            # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
+            # processor's queues before those of the next entry could enter.
+            last = end_of_row(pairs, i // 2, moved) - 1
+            entry = np.int32(0)
+            between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
+            if first_entry <= last:
+                entry = entries[first_entry]
+                between = _displacements(pairs, c, here, entry)
+            for n in range(first_entry, last + 1):
+                ahead = entries[min(n + 1, last)]
+                after = _displacements(pairs, c, here, ahead)
+                sums = _meet(law, pairs, block, i, entry, between, (None, None), others, sums, tallies)
+                entry, between = ahead, after
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
-            on_first, on_second, totals = sums
+            first, second, totals = sums
             for k in range(3):
-                own[at + k * width] = total(on_first[k])
-                own[at + k * width + 1] = total(on_second[k])
+                own[at + k * width] = total(first[k])
+                own[at + k * width + 1] = total(second[k])
             if tallies is not None:
                 for k, of in enumerate((0, 1, 2, 3, 2, 4, 5, 3, 5, 6)):
                     tallies[block, k] += total(totals[of])
@@ -336,7 +331,7 @@ def _separation(here, x, y, z):
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
 def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
-    """Forces between the sites in slots i, i + 1 and those of an entry, into `others` and `sums`; energies too."""
+    """Forces between the sites in slots i, i + 1 and those of an entry, added to `others` and `sums`; energies too."""
     width = width_of(pairs.clusters.local)
     other = cluster_of(entry)
     first, second, totals = sums
@@ -346,9 +341,9 @@ def _meet(law, pairs, block, i, entry, between, masks, others, sums, tallies):
     if ahead < 0:
         ahead += len(pairs.clusters.origin) // 4
     at = 3 * width * ahead
-    store(others, at, load(others, at) + (gx + hx))
-    store(others, at + width, load(others, at + width) + (gy + hy))
-    store(others, at + 2 * width, load(others, at + 2 * width) + (gz + hz))
+    store(others, at, load(others, at) - (gx + hx))
+    store(others, at + width, load(others, at + width) - (gy + hy))
+    store(others, at + 2 * width, load(others, at + 2 * width) - (gz + hz))
     return (
         (first[0] + gx, first[1] + gy, first[2] + gz),
         (second[0] + hx, second[1] + hy, second[2] + hz),
@@ -394,5 +389,5 @@ def gather_block(pairs, own, others, block):
                 if ahead < 0:
                     ahead += len(clusters.origin) // 4
                 if ahead < pairs.needed[b, WINDOW]:
-                    on_cluster = on_cluster - double(load(others[b], 3 * width * ahead + k * width))
+                    on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
             store(own, at, narrowed(on_cluster, own))

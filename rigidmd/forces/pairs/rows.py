@@ -21,7 +21,6 @@ from rigidmd.compile.lanes import (
 )  # fmt: skip
 from rigidmd.forces.pairs.lists import (
     ENTRIES,
-    FINE,
     IMAGES,
     IMAGES_FOUND,
     MASK_BITS,
@@ -134,7 +133,7 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
     width = width_of(pairs.clusters.local)
     rows = width // 2
     count = len(pairs.clusters.origin) // 4
-    entries, beyond_by, masked = pairs.entries[block], pairs.beyond_by[block], pairs.masked[block]
+    entries, masked = pairs.entries[block], pairs.masked[block]
     radius2 = ((pairs.cutoff + pairs.skin) * (1 + ROUNDING)) ** 2
     farthest = 0
     scratch.count[:] = 0
@@ -144,7 +143,7 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
         farthest = max(farthest, ahead + count if ahead < 0 else ahead)
     for own in range(rows):
         r = rows * c + own
-        filled = _fill_row(pairs.beyond[r], entries, beyond_by, filled, scratch, own, width)
+        filled = _fill_row(pairs.beyond[r], entries, filled, scratch, own, width)
         pairs.row[r] = min(filled, len(entries))
         for n in range(scratch.count[2, own]):
             entry = scratch.special[own, n]
@@ -160,7 +159,7 @@ def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
 
 
 @kernel(inline=True)
-def _fill_row(beyond, entries, beyond_by, filled, scratch, own, width):
+def _fill_row(beyond, entries, filled, scratch, own, width):
     """Write the entries of a row, shell by shell; returns the number of entries in the block so far.
 
     `beyond` is limited by its type: entries above that limit count as if they were inside the shell.
@@ -182,10 +181,8 @@ def _fill_row(beyond, entries, beyond_by, filled, scratch, own, width):
         for n in range(inners):
             entries[filled + n] = inner[n]
         for n in range(outers):
-            shell = scratch.shell[width * outer[n] + 2 * own]
-            k = ceil(shell)
+            k = ceil(scratch.shell[width * outer[n] + 2 * own])
             entries[end[k]] = scratch.entry[outer[n]]
-            beyond_by[end[k]] = int(FINE * shell)
             end[k] += 1
     return last
 
