@@ -13,6 +13,9 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import BodyScene, Scene
 
+# Tests run on all cores: a second process for each that compiles would only take time from the others.
+os.environ.setdefault("RIGIDMD_COMPILERS", "1")
+
 ROOT = Path(__file__).parent.parent
 SYSTEMS = sorted((ROOT / "systems").glob("*.toml"))
 BODIES = [path for path in SYSTEMS if isinstance(Scene.read(path), BodyScene)]

@@ -273,7 +273,7 @@ def test_an_override_with_nothing_removes_the_key(tmp_path):
 
     assert read().forces.cutoff_A == 8.0
     assert (read("forces.cutoff_A=").forces.cutoff_A, read("forces.cutoff_A= ").forces.skin_A) == (None, 1.0)
-    assert read("forces=").forces.skin_A == 1.6
+    assert read("forces=").forces.skin_A == 1.9
     assert [stage.timestep_fs for stage in read("stages.0=").stages] == [4]
     assert read("stages.1.timestep_fs=").stages[1].timestep_fs == 2.0
     assert read('stages.0.name=""').stages[0].name == ""  # an empty text is a value

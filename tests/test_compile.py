@@ -155,6 +155,58 @@ def test_a_task_that_is_not_there_is_named():
         call_what_is_not_there(content_of(np.zeros(2)))
 
 
+def test_every_block_is_worked_on_once_whichever_thread_takes_it():
+    content = content_of(np.zeros(3000))
+    for _ in range(20):
+        add_once_and_in_blocks(content, 3000)
+    assert content.values[0] == 60 and (content.values[1:] == 40).all()
+
+
+# --- a second process ------------------------------------------------------------------------------------------------
+
+#: Compiles `_add` for several types while a helper does so too, from the other end; prints what was read from the cache.
+BOTH = """
+import time
+import numba, numpy as np
+from rigidmd.compile import Parcel, ahead
+from test_compile import _add
+contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
+wanted = [(*_add.name, Parcel(numba.typeof(content))) for content in contents]
+with ahead.helped(wanted):
+    while not ahead._helper._over and len(ahead._helper._done) < 2:
+        time.sleep(0.05)
+    for _, _, parcel in wanted:
+        _add.address(parcel)
+print([_add.compiled[parcel]._cache_hits for _, _, parcel in wanted][-2:])
+"""
+
+
+def with_compilers(count: str, asked: str, tmp_path) -> subprocess.CompletedProcess:
+    environment = os.environ | {
+        "RIGIDMD_CACHE": str(tmp_path / "cache"), "RIGIDMD_COMPILERS": count,
+        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests"))),
+    }  # fmt: skip
+    return subprocess.run([sys.executable, "-c", asked], env=environment, capture_output=True, text=True, timeout=300)
+
+
+def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
+    done = with_compilers("2", BOTH, tmp_path)
+    assert done.stdout.split("\n")[0] == "[1, 1]", done.stderr
+
+
+def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
+    lost = BOTH.replace("with ahead.helped", "ahead.CHILD = 'raise SystemExit'\nwith ahead.helped")
+    done = with_compilers("2", lost, tmp_path)
+    assert done.stdout.split("\n")[0] == "[0, 0]", done.stderr
+
+
+@pytest.mark.parametrize("named", ["0", "three", ""])
+def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
+    asked = "from rigidmd.compile.ahead import compilers\ncompilers()"
+    done = with_compilers(named, asked, tmp_path)
+    assert f"RIGIDMD_COMPILERS is {named!r}, must be 1 or 2" in done.stderr
+
+
 # --- the cache -------------------------------------------------------------------------------------------------------
 
 

@@ -15,6 +15,7 @@ from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.dynamics.ramps import steady
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
+from rigidmd.forces.pairs.sites import blocks_of
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import random_rotations
@@ -249,6 +250,19 @@ def test_a_thermostat_that_rests_changes_no_bit():
     for free, rested in zip(*found, strict=True):
         assert np.array_equal(free, rested)
     assert found[1].books[HEAT] == 0
+
+
+@pytest.mark.parametrize("count", [513, 70_001])  # in 16 blocks, and in more
+def test_every_molecule_is_moved_once_in_however_many_blocks(count):
+    rng = np.random.default_rng(3)
+    model = build(small_scene({"argon": 2}, 30.0)).model
+    assert blocks_of(count) == (16 if count < 1000 else 17)
+    position, velocity = rng.normal(size=(2, count, 3))
+    state = state_of(position, velocity)
+    engine = Engine(model._replace(species=np.zeros(count, model.species.dtype)), {})
+    engine.advance(state, VERLET, 0.5, 2)
+    assert np.array_equal(state.velocity, velocity)
+    assert np.array_equal(state.position, position + 0.5 * velocity + 0.5 * velocity)
 
 
 def test_a_free_body_is_carried_by_nothing_else():

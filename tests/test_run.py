@@ -334,7 +334,7 @@ def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, 
     assert DECIDED[electrostatics] <= again.forces.model_fields_set
     assert "ewald_accuracy" not in again.forces.model_fields_set
     assert again.start.temperature_K == 300.0
-    assert again.forces.skin_A == 1.6
+    assert again.forces.skin_A == 1.9
     assert scene.resolved() == first.system.scene
     assert again.model_dump() == first.system.scene.model_dump()
     repeated = Simulation(again).run()

@@ -11,6 +11,7 @@ from rigidmd.compile.code import (
     address_of,
     call,
     call_blocks,
+    compiled_together,
     jump_to,
     laid_down,
     opened,
@@ -18,10 +19,11 @@ from rigidmd.compile.code import (
     task,
 )
 from rigidmd.compile.kernels import PAIR_FLAGS, implements, is_a, kernel
-from rigidmd.compile.machine import BLOCKS, SIMD_BITS
+from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 
 __all__ = [
     "BLOCKS",
+    "MOST_BLOCKS",
     "PAIR_FLAGS",
     "SIMD_BITS",
     "Code",
@@ -30,6 +32,7 @@ __all__ = [
     "address_of",
     "call",
     "call_blocks",
+    "compiled_together",
     "implements",
     "is_a",
     "jump_to",

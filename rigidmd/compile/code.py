@@ -1,6 +1,8 @@
 """Machine code that is called by address. Each address carries the type that the code was compiled for."""
 
+import contextlib
 import hashlib
+from collections.abc import Callable, Iterator
 
 import numba
 import numpy as np
@@ -11,8 +13,9 @@ from numba.core.errors import TypingError
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
+from rigidmd.compile import ahead
 from rigidmd.compile.kernels import kernel, options_of
-from rigidmd.compile.numba_private import callback, uncounted
+from rigidmd.compile.numba_private import callback, kept_callback, uncounted
 
 ADDRESS = ir.IntType(8).as_pointer()
 
@@ -72,17 +75,59 @@ class Task:
     def address(self, parcel: Parcel) -> int:
         """Address of the machine code for a parcel of this type, which is compiled or read from the cache."""
         if parcel not in self.compiled:
-            # Cached code that uses threads needs the threading layer to be running. Numba starts it for such code, but
-            # not where freshly compiled code calls a function that comes from the cache: without this line, a crash.
-            numba.get_num_threads()
+            ahead.wait_for(*self.name, parcel)
+            _start_threads()
             code = callback(self.function, (parcel, types.intp), self.options)
             self.compiled[parcel] = code
         return self.compiled[parcel].address
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Its module, and its name there."""
+        return self.function.__module__, self.function.__name__
+
+    def is_ready(self, parcel: Parcel) -> bool:
+        """Whether `address` has nothing to compile."""
+        if parcel not in self.compiled:
+            _start_threads()
+            code = kept_callback(self.function, (parcel, types.intp), self.options)
+            if code is None:
+                return False
+            self.compiled[parcel] = code
+        return True
+
+
+def _start_threads() -> None:
+    # Cached code that uses threads needs the threading layer to be running. Numba starts it for such code, but not
+    # where freshly compiled code calls a function that comes from the cache: without this, a crash.
+    numba.get_num_threads()
 
 
 def task(*, fastmath=False, counted=True):
     """Turn a function into a `Task`; the options are those of `kernel`."""
     return lambda function: Task(function, **options_of(fastmath, False), **uncounted(counted))
+
+
+#: Tasks of each `Code` that is made, while nothing is compiled; None otherwise.
+_plan: list[tuple[Task, Parcel]] | None = None
+
+
+@contextlib.contextmanager
+def compiled_together(make: Callable[[], object]) -> Iterator[None]:
+    """Within it another process helps to compile every `Code` that a function makes, if that is worth while.
+
+    The function is called for the tasks and types of its codes; these have no addresses, and must not be called.
+    """
+    global _plan
+    _plan = []
+    try:
+        make()
+        wanted = _plan
+    finally:
+        _plan = None
+    missing = [(*one.name, parcel) for one, parcel in wanted if not one.is_ready(parcel)]
+    with ahead.helped(missing) if len(missing) >= ahead.FEWEST else contextlib.nullcontext():
+        yield
 
 
 class Code:
@@ -93,7 +138,10 @@ class Code:
 
     def __init__(self, **tasks: tuple[Task, object]):
         parcels = {name: Parcel(numba.typeof(content)) for name, (_, content) in tasks.items()}
-        self._addresses = np.array([tasks[name][0].address(parcel) for name, parcel in parcels.items()], np.uintp)
+        of = [(tasks[name][0], parcel) for name, parcel in parcels.items()]
+        if _plan is not None:
+            _plan.extend(of)
+        self._addresses = np.array([0 if _plan is not None else one.address(parcel) for one, parcel in of], np.uintp)
         self.table = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(parcels.items()))
         self._names = list(tasks)

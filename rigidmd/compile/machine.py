@@ -10,7 +10,8 @@ from rigidmd.errors import SettingError
 #: As LLVM names them: the processor, and what it can do.
 PROCESSOR = get_host_cpu_name()
 PROCESSOR_FEATURES = tuple(sorted(name[1:] for name in get_host_cpu_features().split(",") if name.startswith("+")))
-BLOCKS = 16  # of work, which any thread may take: enough for 16 threads
+BLOCKS = 16  # of work, at least, which any thread may take: enough for 16 threads
+MOST_BLOCKS = 128
 WIDTHS = ("128", "256", "512")  # of vectors, in bits
 
 

@@ -6,7 +6,7 @@
 - `get_call_template` compiles for the types of arguments that it is given.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for Python.
 - `_nrt` is an option too: if it is False, references are not counted.
-- A `CFunc` compiles for given types and accepts a cache that we set.
+- A `CFunc` compiles for given types, accepts a cache that we set, and calls `_compile_uncached` if that has nothing.
 """
 
 import contextlib
@@ -196,9 +196,32 @@ def dispatcher(function: Callable, options: dict, outer: bool) -> CPUDispatcher:
 
 def callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
     """A function compiled for these types of arguments, or read from our cache; it is called by address."""
+    code = _not_yet_compiled(function, arguments, options)
+    code.compile()
+    return code
+
+
+def kept_callback(function: Callable, arguments: tuple, options: dict) -> CFunc | None:
+    """The same if our cache has it; None if it must be compiled."""
+
+    class NotKept(Exception):
+        pass
+
+    def compile_nothing():
+        raise NotKept
+
+    code = _not_yet_compiled(function, arguments, options)
+    code._compile_uncached = compile_nothing
+    try:
+        code.compile()
+    except NotKept:
+        return None
+    return code
+
+
+def _not_yet_compiled(function: Callable, arguments: tuple, options: dict) -> CFunc:
     code = CFunc(function, (arguments, types.void), locals={}, options=options)
     code._cache = _opened_cache(function)
-    code.compile()
     return code
 
 

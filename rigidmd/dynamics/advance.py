@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.schemes import BATH, BOX, DRIFT, KICK, STRETCH, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN, WORK
 from rigidmd.dynamics.baths import apply, bath_code
 from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
-from rigidmd.forces.pairs.sites import SERIAL
+from rigidmd.forces.pairs.sites import blocks_of
 from rigidmd.forces.terms import is_driven, total_energy_rate
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
@@ -172,7 +172,7 @@ def _kick_molecules(model, code, state, load, h):
 
     def kick_molecules(model, code, state, load, h):
         parcel = packed((model.species, model.inverse_mass, model.inverse_inertia, state, load, h))
-        call_blocks(code, "kick", parcel, _blocks(state))
+        call_blocks(code, "kick", parcel, blocks_of(len(state.position)))
 
     return kick_molecules
 
@@ -183,7 +183,7 @@ def _drift_molecules(model, code, state, h):
         return None
 
     def drift_molecules(model, code, state, h):
-        call_blocks(code, "drift", packed((model.rotor, model.species, state, h)), _blocks(state))
+        call_blocks(code, "drift", packed((model.rotor, model.species, state, h)), blocks_of(len(state.position)))
 
     return drift_molecules
 
@@ -233,16 +233,10 @@ def _pay_for_molecules(model, terms, state, h):
     return pay_for_molecules
 
 
-@kernel
-def _blocks(state):
-    """Blocks that molecules are moved in: one, on this thread, where there are few."""
-    return BLOCKS if len(state.position) > SERIAL else 1
-
-
 @kernel(inline=True)
 def _groups_of(state, block):
     """The first molecule of a block, and the first that is no more in it; whole groups."""
-    n, blocks = len(state.position), _blocks(state)
+    n, blocks = len(state.position), blocks_of(len(state.position))
     groups = (n + GROUP - 1) // GROUP
     return GROUP * (groups * block // blocks), min(n, GROUP * (groups * (block + 1) // blocks))
 

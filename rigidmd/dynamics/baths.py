@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.state import EXAMPLE, HEAT, NOW
 from rigidmd.dynamics.noise import Key, chi_square, fill_words, normal_of, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
-from rigidmd.forces.pairs.sites import SERIAL
+from rigidmd.forces.pairs.sites import blocks_of
 
 
 class NoBath(NamedTuple):
@@ -84,8 +84,8 @@ class NoseHoover(NamedTuple):
 
 
 def heat_room() -> np.ndarray:
-    """Room (BLOCKS,) for the heat that goes into each block of molecules."""
-    return np.zeros(BLOCKS)
+    """Room (MOST_BLOCKS,) for the heat that goes into each block of molecules."""
+    return np.zeros(MOST_BLOCKS)
 
 
 def bath_code(bath: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
@@ -138,7 +138,7 @@ def _apply_by_molecule(bath, model, code, state, room, h, draw):
         return None
 
     def apply_by_molecule(bath, model, code, state, room, h, draw):
-        blocks = BLOCKS if len(state.velocity) > SERIAL else 1
+        blocks = blocks_of(len(state.velocity))
         call_blocks(code, "stir", packed((bath, model, state, room, h, draw)), blocks)
         for block in range(blocks):
             state.books[HEAT] += room[block]
@@ -155,7 +155,7 @@ NORMALS, UNIFORM, FURTHER = 2, 2, 1 << 10
 def _stir(parcel, block):
     """The share of a bath that acts on each molecule by itself; its heat into room[block]."""
     bath, model, state, room, h, draw = opened(parcel)
-    n, blocks = len(state.velocity), BLOCKS if len(state.velocity) > SERIAL else 1
+    n, blocks = len(state.velocity), blocks_of(len(state.velocity))
     first, end = n * block // blocks, n * (block + 1) // blocks
     step, key = state.step[NOW], bath.key
     thermal = present(bath.thermal_energy, state)

@@ -6,6 +6,8 @@ from typing import Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 
+from rigidmd.compile import compiled_together
+from rigidmd.compile.ahead import compilers
 from rigidmd.compile.own import CompileError
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import (
@@ -77,7 +79,7 @@ class Engine:
         model: Model | Body,
         terms: dict[str, NamedTuple],
         precision: Precision = "double",
-        skin: float = 1.6,
+        skin: float = 1.9,
         applied: dict[str, Callable] | None = None,
     ):
         self.model = model
@@ -94,6 +96,7 @@ class Engine:
         self._seen: Load | None = None
         self._room: BoxRoom | None = None
         self._stale = True
+        self._first = True
         self._moved: State | None = None
 
     @property
@@ -226,8 +229,19 @@ class Engine:
         """Check the arrays for compiled code; return its workspaces, made at the first use."""
         _check_arrays(state)
         if self._workspaces is None:
-            self._workspaces = tuple(with_code(workspace) for workspace in self.room(state))
+            room = self.room(state)
+            if self._first and isinstance(self.model, Model) and compilers() > 1:
+                with compiled_together(lambda: self._codes_for(room)):
+                    self._codes_for(room)
+            self._first = False
+            self._workspaces = tuple(with_code(workspace) for workspace in room)
         return self._workspaces
+
+    def _codes_for(self, room: tuple[NamedTuple, ...]) -> None:
+        """Make all machine code of molecules that does not depend on a thermostat or a barostat."""
+        workspaces = tuple(with_code(workspace) for workspace in room)
+        Loading(workspaces, True)
+        code_of(self.model, NoBath())
 
     def _answer(self, status: int, state: State) -> tuple[NamedTuple, ...]:
         """Handle a status of compiled code; return the workspaces with which to call it again."""

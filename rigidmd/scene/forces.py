@@ -146,7 +146,7 @@ class Forces(Section):
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
     """Of pme: grid points along each edge of the cell of box or file; three equal numbers if it leans by more than half
     an edge, because an equivalent cell replaces it then"""
-    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.6
+    skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
 
     @model_validator(mode="after")

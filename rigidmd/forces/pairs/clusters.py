@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, PAIR_FLAGS, kernel
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, PAIR_FLAGS, kernel
 from rigidmd.compile.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
 from rigidmd.forces.pairs.sites import place
 
@@ -38,7 +38,9 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
     """Room for the clusters of this many sites, with positions of a NumPy dtype."""
     width = lane_count(dtype)
     count = max(1, ceil(sites / width))
-    blocks = min(BLOCKS, count) if sites > SERIAL_SITES else 1
+    # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as the cut-off. So the
+    # number of blocks grows as the edge of the box: memory for the sums is then in proportion to the sites.
+    blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > SERIAL_SITES else 1
     slots = count * width
     return Clusters(
         bounds=np.linspace(0, count, blocks + 1).astype(np.int64),

@@ -8,13 +8,20 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange, types
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, implements, is_a, kernel
 from rigidmd.compile.lanes import lane_count, width_of
 
 # Up to this number, loops over molecules stay on one thread. Measured: starting two threads costs about 40 µs,
 # placing the sites of a water 9.5 ns, so placing alone would gain only beyond some 8000 molecules. The drift uses the
 # same bound; with its sines and cosines a molecule takes longer.
 SERIAL = 512
+SHARE = 4096  # molecules of a block, where there are more blocks than the fewest
+
+
+@kernel(outer=True)
+def blocks_of(molecules):
+    """Number of blocks in which molecules are moved: one, on this thread, where there are few."""
+    return max(BLOCKS, min(MOST_BLOCKS, molecules // SHARE)) if molecules > SERIAL else 1
 
 
 class BodySites(NamedTuple):

@@ -22,7 +22,20 @@ from typing import NamedTuple
 import numpy as np
 from rocket_fft import c2c, c2r, r2c
 
-from rigidmd.compile import BLOCKS, PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import (
+    BLOCKS,
+    MOST_BLOCKS,
+    PAIR_FLAGS,
+    Code,
+    call,
+    call_blocks,
+    implements,
+    is_a,
+    kernel,
+    opened,
+    packed,
+    task,
+)
 from rigidmd.compile.lanes import load_eight, load_four, store, total
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
@@ -32,6 +45,7 @@ from rigidmd.forces.terms import Setup
 from rigidmd.forces.waves.ewald import add_wave_virial, invert_cell
 from rigidmd.forces.waves.splines import aliases, weights
 
+PLANES = 16  # of a block, where there are more blocks than the fewest
 SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, and no thread is started
 
 
@@ -89,7 +103,8 @@ class Pme(NamedTuple):
         kind = np.dtype(setup.dtype)
         pair = np.complex64 if kind == np.float32 else np.complex128
         s, width = len(self.charge), 4 if order <= 4 else 8
-        blocks = max(1, min(BLOCKS, grid[0] // order)) if np.prod(grid) > SERIAL_POINTS else 1
+        most = min(max(BLOCKS, grid[0] // PLANES), MOST_BLOCKS, grid[0] // order)
+        blocks = max(1, most) if np.prod(grid) > SERIAL_POINTS else 1
         value = np.zeros((order, width))
         value[:, :order] = weights(order)
         slope = value[1:] * np.arange(1, order)[:, None]

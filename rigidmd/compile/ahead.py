@@ -1,0 +1,119 @@
+"""A second process that compiles too: it begins with the last of the tasks that are wanted, this one with the first.
+
+Python and LLVM compile one function at a time in a process, so a second core helps only a second process. What it has
+compiled is read from the cache. It is started only where several tasks are not in the cache and there is a second core.
+The environment variable `RIGIDMD_COMPILERS` is the number of processes, 1 or 2; without it, 2.
+"""
+
+import contextlib
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+
+from rigidmd.errors import SettingError
+
+#: A helper is started for so many tasks; for fewer, loading the package in a second process takes longer.
+FEWEST = 3
+#: (module of a task, its name there, the type of its parcel)
+Wanted = tuple[str, str, object]
+#: What the helper runs: it finds the package where this process does.
+CHILD = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "from rigidmd.compile import ahead; ahead.serve()"
+)  # fmt: skip
+
+_helper: "Helper | None" = None
+
+
+def compilers() -> int:
+    """Number of processes that compile."""
+    named = os.environ.get("RIGIDMD_COMPILERS", "2")
+    if named not in ("1", "2"):
+        raise SettingError(f"RIGIDMD_COMPILERS is {named[:40]!r}, must be 1 or 2")
+    alone = not sys.executable or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0]) < 2
+    return 1 if alone else int(named)
+
+
+class Helper:
+    """A process that compiles tasks, the last of them first."""
+
+    def __init__(self, wanted: Sequence[Wanted]):
+        content = pickle.dumps(sys.path) + pickle.dumps(list(wanted))
+        self._places = {one: k for k, one in enumerate(wanted)}
+        self._begun: set[int] = set()
+        self._done: set[int] = set()
+        self._news = threading.Condition()
+        self._over = False
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", CHILD],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for this process, which then ends the helper
+        )
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # it has ended: then there is no help
+            self._process.stdin.write(content)
+            self._process.stdin.close()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                word, _, place = line.decode().partition(" ")
+                with self._news:
+                    (self._begun if word == "begun" else self._done).add(int(place))
+                    self._news.notify_all()
+        with self._news:
+            self._over = True
+            self._news.notify_all()
+
+    def wait_for(self, one: Wanted) -> None:
+        """Wait until the helper has compiled a task that it has begun."""
+        place = self._places.get(one)
+        with self._news:
+            while place in self._begun and place not in self._done and not self._over:
+                self._news.wait()
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+
+
+@contextlib.contextmanager
+def helped(wanted: Sequence[Wanted]) -> Iterator[None]:
+    """Within it a helper compiles the same tasks; without one if their types cannot be told to another process."""
+    global _helper
+    try:
+        _helper = Helper(wanted)
+    except (OSError, pickle.PicklingError, TypeError, AttributeError):
+        _helper = None
+    try:
+        yield
+    finally:
+        if _helper is not None:
+            _helper.stop()
+        _helper = None
+
+
+def wait_for(module: str, name: str, parcel: object) -> None:
+    """Called before a task is compiled here: waits if a helper has begun it."""
+    if _helper is not None:
+        _helper.wait_for((module, name, parcel))
+
+
+def serve() -> None:
+    """The helper: compile what standard input says, and say so."""
+    wanted = pickle.load(sys.stdin.buffer)
+    for place in range(len(wanted) - 1, -1, -1):
+        module, name, parcel = wanted[place]
+        task = getattr(importlib.import_module(module), name)
+        print("begun", place, flush=True)
+        task.address(parcel)
+        print("done", place, flush=True)
