@@ -167,8 +167,9 @@ def test_vectors_of_pairs_have_the_forces_of_erfc(x, dtype, rounding):
     assert (np.abs(force - w) < rounding * (1 / r**3 + screened_force(alpha, 0.0))).all()
 
 
-def test_damped_shifted_force_is_fennell_and_gezelter():
-    alpha, cutoff = 0.2, 6.0
+@pytest.mark.parametrize("alpha", [0.2, 0.0])
+def test_damped_shifted_force_is_fennell_and_gezelter(alpha):
+    cutoff = 6.0
     forces = {"cutoff_A": cutoff, "electrostatics": "damped_shifted_force", "damping_per_A": alpha}
     system, engine, state = built({"tip4p2005": 8, "spce": 6}, 13.0, 3, forces=forces)
     x, q, owner = charged_sites(system, state)

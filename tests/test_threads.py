@@ -43,3 +43,14 @@ def test_benchmarks_measure_what_a_user_gets(monkeypatch):
         monkeypatch.setenv(name, "2")
         assert name not in environment()
     assert environment()["PATH"] == os.environ["PATH"]
+
+
+@pytest.mark.parametrize(("layer", "word"), [("omp", "OpenMP"), ("workqueue", "Numba's own threads")])
+def test_check_says_how_many_threads_there_are_and_what_starts_them(layer, word):
+    code = (
+        "from rigidmd.assemble.describe import describe; from rigidmd.scene import Scene; "
+        "print(describe(Scene.read('systems/water.toml')))"
+    )
+    environment = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert f"computing: 2 threads ({word}), double precision" in done.stdout, done.stderr

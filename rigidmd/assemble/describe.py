@@ -11,6 +11,7 @@ from rigidmd.assemble.fields import fields_in_words
 from rigidmd.assemble.room import bytes_of
 from rigidmd.assemble.stage_words import stage_in_words
 from rigidmd.assemble.system import System, build
+from rigidmd.compile.machine import threads_in_words
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.dynamics.body import Body
 from rigidmd.forces.pairs.loop import PairForces
@@ -20,6 +21,9 @@ from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.own import name_of
 from rigidmd.validation import settled
+
+#: The arithmetic of forces, in words.
+PRECISIONS = {"double": "double", "mixed": "single"}
 
 
 def describe(scene: MolecularScene | BodyScene, bare: bool = False) -> str:
@@ -121,6 +125,9 @@ def _molecules(system: System) -> str:
         how, law = stage_in_words(stage)
         lines += [f"  {k}: {how}", f"     {law}"]
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces and neighbour lists")
+    if not scene.engine.is_other:
+        pairs = " between sites, the rest in double" if scene.precision == "mixed" else ""
+        lines.append(f"computing: {threads_in_words(scene.threads)}, {PRECISIONS[scene.precision]} precision{pairs}")
     return "\n".join(lines)
 
 

@@ -2,6 +2,7 @@
 
 import os
 
+import numba
 from llvmlite.binding import get_host_cpu_name
 from numba.core.codegen import get_host_cpu_features
 
@@ -25,3 +26,14 @@ def _simd_bits() -> int:
 
 
 SIMD_BITS = _simd_bits()
+
+#: Numba's names of what starts threads, in words.
+MADE_BY = {"omp": "OpenMP", "tbb": "TBB", "workqueue": "Numba's own threads"}
+
+
+def threads_in_words(asked: int | None) -> str:
+    """How many threads run when so many are asked for (None: all), and what starts them."""
+    most = numba.config.NUMBA_NUM_THREADS
+    numba.get_num_threads()  # this starts them
+    count = min(asked or most, most)
+    return f"{count} thread{'s' if count > 1 else ''} ({MADE_BY[numba.threading_layer()]})"

@@ -1,10 +1,11 @@
 """What a pair of sites costs in each kernel, and where a step of a liquid goes: one core, every vector width.
 
-    python tests/benchmarks/kernels.py --workloads W1,W3 --bits 512,256,128
+    python tests/benchmarks/kernels.py --workloads W1,W2,W3 --bits 512,256,128
 
-The liquids are W1 and W3 of peers.py. A lane is one site of a vector that meets another site; it is useful if the two
+The liquids are those of peers.py. A lane is one site of a vector that meets another site; it is useful if the two
 are inside the cut-off and act on one another. Times are the shortest of many calls, since other programs can only add
-to them; each width runs in a process of its own, since it is chosen when the package is imported.
+to them. A kernel is called several times by compiled code, and what a call from Python takes with no kernel at all,
+some milliseconds to find the types of so many arrays, is taken off. Each width runs in a process of its own, since it is chosen when the package is imported.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import os
 import subprocess
 import sys
 import time
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -32,19 +34,23 @@ from rigidmd.forces.pairs.sites import place_sites
 STEP = 2e-3  # ps
 STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step
 SECONDS = 0.5  # for each measurement
+TIMES = 10  # that a kernel is called at once
+MESH = ("scale", "spread", "convolve", "back", "pull")  # tasks in blocks
 ENDINGS = ("shift", "switch", "smooth_switch")
 
 
 @njit
-def run_blocks(code, name, content, blocks):
-    """All blocks of a task on this thread."""
-    call_blocks(code, literally(name), packed(content), blocks)
+def run_blocks(code, name, content, blocks, times):
+    """All blocks of a task on this thread, so many times."""
+    for _ in range(times):
+        call_blocks(code, literally(name), packed(content), blocks)
 
 
 @njit
-def run_once(code, name, content):
-    """A task that has one block."""
-    call(code, literally(name), packed(content))
+def run_once(code, name, content, times):
+    """A task that has one block, so many times."""
+    for _ in range(times):
+        call(code, literally(name), packed(content))
 
 
 @njit
@@ -61,14 +67,15 @@ def entries_that_matter(pairs):
 
 
 def milliseconds(function, *arguments) -> float:
-    """Shortest time of a call, ms."""
-    function(*arguments)
-    taken = []
-    while sum(taken) < SECONDS or len(taken) < 5:
-        began = time.perf_counter()
-        function(*arguments)
-        taken.append(time.perf_counter() - began)
-    return 1e3 * min(taken)
+    """Shortest time of a kernel, ms."""
+    function(*arguments, 1)
+    taken = {0: [], TIMES: []}
+    while sum(taken[TIMES]) < SECONDS or len(taken[TIMES]) < 5:
+        for times, own in taken.items():
+            began = time.perf_counter()
+            function(*arguments, times)
+            own.append(time.perf_counter() - began)
+    return max(0.0, 1e3 * (min(taken[TIMES]) - min(taken[0])) / TIMES)
 
 
 def useful_pairs(term: PairWorkspace, state: State) -> int:
@@ -98,46 +105,63 @@ def measure(job: dict) -> list[dict]:
     numba.set_num_threads(1)
     scheme = SCHEMES["velocity_verlet"]
     engine.advance(state, scheme, STEP, STEPS)
-    builds = [own.pairs.counters[BUILDS] for own in engine.workspaces.values()]
+    builds = {name: builds_of(own) for name, own in engine.workspaces.items()}
     began = time.perf_counter()
     engine.advance(state, scheme, STEP, 2 * STEPS)
     step = 1e3 * (time.perf_counter() - began) / STEPS
+    common = {**job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * DTYPES[job["precision"]]().itemsize), "step": step}
     found = []
-    load = no_load(state)
-    for (name, term), before in zip(engine.workspaces.items(), builds, strict=True):
-        pairs, blocks = term.pairs, len(term.pairs.needed)
-        code, lists, content = term.code, term.list_code, (term.arranged, pairs, term.sums)
-        placed, on_sites = (pairs, term.sites, state), (term.sites, term.forces_in_slots, state, load)
-        every = STEPS / max(1, pairs.counters[BUILDS] - before)
-        lanes, useful = lanes_of(term), useful_pairs(term, state)
-        forces = milliseconds(run_blocks, code, "forces", content, blocks)
-        found.append({
-            **job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * DTYPES[job["precision"]]().itemsize),
-            "kernel": f"{name}, {type(term.arranged).__name__}", "step": step, "every": every,
-            "per_pair": 1e6 * forces / useful, "per_lane": 1e6 * forces / lanes, "useful": useful / lanes,
-            "parts": {
-                "pairs": forces,
-                "gather": milliseconds(run_blocks, code, "gather", content, blocks),
-                "follow": milliseconds(run_blocks, lists, "follow", pairs, blocks),
-                "sites": milliseconds(run_blocks, lists, "place", placed, blocks)
-                + milliseconds(run_once, code, "hand_over", on_sites),
-                "list": (
-                    milliseconds(run_blocks, lists, "wrap", placed, blocks)
-                    + milliseconds(run_blocks, lists, "bin", placed, blocks)
-                    + milliseconds(run_once, lists, "prepare", pairs)
-                    + milliseconds(run_blocks, lists, "settle", placed, blocks)
-                    + milliseconds(run_once, lists, "grow", pairs)
-                    + milliseconds(run_blocks, lists, "fill", pairs, blocks)
-                ) / every,
-            },
-        })  # fmt: skip
+    for name, term in engine.workspaces.items():
+        if isinstance(term, PairWorkspace):
+            every = STEPS / max(1, builds_of(term) - builds[name])
+            found.append(common | {"kernel": f"{name}, {type(term.arranged).__name__}"} | of_pairs(term, state, every))
+        elif hasattr(term, "mesh"):
+            found.append(common | {"kernel": name, "mesh": of_mesh(term)})
     return found
+
+
+def builds_of(term: NamedTuple) -> int:
+    """Builds of its list so far; 0 if it has none."""
+    return int(term.pairs.counters[BUILDS]) if isinstance(term, PairWorkspace) else 0
+
+
+def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
+    """Times of the kernels of a law between pairs, whose list is built anew every so many steps."""
+    load = no_load(state)
+    pairs, blocks = term.pairs, len(term.pairs.needed)
+    code, lists, content = term.code, term.list_code, (term.arranged, pairs, term.sums)
+    placed, on_sites = (pairs, term.sites, state), (term.sites, term.forces_in_slots, state, load)
+    lanes, useful = lanes_of(term), useful_pairs(term, state)
+    forces = milliseconds(run_blocks, code, "forces", content, blocks)
+    gather = milliseconds(run_blocks, code, "gather", content, blocks)
+    follow = milliseconds(run_blocks, lists, "follow", pairs, blocks)
+    sites = milliseconds(run_blocks, lists, "place", placed, blocks)
+    sites += milliseconds(run_once, code, "hand_over", on_sites)
+    build = (  # in their order: each needs what the one before it leaves
+        milliseconds(run_blocks, lists, "wrap", placed, blocks)
+        + milliseconds(run_blocks, lists, "bin", placed, blocks)
+        + milliseconds(run_once, lists, "prepare", pairs)
+        + milliseconds(run_blocks, lists, "settle", placed, blocks)
+        + milliseconds(run_once, lists, "grow", pairs)
+        + milliseconds(run_blocks, lists, "fill", pairs, blocks)
+    )
+    return {
+        "every": every, "per_pair": 1e6 * forces / useful, "per_lane": 1e6 * forces / lanes, "useful": useful / lanes,
+        "parts": {"pairs": forces, "gather": gather, "follow": follow, "sites": sites, "list": build / every},
+    }  # fmt: skip
+
+
+def of_mesh(term: NamedTuple) -> dict[str, float]:
+    """Times of the kernels of the mesh, ms."""
+    content, blocks = (term.alpha, term.charge, term.spline, term.mesh), len(term.mesh.tallies)
+    times = {task: milliseconds(run_blocks, term.code, task, content, blocks) for task in MESH}
+    return times | {"sort": milliseconds(run_once, term.code, "sort", content)}
 
 
 def main() -> None:
     """Measure and print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--workloads", type=choice(WORKLOADS), default=["W1", "W3"], help="W1,W3")
+    parser.add_argument("--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1,W2,W3")
     parser.add_argument("--bits", type=numbers(int), default=[SIMD_BITS], help="vector widths; 512,256,128")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     asked = parser.parse_args()
@@ -157,24 +181,35 @@ def main() -> None:
                     sys.exit(done.stderr)
                 rows += json.loads(done.stdout.splitlines()[-1])
                 print(".", end="", file=sys.stderr, flush=True)
+    of_pair, of_waves = [r for r in rows if "parts" in r], [r for r in rows if "mesh" in r]
     print(
         "\n| | kernel | precision | ending | lanes | ns a useful pair | ns a lane | useful lanes |\n" + "|---" * 8 + "|"
     )
-    for r in rows:
+    for r in of_pair:
         print(
             f"| {r['workload']} | {r['kernel']} | {r['precision']} | {r['ending']} | {r['lanes']} "
             f"| {r['per_pair']:.2f} | {r['per_lane']:.2f} | {100 * r['useful']:.0f} % |"
         )
     print(
-        "\n| ms of a step | lanes | " + " | ".join(rows[0]["parts"]) + " | list every | the step |\n" + "|---" * 9 + "|"
+        "\n| ms of a step | lanes | "
+        + " | ".join(of_pair[0]["parts"])
+        + " | list every | the step |\n"
+        + "|---" * 9
+        + "|"
     )
-    for r in rows:
+    for r in of_pair:
         if r["ending"] == ENDINGS[0]:
             parts = " | ".join(f"{part:.3f}" for part in r["parts"].values())
             print(
                 f"| {r['workload']} {r['kernel'].partition(',')[0]}, {r['precision']} | {r['lanes']} | {parts} "
                 f"| {r['every']:.1f} steps | {r['step']:.2f} |"
             )
+    if of_waves:
+        print("\n| ms of a step | lanes | " + " | ".join(of_waves[0]["mesh"]) + " |\n" + "|---" * 8 + "|")
+    for r in of_waves:
+        if r["ending"] == ENDINGS[0]:
+            parts = " | ".join(f"{part:.3f}" for part in r["mesh"].values())
+            print(f"| {r['workload']} {r['kernel']}, {r['precision']} | {r['lanes']} | {parts} |")
 
 
 if __name__ == "__main__":

@@ -49,7 +49,8 @@ def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: floa
     kind = np.dtype(dtype)
     strength = 2 / sqrt(pi) * alpha
     energy = _cut(_series(alpha * cutoff, 0), 0.0, kind)
-    force = _cut(_series(alpha * cutoff, 2), error / (strength * 2 * alpha**2 * cutoff), kind)
+    of_unit = strength * 2 * alpha**2 * cutoff  # 0 without screening
+    force = _cut(_series(alpha * cutoff, 2), error / of_unit if of_unit else 0.0, kind)
     return Screening(
         kind.type(2 / cutoff**2),
         tuple(map(kind.type, strength * energy)),
