@@ -173,7 +173,8 @@ from test_compile import _add
 contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
 wanted = [(*_add.name, Parcel(numba.typeof(content))) for content in contents]
 with ahead.helped(wanted):
-    while not ahead._helper._over and len(ahead._helper._done) < 2:
+    helper = ahead._helper.get()
+    while not helper._over and len(helper._done) < 2:
         time.sleep(0.05)
     for _, _, parcel in wanted:
         _add.address(parcel)

@@ -22,8 +22,11 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.own import name_of
 from rigidmd.validation import settled
 
-#: The arithmetic of forces, in words.
-PRECISIONS = {"double": "double", "mixed": "single"}
+#: The arithmetic of forces, in words. Times: docs/benchmarks.md; the error is what tests/test_lanes.py allows.
+PRECISIONS = {
+    "double": 'double precision (precision = "mixed" takes about 0.6 of the time; its forces are good to 1e-5)',
+    "mixed": "mixed precision: single between sites, with forces good to 1e-5, and double for all else",
+}
 
 
 def describe(scene: MolecularScene | BodyScene, bare: bool = False) -> str:
@@ -126,8 +129,7 @@ def _molecules(system: System) -> str:
         lines += [f"  {k}: {how}", f"     {law}"]
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces and neighbour lists")
     if not scene.engine.is_other:
-        pairs = " between sites, the rest in double" if scene.precision == "mixed" else ""
-        lines.append(f"computing: {threads_in_words(scene.threads)}, {PRECISIONS[scene.precision]} precision{pairs}")
+        lines.append(f"computing: {threads_in_words(scene.threads)}, {PRECISIONS[scene.precision]}")
     return "\n".join(lines)
 
 

@@ -13,7 +13,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 
+from rigidmd.compile.cache import is_lasting
 from rigidmd.errors import SettingError
 
 #: A helper is started for so many tasks; for fewer, loading the package in a second process takes longer.
@@ -26,16 +28,14 @@ CHILD = (
     "from rigidmd.compile import ahead; ahead.serve()"
 )  # fmt: skip
 
-_helper: "Helper | None" = None
-
 
 def compilers() -> int:
     """Number of processes that compile."""
     named = os.environ.get("RIGIDMD_COMPILERS", "2")
     if named not in ("1", "2"):
         raise SettingError(f"RIGIDMD_COMPILERS is {named[:40]!r}, must be 1 or 2")
-    alone = not sys.executable or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0]) < 2
-    return 1 if alone else int(named)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return int(named) if cores > 1 and sys.executable and is_lasting() else 1
 
 
 class Helper:
@@ -86,26 +86,30 @@ class Helper:
         self._process.wait()
 
 
+#: The helper of this thread, if there is one.
+_helper: ContextVar[Helper | None] = ContextVar("helper", default=None)
+
+
 @contextlib.contextmanager
 def helped(wanted: Sequence[Wanted]) -> Iterator[None]:
-    """Within it a helper compiles the same tasks; without one if their types cannot be told to another process."""
-    global _helper
-    try:
-        _helper = Helper(wanted)
-    except (OSError, pickle.PicklingError, TypeError, AttributeError):
-        _helper = None
+    """Within it a helper compiles the same tasks; nobody helps if another process cannot be told their types."""
+    helper = None
+    with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
+        helper = Helper(wanted)
+    before = _helper.set(helper)
     try:
         yield
     finally:
-        if _helper is not None:
-            _helper.stop()
-        _helper = None
+        _helper.reset(before)
+        if helper is not None:
+            helper.stop()
 
 
 def wait_for(module: str, name: str, parcel: object) -> None:
     """Called before a task is compiled here: waits if a helper has begun it."""
-    if _helper is not None:
-        _helper.wait_for((module, name, parcel))
+    helper = _helper.get()
+    if helper is not None:
+        helper.wait_for((module, name, parcel))
 
 
 def serve() -> None:

@@ -58,6 +58,11 @@ def shared_folder() -> str | None:
     return str(folder) if cache_folder() != str(folder) and folder.is_dir() else None
 
 
+def is_lasting() -> bool:
+    """Whether what is compiled is kept where other processes read it."""
+    return cache_folder() == str(_named_folder())
+
+
 @functools.cache
 def cache_folder() -> str:
     """A writable folder for compiled code. Caches of older sources that were not used for a month are removed.

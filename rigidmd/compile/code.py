@@ -1,8 +1,8 @@
 """Machine code that is called by address. Each address carries the type that the code was compiled for."""
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextvars import ContextVar
 
 import numba
 import numpy as np
@@ -108,26 +108,28 @@ def task(*, fastmath=False, counted=True):
     return lambda function: Task(function, **options_of(fastmath, False), **uncounted(counted))
 
 
-#: Tasks of each `Code` that is made, while nothing is compiled; None otherwise.
-_plan: list[tuple[Task, Parcel]] | None = None
+#: Tasks of each `Code` that this thread makes, while it compiles nothing; None otherwise.
+_plan: ContextVar[list[tuple[Task, Parcel]] | None] = ContextVar("plan", default=None)
 
 
-@contextlib.contextmanager
-def compiled_together(make: Callable[[], object]) -> Iterator[None]:
-    """Within it another process helps to compile every `Code` that a function makes, if that is worth while.
+def compile_together(make: Callable[[], object]) -> None:
+    """Compile every `Code` that a function makes, with the help of a second process if that is worth while.
 
-    The function is called for the tasks and types of its codes; these have no addresses, and must not be called.
+    The function is first called for the tasks and types of its codes alone: these have no addresses, and it must not
+    call them.
     """
-    global _plan
-    _plan = []
+    if ahead.compilers() == 1:
+        return
+    wanted: list[tuple[Task, Parcel]] = []
+    before = _plan.set(wanted)
     try:
         make()
-        wanted = _plan
     finally:
-        _plan = None
-    missing = [(*one.name, parcel) for one, parcel in wanted if not one.is_ready(parcel)]
-    with ahead.helped(missing) if len(missing) >= ahead.FEWEST else contextlib.nullcontext():
-        yield
+        _plan.reset(before)
+    missing = [(*one.name, parcel) for one, parcel in dict.fromkeys(wanted) if not one.is_ready(parcel)]
+    if len(missing) >= ahead.FEWEST:
+        with ahead.helped(missing):
+            make()
 
 
 class Code:
@@ -139,9 +141,10 @@ class Code:
     def __init__(self, **tasks: tuple[Task, object]):
         parcels = {name: Parcel(numba.typeof(content)) for name, (_, content) in tasks.items()}
         of = [(tasks[name][0], parcel) for name, parcel in parcels.items()]
-        if _plan is not None:
-            _plan.extend(of)
-        self._addresses = np.array([0 if _plan is not None else one.address(parcel) for one, parcel in of], np.uintp)
+        plan = _plan.get()
+        if plan is not None:
+            plan.extend(of)
+        self._addresses = np.array([one.address(parcel) if plan is None else 0 for one, parcel in of], np.uintp)
         self.table = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(parcels.items()))
         self._names = list(tasks)

@@ -6,8 +6,7 @@ from typing import Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from rigidmd.compile import compiled_together
-from rigidmd.compile.ahead import compilers
+from rigidmd.compile import compile_together
 from rigidmd.compile.own import CompileError
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import (
@@ -230,9 +229,8 @@ class Engine:
         _check_arrays(state)
         if self._workspaces is None:
             room = self.room(state)
-            if self._first and isinstance(self.model, Model) and compilers() > 1:
-                with compiled_together(lambda: self._codes_for(room)):
-                    self._codes_for(room)
+            if self._first and isinstance(self.model, Model):
+                compile_together(lambda: self._codes_for(room))
             self._first = False
             self._workspaces = tuple(with_code(workspace) for workspace in room)
         return self._workspaces

@@ -163,6 +163,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1,W2,W3")
     parser.add_argument("--bits", type=numbers(int), default=[SIMD_BITS], help="vector widths; 512,256,128")
+    parser.add_argument("--endings", type=choice(ENDINGS), default=list(ENDINGS), help="of mixed precision; double has "
+                        "the first of them")  # fmt: skip
     parser.add_argument("--job", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.job:
@@ -172,7 +174,7 @@ def main() -> None:
     for bits in asked.bits:
         for workload in asked.workloads:
             start_of(workload, "own")
-            for precision, ending in [*(("mixed", ending) for ending in ENDINGS), ("double", ENDINGS[0])]:
+            for precision, ending in [*(("mixed", ending) for ending in asked.endings), ("double", asked.endings[0])]:
                 job = {"workload": workload, "precision": precision, "ending": ending}
                 command = [sys.executable, __file__, "--job", json.dumps(job)]
                 environment = os.environ | {"RIGIDMD_SIMD_BITS": str(bits), "NUMBA_NUM_THREADS": "1"}
@@ -198,7 +200,7 @@ def main() -> None:
         + "|"
     )
     for r in of_pair:
-        if r["ending"] == ENDINGS[0]:
+        if r["ending"] == asked.endings[0]:
             parts = " | ".join(f"{part:.3f}" for part in r["parts"].values())
             print(
                 f"| {r['workload']} {r['kernel'].partition(',')[0]}, {r['precision']} | {r['lanes']} | {parts} "
@@ -207,7 +209,7 @@ def main() -> None:
     if of_waves:
         print("\n| ms of a step | lanes | " + " | ".join(of_waves[0]["mesh"]) + " |\n" + "|---" * 8 + "|")
     for r in of_waves:
-        if r["ending"] == ENDINGS[0]:
+        if r["ending"] == asked.endings[0]:
             parts = " | ".join(f"{part:.3f}" for part in r["mesh"].values())
             print(f"| {r['workload']} {r['kernel']}, {r['precision']} | {r['lanes']} | {parts} |")
 
