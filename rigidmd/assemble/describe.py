@@ -24,7 +24,7 @@ from rigidmd.validation import settled
 
 #: The arithmetic of forces, in words. Times: docs/benchmarks.md; the error is what tests/test_lanes.py allows.
 PRECISIONS = {
-    "double": 'double precision (precision = "mixed" takes about 0.6 of the time; its forces are good to 1e-5)',
+    "double": 'double precision (precision = "mixed" takes about half the time; its forces are good to 1e-5)',
     "mixed": "mixed precision: single between sites, with forces good to 1e-5, and double for all else",
 }
 
