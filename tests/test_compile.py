@@ -201,6 +201,34 @@ def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
     assert done.stdout.split("\n")[0] == "[0, 0]", done.stderr
 
 
+#: As an engine does it: how often its codes are made, and whether each that is made last can be called.
+TOGETHER = """
+import numpy as np
+from rigidmd.compile import Code, ahead, compile_together
+from test_compile import _add
+contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
+made = []
+make = lambda: made.append([Code(add=(_add, content)) for content in contents])
+compile_together(make)
+print([[code.address("add") != 0 for code in codes] for codes in made])
+compile_together(make)
+print(len(made), Code(add=(_add, contents[0])).address("add") == made[1][0].address("add"))
+"""
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="where there is one core, one process compiles")
+def test_codes_are_planned_and_then_compiled_together(tmp_path):
+    """First without addresses; then with them; once more only planned, since nothing is left to compile."""
+    done = with_compilers("2", TOGETHER, tmp_path)
+    assert done.stdout.splitlines() == [f"[{[False] * 4}, {[True] * 4}]", "3 True"], done.stderr
+
+
+def test_one_compiler_plans_nothing(tmp_path):
+    before = TOGETHER.partition("compile_together(make)")[0]
+    done = with_compilers("1", f"{before}compile_together(make)\nprint(made)", tmp_path)
+    assert done.stdout.splitlines() == ["[]"], done.stderr
+
+
 @pytest.mark.parametrize("named", ["0", "three", ""])
 def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
     asked = "from rigidmd.compile.ahead import compilers\ncompilers()"

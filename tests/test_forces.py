@@ -7,10 +7,12 @@ from numba.core.errors import TypingError
 from reference import Oracle
 
 from rigidmd.assemble.system import build
+from rigidmd.compile.lanes import lane_count
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import no_load
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
+from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import BUILDS, USABLE
 from rigidmd.forces.pairs.space import cell_of
 from rigidmd.forces.terms import Loading
@@ -219,6 +221,13 @@ def test_lists_begin_with_about_the_room_they_need(edge):
         assert needed[0] <= 1.1 * entries and entries < 1.6 * needed[0] + 16
         if edge:
             assert needed[2] <= 1.2 * others and others < 1.6 * needed[2] + 16
+
+
+def test_blocks_of_lists_grow_in_number_with_the_edge_of_the_box():
+    for sites, blocks in ((900, 1), (12_288, 16), (1_000_000, 20), (2_000_000, 25)):
+        bounds = clusters_of(sites, np.float64).bounds
+        assert len(bounds) == blocks + 1
+        assert bounds[0] == 0 and bounds[-1] * lane_count(np.float64) >= sites and (np.diff(bounds) > 0).all()
 
 
 CHANGED = {"squeezed": np.diag([0.99] * 3), "sheared": np.array([[1, 0, 0], [0.01, 1, 0], [-0.02, 0.01, 1]])}

@@ -1,4 +1,4 @@
-"""Properties of this machine: its processor, the width of its vectors, and how finely work is divided."""
+"""Properties of this machine: its processor, the width of its vectors, its threads, how finely work is divided."""
 
 import os
 

@@ -5,8 +5,9 @@ force over r. Each is a polynomial in r², fitted when the law is created, with 
 the precision of the loop require. A vector of pairs then costs one inverse square root and one multiply-add per term.
 
 In vectors of 16 float32 the force is rather a cubic for each of 32 intervals of r²: a lookup takes one instruction,
-which runs beside the multiply-adds. For PME with a cut-off of 9 Å the loop takes 5 % less time than with the ten terms
-that it would need there, and the force is 30 times as accurate; the loop without any screening takes 14 to 20 % less.
+which runs beside the multiply-adds. For PME with a cut-off of 9 Å the loop takes 4 to 10 % less time than with the ten
+terms that it would need there, and the force is 30 times as accurate; without any screening it would take 14 to 20 %
+less.
 """
 
 from math import exp, pi, sqrt
