@@ -14,6 +14,7 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
 from rigidmd.compile import ahead
+from rigidmd.compile.crew import begin, spread
 from rigidmd.compile.kernels import kernel, options_of
 from rigidmd.compile.numba_private import callback, kept_callback, uncounted
 
@@ -76,7 +77,7 @@ class Task:
         """Address of the machine code for a parcel of this type, which is compiled or read from the cache."""
         if parcel not in self.compiled:
             ahead.wait_for(*self.name, parcel)
-            _start_threads()
+            begin()
             code = callback(self.function, (parcel, types.intp), self.options)
             self.compiled[parcel] = code
         return self.compiled[parcel].address
@@ -89,18 +90,12 @@ class Task:
     def is_ready(self, parcel: Parcel) -> bool:
         """Whether `address` has nothing to compile."""
         if parcel not in self.compiled:
-            _start_threads()
+            begin()
             code = kept_callback(self.function, (parcel, types.intp), self.options)
             if code is None:
                 return False
             self.compiled[parcel] = code
         return True
-
-
-def _start_threads() -> None:
-    # Cached code that uses threads needs the threading layer to be running. Numba starts it for such code, but not
-    # where freshly compiled code calls a function that comes from the cache: without this, a crash.
-    numba.get_num_threads()
 
 
 def task(*, fastmath=False, counted=True):
@@ -268,36 +263,12 @@ def jump_to(typing, address, content, block):
     return types.void(types.intp, types.intp, types.intp), emit
 
 
-@intrinsic
-def _next(typing, taken):
-    """The number in a parcel, to which 1 is added at the same time, whichever thread asks."""
-
-    def emit(context, builder, signature, arguments):
-        whole = ir.IntType(64)
-        count = builder.bitcast(arguments[0], whole.as_pointer())
-        return builder.atomic_rmw("add", count, whole(1), "monotonic")
-
-    return types.int64(taken), emit
-
-
-@kernel(parallel=True)
-def _jump_threaded(address, parcel, taken, blocks):
-    # Each thread takes the next block as soon as it has done one: a thread that shares its core with another program
-    # does fewer, and the others do not wait for its share. Its first turn of this loop takes blocks until there are
-    # none; the other turns find none.
-    for _ in numba.prange(blocks):
-        block = _next(taken)
-        while block < blocks:
-            _jump(address, parcel, block)
-            block = _next(taken)
-
-
 @kernel
 def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
         _jump(address, parcel, 0)
     else:
-        _jump_threaded(address, parcel, packed(0), blocks)
+        spread(address, parcel, blocks)
 
 
 def call(code, name, parcel):

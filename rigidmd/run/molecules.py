@@ -6,9 +6,9 @@ from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-import numba
 import numpy as np
 
+from rigidmd.compile.crew import most_threads, set_threads
 from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
@@ -88,9 +88,7 @@ class MolecularSimulation(Simulation):
             raise SceneError(
                 scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
             )
-        # Numba defines the names of its config at import, out of sight of a type checker
-        most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
-        self.threads = min(scene.threads or most, most)
+        self.threads = min(scene.threads or most_threads(), most_threads())
         self._reset()
 
     def start_from(self, state: State) -> None:
@@ -125,7 +123,7 @@ class MolecularSimulation(Simulation):
         self.scene = self.system.scene
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
-        numba.set_num_threads(self.threads)
+        set_threads(self.threads)
 
     def _prepare(self) -> None:
         """Relieve overlaps, and compile the steps or see that another engine computes the same."""

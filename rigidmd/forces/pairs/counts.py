@@ -5,9 +5,8 @@ a frame for 4096 waters within 10 Å.
 """
 
 import numpy as np
-from numba import prange
 
-from rigidmd.compile import kernel
+from rigidmd.compile import Code, call_blocks, kernel, opened, packed, task
 
 #: Parts of the sites that are counted independently.
 PARTS = 64
@@ -15,34 +14,39 @@ PARTS = 64
 WITHIN, FOR_EACH = 2, 8
 
 
-@kernel(parallel=True, outer=True)
-def _count(first, owner, second, owner_2, cell, grid, start, reach, edge, counts):
+@kernel(outer=True)
+def _count(code, content):
+    call_blocks(code, "count", packed(content), PARTS)
+
+
+@task()
+def _count_part(parcel, part):
     """Add to counts (PARTS, bins) the pairs (i of first, j of second) of different owners that are closer than
     edge * bins; fractions of the box, second sorted by cells of the grid, `start` where each begins."""
+    first, owner, second, owner_2, cell, grid, start, reach, edge, counts = opened(parcel)
     bins = counts.shape[1]
     largest = (edge * bins) ** 2
     nx, ny, nz = grid
-    for part in prange(PARTS):
-        for i in range(len(first) * part // PARTS, len(first) * (part + 1) // PARTS):
-            x, y, z = first[i]
-            cx = int(x * nx) - reach[0] + nx
-            cy = int(y * ny) - reach[1] + ny
-            cz = int(z * nz) - reach[2] + nz
-            for dx in range(min(nx, 2 * reach[0] + 1)):
-                for dy in range(min(ny, 2 * reach[1] + 1)):
-                    for dz in range(min(nz, 2 * reach[2] + 1)):
-                        here = ((cx + dx) % nx * ny + (cy + dy) % ny) * nz + (cz + dz) % nz
-                        for j in range(start[here], start[here + 1]):
-                            if owner[i] == owner_2[j]:
-                                continue
-                            u, v, w = second[j, 0] - x, second[j, 1] - y, second[j, 2] - z
-                            u, v, w = u - np.rint(u), v - np.rint(v), w - np.rint(w)
-                            a = u * cell[0, 0] + v * cell[1, 0] + w * cell[2, 0]
-                            b = v * cell[1, 1] + w * cell[2, 1]
-                            c = w * cell[2, 2]
-                            r2 = a * a + b * b + c * c
-                            if r2 < largest:
-                                counts[part, min(int(np.sqrt(r2) / edge), bins - 1)] += 1
+    for i in range(len(first) * part // PARTS, len(first) * (part + 1) // PARTS):
+        x, y, z = first[i]
+        cx = int(x * nx) - reach[0] + nx
+        cy = int(y * ny) - reach[1] + ny
+        cz = int(z * nz) - reach[2] + nz
+        for dx in range(min(nx, 2 * reach[0] + 1)):
+            for dy in range(min(ny, 2 * reach[1] + 1)):
+                for dz in range(min(nz, 2 * reach[2] + 1)):
+                    here = ((cx + dx) % nx * ny + (cy + dy) % ny) * nz + (cz + dz) % nz
+                    for j in range(start[here], start[here + 1]):
+                        if owner[i] == owner_2[j]:
+                            continue
+                        u, v, w = second[j, 0] - x, second[j, 1] - y, second[j, 2] - z
+                        u, v, w = u - np.rint(u), v - np.rint(v), w - np.rint(w)
+                        a = u * cell[0, 0] + v * cell[1, 0] + w * cell[2, 0]
+                        b = v * cell[1, 1] + w * cell[2, 1]
+                        c = w * cell[2, 2]
+                        r2 = a * a + b * b + c * c
+                        if r2 < largest:
+                            counts[part, min(int(np.sqrt(r2) / edge), bins - 1)] += 1
 
 
 def heights(cell: np.ndarray) -> np.ndarray:
@@ -75,5 +79,6 @@ def count_pairs(
     start = np.searchsorted(place[order], np.arange(grid.prod() + 1))
     counts = np.zeros((PARTS, bins), np.int64)
     sizes = tuple(map(int, grid)), tuple(map(int, reach))
-    _count(inside, owner, inside_2[order], owner_2[order], cell, sizes[0], start, sizes[1], edge, counts)
+    content = (inside, owner, inside_2[order], owner_2[order], cell, sizes[0], start, sizes[1], edge, counts)
+    _count(Code(count=(_count_part, content)), content)
     return counts.sum(axis=0)

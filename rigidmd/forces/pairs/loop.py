@@ -44,7 +44,7 @@ from rigidmd.forces.pairs.lists import (
     lanes_of_second,
     most_needed,
 )  # fmt: skip
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, load_from_sites, virial_of_offsets
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, blocks_of, load_some, virial_of_offsets
 from rigidmd.forces.pairs.update import list_code, refill, update_list
 from rigidmd.forces.terms import Setup
 
@@ -109,7 +109,7 @@ class PairWorkspace(NamedTuple):
             forces=(_forces, content),
             forces_and_energies=(_forces_and_energies, content),
             gather=(_gather, content),
-            hand_over=(_hand_over, (self.sites, self.forces_in_slots, state, load)),
+            load=(load_some, (self.sites, state, load, self.forces_in_slots)),
         )
         return self._replace(code=code, list_code=lists)
 
@@ -186,7 +186,7 @@ def _add_pair_forces(term, state, load, tally):
             call_blocks(code, "forces_and_energies", parcel, blocks)
         call_blocks(code, "gather", parcel, blocks)
         force = InSlots(sums.own, pairs.clusters.slot)
-        call(code, "hand_over", packed((term.sites, force, state, load)))
+        call_blocks(code, "load", packed((term.sites, state, load, force)), blocks_of(len(state.position)))
         if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
@@ -227,12 +227,6 @@ def _refill(term):
         status = _arranged(term.law, term.arranged, pairs, term.sums)
     pairs.counters[STATUS] = status
     return status
-
-
-@task()
-def _hand_over(parcel, block):
-    sites, force, state, load = opened(parcel)
-    load_from_sites(sites, state, load, force)
 
 
 @task(fastmath=PAIR_FLAGS, counted=False)

@@ -6,14 +6,13 @@ Each law has its own list of sites: those that take part in it. Sites of one mol
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange, types
+from numba import types
 
-from rigidmd.compile import BLOCKS, MOST_BLOCKS, implements, is_a, kernel
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, implements, is_a, kernel, opened, task
 from rigidmd.compile.lanes import lane_count, width_of
+from rigidmd.core.state import EXAMPLE
 
-# Up to this number, loops over molecules stay on one thread. Measured: starting two threads costs about 40 µs,
-# placing the sites of a water 9.5 ns, so placing alone would gain only beyond some 8000 molecules. The drift uses the
-# same bound; with its sines and cosines a molecule takes longer.
+# Up to this number, loops over molecules stay on one thread.
 SERIAL = 512
 SHARE = 4096  # molecules of a block, where there are more blocks than the fewest
 
@@ -22,6 +21,12 @@ SHARE = 4096  # molecules of a block, where there are more blocks than the fewes
 def blocks_of(molecules):
     """Number of blocks in which molecules are moved: one, on this thread, where there are few."""
     return max(BLOCKS, min(MOST_BLOCKS, molecules // SHARE)) if molecules > SERIAL else 1
+
+
+@kernel(inline=True)
+def _molecules_of(state, block):
+    n, blocks = len(state.position), blocks_of(len(state.position))
+    return range(n * block // blocks, n * (block + 1) // blocks)
 
 
 class BodySites(NamedTuple):
@@ -179,36 +184,40 @@ def place_molecule(sites, state, m, site_position):
         site_position[i, 0], site_position[i, 1], site_position[i, 2] = place(sites, state, m, i)
 
 
-@kernel(parallel=True)
-def _place_threaded(sites, state, site_position):
-    for m in prange(len(state.position)):
-        place_molecule(sites, state, m, site_position)
-
-
-@kernel(parallel=True)
-def _load_threaded(sites, state, load, site_force):
-    for m in prange(len(state.position)):
-        load_molecule(sites, state, load, m, site_force)
-
-
 @kernel(outer=True)
 def place_sites(sites, state, site_position):
     """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
-    if len(state.position) <= SERIAL:
-        for m in range(len(state.position)):
-            place_molecule(sites, state, m, site_position)
-    else:
-        _place_threaded(sites, state, site_position)
+    for m in range(len(state.position)):
+        place_molecule(sites, state, m, site_position)
 
 
 @kernel
 def load_from_sites(sites, state, load, site_force):
     """Add site forces, an array (s, 3) or `InSlots`, to the bodies' forces and torques."""
-    if len(state.position) <= SERIAL:
-        for m in range(len(state.position)):
-            load_molecule(sites, state, load, m, site_force)
-    else:
-        _load_threaded(sites, state, load, site_force)
+    for m in range(len(state.position)):
+        load_molecule(sites, state, load, m, site_force)
+
+
+@task()
+def place_some(parcel, block):
+    """`place_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    sites, state, site_position = opened(parcel)
+    for m in _molecules_of(state, block):
+        place_molecule(sites, state, m, site_position)
+
+
+@task()
+def load_some(parcel, block):
+    """`load_from_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    sites, state, load, site_force = opened(parcel)
+    for m in _molecules_of(state, block):
+        load_molecule(sites, state, load, m, site_force)
+
+
+def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray) -> dict:
+    """The tasks "place" and "load" for arrays (s, 3), see `Code`."""
+    state, load = EXAMPLE
+    return {"place": (place_some, (sites, state, position)), "load": (load_some, (sites, state, load, force))}
 
 
 def virial_of_offsets(sites, state, site_force, tally):

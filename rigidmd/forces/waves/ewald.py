@@ -25,7 +25,7 @@ from rigidmd.compile import PAIR_FLAGS, Code, call_blocks, implements, is_a, ker
 from rigidmd.compile.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, blocks_of, site_tasks, virial_of_offsets
 from rigidmd.forces.pairs.space import follow_cell
 from rigidmd.forces.terms import Setup
 from rigidmd.forces.waves.vectors import Waves
@@ -97,7 +97,8 @@ class EwaldWorkspace(NamedTuple):
     def with_code(self) -> "EwaldWorkspace":
         """With its machine code."""
         content = (self.alpha, self.waves, self.sums)
-        return self._replace(code=Code(turn=(_turn, content), sum=(_sum, content), push=(_push, content)))
+        moved = site_tasks(self.sites, self.sums.position, self.sums.force)
+        return self._replace(code=Code(turn=(_turn, content), sum=(_sum, content), push=(_push, content), **moved))
 
 
 @kernel
@@ -123,7 +124,8 @@ def _add_ewald_sum(term, state, load, tally):
 
     def add_ewald_sum(term, state, load, tally):
         own = term.sums
-        place_sites(term.sites, state, own.position)
+        placed, molecules = packed((term.sites, state, own.position)), blocks_of(len(state.position))
+        call_blocks(term.code, "place", placed, molecules)
         if follow_cell(state.cell, own.cell):
             volume = abs(invert_cell(own.cell, own.reciprocal))
             _set_strengths(term.waves, own, term.alpha, volume)
@@ -137,7 +139,7 @@ def _add_ewald_sum(term, state, load, tally):
                 for k in range(len(tally)):
                     tally[k] += own.tallies[block, k]
             virial_of_offsets(term.sites, state, own.force, tally)
-        load_from_sites(term.sites, state, load, own.force)
+        call_blocks(term.code, "load", packed((term.sites, state, load, own.force)), molecules)
         return OK
 
     return add_ewald_sum

@@ -39,7 +39,7 @@ from rigidmd.compile import (
 from rigidmd.compile.lanes import load_eight, load_four, store, total
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, blocks_of, site_tasks, virial_of_offsets
 from rigidmd.forces.pairs.space import follow_cell
 from rigidmd.forces.terms import Setup
 from rigidmd.forces.waves.ewald import add_wave_virial, invert_cell
@@ -158,7 +158,9 @@ class PmeWorkspace(NamedTuple):
         content = (self.alpha, self.charge, self.spline, self.mesh)
         tasks = (_weigh, _scale, _sort, _spread, _convolve, _convolve_and_count, _back, _pull)
         names = ("weigh", "scale", "sort", "spread", "convolve", "convolve_and_count", "back", "pull")
-        return self._replace(code=Code(**{name: (one, content) for name, one in zip(names, tasks, strict=True)}))
+        found = {name: (one, content) for name, one in zip(names, tasks, strict=True)}
+        moved = site_tasks(self.sites, self.mesh.position, self.mesh.force)
+        return self._replace(code=Code(**found, **moved))
 
 
 @implements(terms.add_forces, counted=False)
@@ -170,7 +172,8 @@ def _add_pme(term, state, load, tally):
         code, mesh = term.code, term.mesh
         blocks = len(mesh.tallies)
         parcel = packed((term.alpha, term.charge, term.spline, mesh))
-        place_sites(term.sites, state, mesh.position)
+        placed, molecules = packed((term.sites, state, mesh.position)), blocks_of(len(state.position))
+        call_blocks(code, "place", placed, molecules)
         if follow_cell(state.cell, mesh.cell):
             invert_cell(mesh.cell, mesh.reciprocal)
             call_blocks(code, "weigh", parcel, blocks)
@@ -191,7 +194,7 @@ def _add_pme(term, state, load, tally):
                 for k in range(len(tally)):
                     tally[k] += mesh.tallies[block, k]
             virial_of_offsets(term.sites, state, mesh.force, tally)
-        load_from_sites(term.sites, state, load, mesh.force)
+        call_blocks(code, "load", packed((term.sites, state, load, mesh.force)), molecules)
         return OK
 
     return add_pme

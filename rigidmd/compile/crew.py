@@ -1,0 +1,324 @@
+"""Threads that share the blocks of a task, without OpenMP: they wait inside compiled code, a thread for each core.
+
+One thread, the leader, is in the loop over steps; the helpers are Python threads that never leave `_help` and hold no
+lock of Python's. A leader writes down a task, its parcel and the number of blocks, and takes blocks itself; helpers
+that are awake take blocks too, each the next one, until there are none. Nobody waits for a helper that has taken no
+block: one that sleeps, or whose core is busy with another program, is not missed. So a task costs a few exchanges of a
+line of memory between cores, not an entry into a parallel region and a barrier of all threads at its end.
+
+A leader that finds the crew at work, for another simulation or because a block has blocks of its own, does all its
+blocks alone. The blocks of a task, not the threads, decide the bits of a result.
+"""
+
+import ctypes
+import os
+import threading
+import time
+
+import llvmlite.binding
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from rigidmd.compile.kernels import kernel, options_of
+from rigidmd.compile.machine import PROCESSOR_FEATURES
+from rigidmd.compile.numba_private import callback, uncounted
+from rigidmd.compile.threads import MOST_THREADS
+
+WORD = ir.IntType(64)
+#: Cells of the crew's memory, 8 to a line of cache: cells that different threads write are on lines of their own.
+LEAD, HELPERS, POLLS = 0, 1, 2  # address of `_lead`; helpers that may help; looks of a waiting thread before it sleeps
+AT_WORK = 8  # 1 while a leader has the crew
+TICKET = 16  # the number of the present job, times `JOB`; the next block that is free
+ADDRESS, PARCEL, BLOCKS = 24, 25, 26  # the job
+DONE = 32  # blocks that are done
+LEADER_SLEEPS, LEADERS_BELL = 40, 41  # 1 while the leader sleeps; the lock on which it sleeps
+FIRST_HELPER, LINE = 48, 8  # a line for each helper: 1 while it sleeps, and its lock
+SLEEPS, BELL = 0, 1
+JOB = 1 << 24
+CLOSED = JOB - 1  # in place of the next block while a job is written down
+SYMBOL = "rigidmd_crew"
+#: A thread that waits looks again and again for so long, in seconds, before it sleeps: longer than from one task to the
+#: next, shorter than another program would mind.
+WAIT = 50e-6
+
+
+def _on_cell(emit_on, result=types.int64):
+    """An intrinsic (address of the crew, cell, ...) of whole numbers."""
+
+    def typed(typing, crew, cell, *values):
+        def emit(context, builder, signature, arguments):
+            at = builder.inttoptr(builder.add(arguments[0], builder.mul(arguments[1], WORD(8))), WORD.as_pointer())
+            return emit_on(builder, at, *arguments[2:])
+
+        return result(types.intp, types.intp, *(types.int64 for _ in values)), emit
+
+    return typed
+
+
+@intrinsic
+def _read(typing, crew, cell):
+    """The number in a cell."""
+    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8))(typing, crew, cell)
+
+
+@intrinsic
+def _write(typing, crew, cell, value):
+    """Write a number into a cell; returns the one before."""
+    return _on_cell(lambda b, at, value: b.atomic_rmw("xchg", at, value, "seq_cst"))(typing, crew, cell, value)
+
+
+@intrinsic
+def _add(typing, crew, cell, value):
+    """Add a number to that in a cell; returns the one before."""
+    return _on_cell(lambda b, at, value: b.atomic_rmw("add", at, value, "seq_cst"))(typing, crew, cell, value)
+
+
+@intrinsic
+def _replace(typing, crew, cell, old, new):
+    """Write a number into a cell if it holds another, and whether it did."""
+
+    def emit(builder, at, old, new):
+        return builder.extract_value(builder.cmpxchg(at, old, new, "seq_cst", "seq_cst"), 1)
+
+    return _on_cell(emit, types.boolean)(typing, crew, cell, old, new)
+
+
+@intrinsic
+def _pause(typing):
+    """Leave the core to its other thread for a moment."""
+
+    def emit(context, builder, signature, arguments):
+        if "sse2" in PROCESSOR_FEATURES:
+            kind = ir.FunctionType(ir.VoidType(), [])
+            builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", (), kind), [])
+        return context.get_dummy_value()
+
+    return types.void(), emit
+
+
+def _of_python(name: str, *more: ir.Constant):
+    """An intrinsic (address of a lock) that calls one of Python's functions, which needs no lock of Python's itself."""
+
+    def typed(typing, bell):
+        def emit(context, builder, signature, arguments):
+            kind = ir.FunctionType(ir.IntType(32) if more else ir.VoidType(), [WORD, *(one.type for one in more)])
+            function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+            builder.call(function, [arguments[0], *more])
+            return context.get_dummy_value()
+
+        return types.void(types.int64), emit
+
+    return typed
+
+
+@intrinsic
+def _sleep(typing, bell):
+    """Sleep until the bell is rung, once for each ring."""
+    return _of_python("PyThread_acquire_lock", ir.IntType(32)(1))(typing, bell)
+
+
+@intrinsic
+def _ring(typing, bell):
+    """Wake the thread that sleeps on a bell."""
+    return _of_python("PyThread_release_lock")(typing, bell)
+
+
+@intrinsic
+def _do(typing, address, parcel, block):
+    """Call the machine code at an address."""
+
+    def emit(context, builder, signature, arguments):
+        kind = ir.FunctionType(ir.VoidType(), [WORD, WORD])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), emit
+
+
+@kernel(counted=False)
+def _take(crew, ticket, address, parcel, blocks):
+    """Do blocks of the job of a ticket until there are none; whether the last one to be done was among them."""
+    last = False
+    while ticket % JOB < blocks:
+        if _replace(crew, TICKET, ticket, ticket + 1):
+            _do(address, parcel, ticket % JOB)
+            last = _add(crew, DONE, 1) + 1 == blocks
+        now = _read(crew, TICKET)
+        if now // JOB != ticket // JOB:
+            break
+        ticket = now
+    return last
+
+
+def _help(crew, own):
+    """What helper `own` does, for ever."""
+    line = FIRST_HELPER + LINE * own
+    looks = 0
+    while True:
+        ticket = _read(crew, TICKET)
+        address, parcel, blocks = _read(crew, ADDRESS), _read(crew, PARCEL), _read(crew, BLOCKS)
+        # what was read is of this job if the ticket is still the same when a block is taken
+        if ticket % JOB < blocks and own < _read(crew, HELPERS):
+            if _take(crew, ticket, address, parcel, blocks) and _replace(crew, LEADER_SLEEPS, 1, 0):
+                _ring(_read(crew, LEADERS_BELL))
+            looks = 0
+        elif looks < _read(crew, POLLS):
+            looks += 1
+            _pause()
+        else:
+            looks = 0
+            _write(crew, line + SLEEPS, 1)
+            if _read(crew, TICKET) == ticket or not _replace(crew, line + SLEEPS, 1, 0):
+                _sleep(_read(crew, line + BELL))
+
+
+def _lead(crew, address, parcel, blocks):
+    """Do all blocks of a job, with the crew if it is free."""
+    helpers = _read(crew, HELPERS)
+    if helpers == 0 or not _replace(crew, AT_WORK, 0, 1):
+        for block in range(blocks):
+            _do(address, parcel, block)
+        return
+    job = (_read(crew, TICKET) // JOB + 1) * JOB
+    _write(crew, TICKET, job + CLOSED)
+    _write(crew, ADDRESS, address)
+    _write(crew, PARCEL, parcel)
+    _write(crew, BLOCKS, blocks)
+    _write(crew, DONE, 0)
+    job += JOB
+    _write(crew, TICKET, job)
+    for own in range(min(helpers, blocks - 1)):
+        line = FIRST_HELPER + LINE * own
+        if _read(crew, line + SLEEPS) == 1 and _replace(crew, line + SLEEPS, 1, 0):
+            _ring(_read(crew, line + BELL))
+    _take(crew, job, address, parcel, blocks)
+    looks = 0
+    while _read(crew, DONE) < blocks:
+        looks += 1
+        if looks < _read(crew, POLLS):
+            _pause()
+        else:
+            looks = 0
+            _write(crew, LEADER_SLEEPS, 1)
+            if _read(crew, DONE) < blocks or not _replace(crew, LEADER_SLEEPS, 1, 0):
+                _sleep(_read(crew, LEADERS_BELL))
+    _write(crew, AT_WORK, 0)
+
+
+def _look(crew, looks):
+    """Look as a thread that waits does, so many times."""
+    for _ in range(looks):
+        _read(crew, TICKET)
+        _pause()
+
+
+@intrinsic
+def spread(typing, address, parcel, blocks):
+    """Call the task at an address for every block of its parcel, on all threads. `begin` must have been called."""
+
+    def emit(context, builder, signature, arguments):
+        memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, WORD, SYMBOL)
+        kind = ir.FunctionType(ir.VoidType(), [WORD] * 4)
+        lead = builder.inttoptr(builder.load(memory), kind.as_pointer())
+        parcel = builder.ptrtoint(arguments[1], WORD)
+        builder.call(lead, [builder.ptrtoint(memory, WORD), arguments[0], parcel, arguments[2]])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, parcel, types.intp), emit
+
+
+def most_threads() -> int:
+    """Threads that there may be: cores of this process, or what `NUMBA_NUM_THREADS` says."""
+    return numba.config.NUMBA_NUM_THREADS
+
+
+class _Crew:
+    """The crew of this process: its memory, and the helpers that have been hired."""
+
+    def __init__(self):
+        own = np.zeros(FIRST_HELPER + LINE * MOST_THREADS + LINE, np.int64)
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(own))  # helpers may still look at it while Python ends
+        self.cells = own[-own.ctypes.data % 64 // 8 :]
+        llvmlite.binding.add_symbol(SYMBOL, self.cells.ctypes.data)
+        self.wanted = most_threads()
+        self.hired = 0
+        self.code: list = []
+
+    def begin(self) -> None:
+        """Compile what the crew does, or read it from the cache, and hire the helpers that are wanted."""
+        if not self.code:
+            options = options_of(False, False) | uncounted(False)
+            self.code = [
+                callback(function, (types.int64,) * count, options)
+                for function, count in ((_lead, 4), (_help, 2), (_look, 2))
+            ]
+            self.cells[LEAD] = self.code[0].address
+            self.cells[LEADERS_BELL] = _bell()
+            self.cells[POLLS] = self._polls()
+        self.hire()
+
+    def hire(self) -> None:
+        """Hire the helpers that are missing, and let as many help as are wanted."""
+        helpers = self.wanted - 1
+        if not self.code or (self.hired >= helpers and self.cells[HELPERS] == helpers):
+            return
+        for own in range(self.hired, helpers):
+            self.cells[FIRST_HELPER + LINE * own + BELL] = _bell()
+            arguments = (self.cells.ctypes.data, own)
+            threading.Thread(target=self._c_function(1), args=arguments, name=f"rigidmd-{own + 1}", daemon=True).start()
+        while (self.cells[FIRST_HELPER + LINE * self.hired + SLEEPS : FIRST_HELPER + LINE * helpers : LINE] == 0).any():
+            time.sleep(WAIT)  # until all are there: they need Python's lock once more on their way
+        self.hired = max(self.hired, helpers)
+        self.cells[HELPERS] = helpers
+
+    def _c_function(self, which: int):
+        """A function with two numbers that runs without Python's lock."""
+        return ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)(self.code[which].address)
+
+    def _polls(self) -> int:
+        """Looks in the time `WAIT`."""
+        look, count, fastest = self._c_function(2), 500, float("inf")
+        for _ in range(3):
+            began = time.perf_counter()
+            look(self.cells.ctypes.data, count)
+            fastest = min(fastest, time.perf_counter() - began)
+        return max(1, int(count * WAIT / fastest))
+
+    def forget(self) -> None:
+        """After a fork: no helper has come along."""
+        self.hired = 0
+        self.cells[[HELPERS, AT_WORK, LEADER_SLEEPS]] = 0
+        self.cells[FIRST_HELPER:] = 0
+        if self.code:
+            self.cells[LEADERS_BELL] = _bell()
+
+
+def _bell() -> int:
+    """A lock of Python's that is taken: who takes it sleeps until it is released."""
+    allocate, acquire = ctypes.pythonapi.PyThread_allocate_lock, ctypes.pythonapi.PyThread_acquire_lock
+    allocate.restype, acquire.argtypes = ctypes.c_void_p, (ctypes.c_void_p, ctypes.c_int)
+    lock = allocate()
+    acquire(lock, 1)
+    return lock
+
+
+_crew = _Crew()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_crew.forget)
+begin = _crew.begin
+
+
+def threads() -> int:
+    """Number of threads that compute."""
+    return _crew.wanted
+
+
+def set_threads(count: int) -> None:
+    """Let so many threads compute, this one and its helpers; results do not depend on it. Raises ValueError."""
+    if not 1 <= count <= most_threads():
+        raise ValueError(f"the number of threads is {count}, must be from 1 to {most_threads()}")
+    _crew.wanted = count
+    _crew.hire()
