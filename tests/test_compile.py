@@ -256,30 +256,6 @@ def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):
     assert not (tmp_path / "cache").exists()
 
 
-def test_threads_are_there_for_code_that_comes_from_the_cache(tmp_path):
-    """Numba forgets that code starts threads where it calls what itself came from the cache; it ended in a crash."""
-    (tmp_path / "shared.py").write_text(
-        "import numba, numpy as np\n"
-        "from rigidmd.compile import Code, call, kernel, opened, packed, task\n"
-        "@kernel(parallel=True, outer=True)\n"
-        "def fill(x):\n    for n in numba.prange(len(x)):\n        x[n] = n\n"
-        "@task()\n"
-        "def filled(parcel, block):\n    fill(opened(parcel))\n"
-        "@numba.njit\n"
-        "def run(code, x):\n    call(code, 'filled', packed(x))\n"
-        "x = np.zeros(5)\n"
-    )
-    environment = os.environ | {
-        "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
-    }  # fmt: skip
-    for script in ("fill(x)", *["run(Code(filled=(filled, x)), x)"] * 2):
-        done = subprocess.run(
-            [sys.executable, "-c", f"from shared import *; {script}; print(x.sum())"],
-            env=environment, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert done.stdout.strip() == "10.0", done.stderr
-
-
 KERNEL = "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef twice(x):\n    return 2 * x\n"
 
 

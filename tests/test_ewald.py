@@ -5,7 +5,6 @@ import subprocess
 import sys
 from itertools import product
 
-import numba
 import numpy as np
 import pytest
 from conftest import ROOT, built, shaken, small_scene
@@ -16,6 +15,7 @@ from rigidmd.assemble.describe import describe
 from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.compile import PAIR_FLAGS, kernel, lanes
+from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.screened import (
@@ -774,16 +774,16 @@ def test_single_precision_is_good_enough_for_1e_5():
     ],
 )
 def test_same_bits_for_any_number_of_threads(method, precision):
-    if numba.config.NUMBA_NUM_THREADS < 2:
+    if MOST_THREADS < 2:
         pytest.skip("one core")
     forces = {"cutoff_A": 9.0, "electrostatics": method, "ewald_accuracy": 1e-4, "skin_A": 0.3}
     system, _, state = built({"spce": 400}, 22.9, 7, forces=forces, precision=precision)
     seen = []
     for threads in (1, 2):
-        numba.set_num_threads(threads)
-        load, tallies = system.engine().evaluate(state)
+        engine = system.engine()
+        engine.threads = threads
+        load, tallies = engine.evaluate(state)
         seen.append((load.force.tobytes(), load.torque_body.tobytes(), str(tallies)))
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert seen[0] == seen[1]
 
 

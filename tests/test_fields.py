@@ -2,7 +2,6 @@
 
 from math import inf, pi, sqrt
 
-import numba
 import numpy as np
 import pytest
 from conftest import move, small_scene
@@ -345,12 +344,10 @@ def test_threads_change_no_bit():
     )
     found = []
     for threads in (1, 2):
-        numba.set_num_threads(threads)
-        system = build(scene)
+        system = build(scene.model_copy(update={"threads": threads}))
         engine, state = system.engine(), system.state.copy()
         move(engine, state, VERLET, 0.0005, 5)
         found.append((*state, observe(system, engine, state).potential))
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
     assert found[0][7].any()  # the books
 

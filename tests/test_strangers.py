@@ -210,7 +210,6 @@ def test_a_state_that_unpacks_to_more_than_there_is(monkeypatch, tmp_path):
     [
         ("NUMBA_NUM_THREADS", "0", "must be a whole number from 1 to 4096"),
         ("NUMBA_NUM_THREADS", "abc", "must be a whole number from 1 to 4096"),
-        ("NUMBA_THREADING_LAYER", "x", "must be one of default, safe"),
         ("RIGIDMD_SIMD_BITS", "0", "must be one of 128, 256, 512"),
         ("RIGIDMD_SIMD_BITS", "64", "must be one of 128, 256, 512"),
         ("RIGIDMD_SIMD_BITS", "abc", "must be one of 128, 256, 512"),

@@ -1,56 +1,162 @@
-"""How threads wait: what is set when nobody says, and that who says is heard."""
+"""Threads: that each block is done once, whoever asks, and that those who wait leave their cores to others."""
 
 import os
 import subprocess
 import sys
+import threading
+import time
 
+import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, small_scene
 
-NAMES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-
-
-def left_set(tmp_path, **said):
-    """What a new process has set of `NAMES` once it has imported the door to Numba."""
-    plain = {key: value for key, value in os.environ.items() if key not in NAMES}
-    code = f"import os, rigidmd.compile; print([os.environ.get(name) for name in {NAMES}])"
-    environment = plain | said | {"RIGIDMD_CACHE": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
+from rigidmd import Simulation
+from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
+from rigidmd.compile.crew import _crew
+from rigidmd.compile.machine import MOST_THREADS
 
 
-def test_threads_that_wait_look_for_a_moment_before_they_sleep(tmp_path):
-    assert left_set(tmp_path) == "['PASSIVE', '1000']"
+@task()
+def _count(parcel, block):
+    seen, work = opened(parcel)
+    total = 0.0
+    for n in range(work):
+        total += np.sqrt(n + block)
+    seen[block, 0] += 1
+    seen[block, 1] = total
 
 
-@pytest.mark.parametrize(
-    ("said", "kept"),
-    [
-        ({"OMP_WAIT_POLICY": "ACTIVE"}, "['ACTIVE', None]"),
-        ({"OMP_WAIT_POLICY": "PASSIVE"}, "['PASSIVE', None]"),
-        ({"GOMP_SPINCOUNT": "7"}, "[None, '7']"),
-    ],
-)
-def test_what_a_user_says_of_waiting_is_kept(tmp_path, said, kept):
-    assert left_set(tmp_path, **said) == kept
+@task()
+def _count_within(parcel, block):
+    code, seen = opened(parcel)
+    call_blocks(code, "count", packed((seen[block], 10)), seen.shape[1])
+
+
+@kernel(outer=True)
+def _run(code, seen, work, times):
+    for _ in range(times):
+        call_blocks(code, "count", packed((seen, work)), len(seen))
+
+
+@kernel(outer=True)
+def _run_within(code, inner, seen):
+    call_blocks(code, "within", packed((inner, seen)), len(seen))
+
+
+def counted(blocks: int, work: int = 10, times: int = 1) -> np.ndarray:
+    """How often each block was done, and its sum."""
+    seen = np.zeros((blocks, 2))
+    _run(Code(count=(_count, (seen, work))), seen, work, times)
+    return seen
+
+
+@pytest.fixture(autouse=True)
+def _all_threads_again():
+    yield
+    set_threads(MOST_THREADS)
+
+
+@pytest.mark.parametrize("threads", [1, 2, MOST_THREADS])
+@pytest.mark.parametrize(("blocks", "work"), [(2, 0), (16, 10), (16, 10_000), (1000, 100)])
+def test_every_block_is_done_once(threads, blocks, work):
+    set_threads(min(threads, MOST_THREADS))
+    seen = counted(blocks, work, 200)
+    assert (seen[:, 0] == 200).all()
+    assert seen[:, 1] == pytest.approx([sum(np.sqrt(np.arange(work) + b)) for b in range(blocks)])
+
+
+def test_a_block_may_have_blocks_of_its_own():
+    inner, seen = Code(count=(_count, (np.zeros((1, 2)), 10))), np.zeros((20, 30, 2))
+    _run_within(Code(within=(_count_within, (inner, seen))), inner, seen)
+    assert (seen[:, :, 0] == 1).all()
+
+
+def test_two_simulations_at_once_have_the_bits_of_each_alone():
+    scenes = [small_scene({"spce": 216}, 19.0, seed=seed, output={"trajectory": False}) for seed in (1, 2)]
+    alone = [Simulation(scene).run().state for scene in scenes]
+    together = [None, None]
+
+    def run(k):
+        together[k] = Simulation(scenes[k]).run().state
+
+    both = [threading.Thread(target=run, args=(k,)) for k in (0, 1)]
+    for one in both:
+        one.start()
+    for one in both:
+        one.join()
+    for a, b in zip(alone, together, strict=True):
+        assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
+
+
+@pytest.mark.skipif(MOST_THREADS < 2, reason="one core")
+def test_the_helpers_help_and_then_sleep():
+    set_threads(2)
+    counted(16)
+    began, used = time.perf_counter(), time.process_time()
+    counted(64, 2_000_000)
+    share = (time.process_time() - used) / (time.perf_counter() - began)
+    assert share > 1.2 or os.getloadavg()[0] > 1.5  # of a core: both have worked, unless another program has one
+    time.sleep(0.05)
+    used = time.process_time()
+    time.sleep(0.5)
+    assert time.process_time() - used < 0.05
+    assert all(_crew.cells[48 + 8 * k] == 1 for k in range(_crew.hired))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_process_has_a_crew_of_its_own():
+    counted(16)
+    child = os.fork()
+    if child == 0:
+        done = 1
+        try:
+            alone = counted(16, 10, 100)  # without helpers, then with new ones
+            set_threads(1)
+            set_threads(MOST_THREADS)
+            done = 0 if (alone[:, 0] == 100).all() and (counted(16, 10, 100)[:, 0] == 100).all() else 2
+        finally:
+            os._exit(done)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert (counted(16, 10, 100)[:, 0] == 100).all()
+
+
+MORE = """
+import numpy as np, sys
+from test_threads import counted
+assert (counted(64, 100, 2000)[:, 0] == 2000).all()
+"""
+
+
+@pytest.mark.parametrize("threads", ["1", "7", "32"])
+def test_there_may_be_more_threads_than_cores_and_the_process_ends(threads):
+    path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
+    environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", MORE], env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_importing_changes_no_variable_of_threads(tmp_path):
+    code = "import os; before = dict(os.environ); import rigidmd.compile; assert dict(os.environ) == before"
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True)
 
 
 def test_benchmarks_measure_what_a_user_gets(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
     from peer_engines import environment
 
-    for name in (*NAMES, "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         monkeypatch.setenv(name, "2")
         assert name not in environment()
     assert environment()["PATH"] == os.environ["PATH"]
 
 
-@pytest.mark.parametrize(("layer", "word"), [("omp", "OpenMP"), ("workqueue", "Numba's own threads")])
-def test_check_says_how_many_threads_there_are_and_what_starts_them(layer, word):
+@pytest.mark.parametrize(("asked", "words"), [(None, "2 threads"), (1, "1 thread"), (7, "2 threads")])
+def test_check_says_how_many_threads_compute(asked, words):
     code = (
         "from rigidmd.assemble.describe import describe; from rigidmd.scene import Scene; "
-        "print(describe(Scene.read('systems/water.toml')))"
+        f"print(describe(Scene.read('systems/water.toml').model_copy(update={{'threads': {asked}}})))"
     )
-    environment = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "2"}
+    environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert f"computing: 2 threads ({word}), double precision" in done.stdout, done.stderr
+    assert f"computing: {words}, double precision" in done.stdout, done.stderr

@@ -11,7 +11,7 @@ from rigidmd.assemble.fields import fields_in_words
 from rigidmd.assemble.room import bytes_of
 from rigidmd.assemble.stage_words import stage_in_words
 from rigidmd.assemble.system import System, build
-from rigidmd.compile.machine import threads_in_words
+from rigidmd.compile.machine import threads_for
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.dynamics.body import Body
 from rigidmd.forces.pairs.loop import PairForces
@@ -129,7 +129,8 @@ def _molecules(system: System) -> str:
         lines += [f"  {k}: {how}", f"     {law}"]
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces and neighbour lists")
     if not scene.engine.is_other:
-        lines.append(f"computing: {threads_in_words(scene.threads)}, {PRECISIONS[scene.precision]}")
+        threads = threads_for(scene.threads)
+        lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {PRECISIONS[scene.precision]}")
     return "\n".join(lines)
 
 

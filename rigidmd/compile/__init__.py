@@ -18,6 +18,7 @@ from rigidmd.compile.code import (
     packed,
     task,
 )
+from rigidmd.compile.crew import set_threads
 from rigidmd.compile.kernels import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 
@@ -40,5 +41,6 @@ __all__ = [
     "laid_down",
     "opened",
     "packed",
+    "set_threads",
     "task",
 ]

@@ -75,7 +75,7 @@ def cache_folder() -> str:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
         with tempfile.TemporaryFile(dir=folder):
-            numba.get_num_threads()
+            pass
     except OSError:
         own = tempfile.mkdtemp(prefix="rigidmd-cache-")  # the home is read-only: keep the code for this process only
         atexit.register(shutil.rmtree, own, ignore_errors=True)

@@ -16,16 +16,14 @@ import threading
 import time
 
 import llvmlite.binding
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
 from rigidmd.compile.kernels import kernel, options_of
-from rigidmd.compile.machine import PROCESSOR_FEATURES
+from rigidmd.compile.machine import MOST_THREADS, PROCESSOR_FEATURES
 from rigidmd.compile.numba_private import callback, uncounted
-from rigidmd.compile.threads import MOST_THREADS
 
 WORD = ir.IntType(64)
 #: Cells of the crew's memory, 8 to a line of cache: cells that different threads write are on lines of their own.
@@ -230,22 +228,18 @@ def spread(typing, address, parcel, blocks):
     return types.void(types.intp, parcel, types.intp), emit
 
 
-def most_threads() -> int:
-    """Threads that there may be: cores of this process, or what `NUMBA_NUM_THREADS` says."""
-    return numba.config.NUMBA_NUM_THREADS
-
-
 class _Crew:
     """The crew of this process: its memory, and the helpers that have been hired."""
 
     def __init__(self):
-        own = np.zeros(FIRST_HELPER + LINE * MOST_THREADS + LINE, np.int64)
+        own = np.zeros(FIRST_HELPER + LINE * (MOST_THREADS + 1), np.int64)
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(own))  # helpers may still look at it while Python ends
         self.cells = own[-own.ctypes.data % 64 // 8 :]
         llvmlite.binding.add_symbol(SYMBOL, self.cells.ctypes.data)
-        self.wanted = most_threads()
+        self.wanted = MOST_THREADS
         self.hired = 0
         self.code: list = []
+        self._hiring = threading.Lock()
 
     def begin(self) -> None:
         """Compile what the crew does, or read it from the cache, and hire the helpers that are wanted."""
@@ -262,17 +256,19 @@ class _Crew:
 
     def hire(self) -> None:
         """Hire the helpers that are missing, and let as many help as are wanted."""
-        helpers = self.wanted - 1
-        if not self.code or (self.hired >= helpers and self.cells[HELPERS] == helpers):
+        if not self.code:
             return
-        for own in range(self.hired, helpers):
-            self.cells[FIRST_HELPER + LINE * own + BELL] = _bell()
-            arguments = (self.cells.ctypes.data, own)
-            threading.Thread(target=self._c_function(1), args=arguments, name=f"rigidmd-{own + 1}", daemon=True).start()
-        while (self.cells[FIRST_HELPER + LINE * self.hired + SLEEPS : FIRST_HELPER + LINE * helpers : LINE] == 0).any():
-            time.sleep(WAIT)  # until all are there: they need Python's lock once more on their way
-        self.hired = max(self.hired, helpers)
-        self.cells[HELPERS] = helpers
+        with self._hiring:
+            helpers = self.wanted - 1
+            for own in range(self.hired, helpers):
+                line = FIRST_HELPER + LINE * own
+                self.cells[line + BELL] = _bell()
+                does, arguments = self._c_function(1), (self.cells.ctypes.data, own)
+                threading.Thread(target=does, args=arguments, name=f"rigidmd-{own + 1}", daemon=True).start()
+                while self.cells[line + SLEEPS] == 0:  # on its way it needs Python's lock, which a run may keep
+                    time.sleep(WAIT)
+                self.hired += 1
+            self.cells[HELPERS] = helpers
 
     def _c_function(self, which: int):
         """A function with two numbers that runs without Python's lock."""
@@ -289,7 +285,7 @@ class _Crew:
 
     def forget(self) -> None:
         """After a fork: no helper has come along."""
-        self.hired = 0
+        self.hired, self._hiring = 0, threading.Lock()
         self.cells[[HELPERS, AT_WORK, LEADER_SLEEPS]] = 0
         self.cells[FIRST_HELPER:] = 0
         if self.code:
@@ -311,14 +307,8 @@ if hasattr(os, "register_at_fork"):
 begin = _crew.begin
 
 
-def threads() -> int:
-    """Number of threads that compute."""
-    return _crew.wanted
-
-
 def set_threads(count: int) -> None:
-    """Let so many threads compute, this one and its helpers; results do not depend on it. Raises ValueError."""
-    if not 1 <= count <= most_threads():
-        raise ValueError(f"the number of threads is {count}, must be from 1 to {most_threads()}")
-    _crew.wanted = count
-    _crew.hire()
+    """Let so many threads compute, the leader and its helpers; results do not depend on it."""
+    if count != _crew.wanted:
+        _crew.wanted = count
+        _crew.hire()

@@ -13,9 +13,7 @@ from rigidmd.compile.numba_private import dispatcher, uncounted
 PAIR_FLAGS = {"reassoc", "contract", "nsz", "arcp"}
 
 
-def kernel(
-    function: Callable | None = None, *, parallel=False, fastmath: Any = False, inline=False, counted=True, outer=False
-) -> Any:
+def kernel(function: Callable | None = None, *, fastmath: Any = False, inline=False, counted=True, outer=False) -> Any:
     """`numba.njit`, cached on disk.
 
     inline: LLVM inlines the function wherever it is called. For functions in an inner loop: a term is passed as its
@@ -30,9 +28,8 @@ def kernel(
     outer: True if Python calls the function.
     """
     if function is None:
-        return lambda f: kernel(f, parallel=parallel, fastmath=fastmath, inline=inline, counted=counted, outer=outer)
-    options = options_of(fastmath, inline) | ({"parallel": True, "_nrt": True} if parallel else uncounted(counted))
-    return dispatcher(function, options, outer)
+        return lambda f: kernel(f, fastmath=fastmath, inline=inline, counted=counted, outer=outer)
+    return dispatcher(function, options_of(fastmath, inline) | uncounted(counted), outer)
 
 
 def implements(stub, fastmath=False, inline=False, counted=True):

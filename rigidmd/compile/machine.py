@@ -27,13 +27,10 @@ def _simd_bits() -> int:
 
 SIMD_BITS = _simd_bits()
 
-#: Numba's names of what starts threads, in words.
-MADE_BY = {"omp": "OpenMP", "tbb": "TBB", "workqueue": "Numba's own threads"}
+#: Threads that there may be: the cores of this process, or what `NUMBA_NUM_THREADS` says.
+MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
-def threads_in_words(asked: int | None) -> str:
-    """How many threads run when so many are asked for (None: all), and what starts them."""
-    most = numba.config.NUMBA_NUM_THREADS
-    numba.get_num_threads()  # this starts them
-    count = min(asked or most, most)
-    return f"{count} thread{'s' if count > 1 else ''} ({MADE_BY[numba.threading_layer()]})"
+def threads_for(asked: int | None) -> int:
+    """Number of threads that compute when so many are asked for; None: all."""
+    return min(asked or MOST_THREADS, MOST_THREADS)

@@ -6,7 +6,8 @@ from typing import Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from rigidmd.compile import compile_together
+from rigidmd.compile import compile_together, set_threads
+from rigidmd.compile.machine import threads_for
 from rigidmd.compile.own import CompileError
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import (
@@ -71,6 +72,7 @@ class Engine:
     skin : extra radius of neighbour lists, Å; speed only
     applied : the functions that terms of type `Told` (of a body) and `ToldForces` stand for: name -> function, as their
         workspaces call it
+    threads : number of threads that compute, at most those of `NUMBA_NUM_THREADS`; None: all. Speed only
     """
 
     def __init__(
@@ -80,12 +82,14 @@ class Engine:
         precision: Precision = "double",
         skin: float = 1.9,
         applied: dict[str, Callable] | None = None,
+        threads: int | None = None,
     ):
         self.model = model
         self.terms = terms
         self.names = list(terms)
         self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin)
         self._applied = applied or {}
+        self.threads = threads
         self._workspaces: tuple[NamedTuple, ...] | None = None
         self._codes: dict = {}
         self.load: Load | None = None
@@ -227,6 +231,8 @@ class Engine:
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         """Check the arrays for compiled code; return its workspaces, made at the first use."""
         _check_arrays(state)
+        if isinstance(self.model, Model):
+            set_threads(threads_for(self.threads))
         if self._workspaces is None:
             room = self.room(state)
             if self._first and isinstance(self.model, Model):

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from rigidmd.compile.crew import most_threads, set_threads
 from rigidmd.assemble.cells import angles_deg
 from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
+from rigidmd.compile.machine import threads_for
 from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
@@ -88,7 +88,7 @@ class MolecularSimulation(Simulation):
             raise SceneError(
                 scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
             )
-        self.threads = min(scene.threads or most_threads(), most_threads())
+        self.threads = threads_for(scene.threads)
         self._reset()
 
     def start_from(self, state: State) -> None:
@@ -123,7 +123,6 @@ class MolecularSimulation(Simulation):
         self.scene = self.system.scene
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
-        set_threads(self.threads)
 
     def _prepare(self) -> None:
         """Relieve overlaps, and compile the steps or see that another engine computes the same."""

@@ -16,7 +16,6 @@ import sys
 import time
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numba import literally, njit
 from peers import WORKLOADS, choice, numbers, start_of
@@ -102,7 +101,7 @@ def measure(job: dict) -> list[dict]:
     scene = Scene.from_dict(work.scene(job["ending"], precision=job["precision"]), folder)
     simulation = Simulation(scene)
     engine, state = simulation.engine, simulation.state
-    numba.set_num_threads(1)
+    engine.threads = 1
     scheme = SCHEMES["velocity_verlet"]
     engine.advance(state, scheme, STEP, STEPS)
     builds = {name: builds_of(own) for name, own in engine.workspaces.items()}

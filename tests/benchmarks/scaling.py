@@ -17,7 +17,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numba
 import numpy as np
 from matplotlib.figure import Figure
 from peer_engines import environment
@@ -68,7 +67,7 @@ def measure(job: dict) -> dict:
     scheme, done = SCHEMES["velocity_verlet"], 0
     seconds = {}
     for cores in job["cores"]:
-        numba.set_num_threads(cores)
+        engine.threads = cores
         done += 3
         engine.advance(state, scheme, STEP, done)
         steps, spent = 0, 0.0

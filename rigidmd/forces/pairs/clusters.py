@@ -14,7 +14,7 @@ from rigidmd.compile import BLOCKS, MOST_BLOCKS, PAIR_FLAGS, kernel
 from rigidmd.compile.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
 from rigidmd.forces.pairs.sites import place
 
-SERIAL_SITES = 1000  # up to this number there is one block, and no thread is started
+SERIAL_SITES = 128  # up to this number there is one block
 
 
 class Clusters(NamedTuple):

@@ -12,8 +12,8 @@ from rigidmd.compile import BLOCKS, MOST_BLOCKS, implements, is_a, kernel, opene
 from rigidmd.compile.lanes import lane_count, width_of
 from rigidmd.core.state import EXAMPLE
 
-# Up to this number, loops over molecules stay on one thread.
-SERIAL = 512
+# Up to this number, loops over molecules stay on one thread: they take few microseconds.
+SERIAL = 128
 SHARE = 4096  # molecules of a block, where there are more blocks than the fewest
 
 
