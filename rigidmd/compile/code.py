@@ -155,7 +155,14 @@ class CodeType(types.Type):
     def __init__(self, parcels: tuple[tuple[str, Parcel], ...]):
         self.parcels = parcels
         # a digest, because this name becomes part of the name of every function compiled for it
-        super().__init__(f"code({hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]})")
+        digest = hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]
+        super().__init__(f"code({digest})")
+        # The same in every process: types are pickled. Numba asks for it in every call from Python, and to hash so many
+        # types takes half a millisecond.
+        self._hash = int(digest[:15], 16)
+
+    def __hash__(self):
+        return self._hash
 
     @property
     def key(self):

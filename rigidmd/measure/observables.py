@@ -8,6 +8,7 @@ import numpy as np
 from rigidmd.assemble.momenta import Freedom
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
+from rigidmd.dynamics.advance import Model
 from rigidmd.engines import Engine
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
@@ -126,10 +127,10 @@ def observe(
     mass = model.mass[model.species]
     translation, rotation = kinetic_energies(system, state)
     slant = verlet_step**2 / 12
-    translation_unbiased = translation + slant * float((load.force**2).sum(axis=1) @ model.inverse_mass[model.species])
+    translation_unbiased = translation + slant * _weighed_squares(load.force, model.inverse_mass, model)
     rotation_unbiased = rotation
     if len(load.torque_body):
-        rotation_unbiased += slant * float((load.torque_body**2 * model.inverse_inertia[model.species]).sum())
+        rotation_unbiased += slant * _weighed_squares(load.torque_body, model.inverse_inertia, model)
     freedom = freedom or system.freedom
     pressure = np.full((3, 3), nan)
     if volume < inf:
@@ -156,8 +157,14 @@ def kinetic_energies(system: System, state: State) -> tuple[float, float]:
     """Of translation and rotation, u Å²/ps²."""
     model, rotation = system.model, 0.0
     if len(state.angular_momentum_body):
-        rotation = float(0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum())
-    return float(0.5 * model.mass[model.species] @ (state.velocity**2).sum(axis=1)), rotation
+        rotation = 0.5 * _weighed_squares(state.angular_momentum_body, model.inverse_inertia, model)
+    return 0.5 * _weighed_squares(state.velocity, model.mass, model), rotation
+
+
+def _weighed_squares(values: np.ndarray, weights: np.ndarray, model: Model) -> float:
+    """Sum of the squares of values (n, 3) with weights of each species, (species,) or (species, 3)."""
+    own = weights[model.species]
+    return float(np.einsum("nk,nk,nk->" if own.ndim == 2 else "nk,nk,n->", values, values, own))
 
 
 def _temperature(kinetic: float, freedom: int) -> float:
