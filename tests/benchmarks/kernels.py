@@ -28,7 +28,7 @@ from rigidmd.core.state import State, no_load
 from rigidmd.engines.cpu import DTYPES
 from rigidmd.forces.pairs.lists import BUILDS, MASKED, end_of_row, farthest
 from rigidmd.forces.pairs.loop import PairWorkspace
-from rigidmd.forces.pairs.sites import place_sites
+from rigidmd.forces.pairs.sites import blocks_of, place_sites
 
 STEP = 2e-3  # ps
 STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step
@@ -129,13 +129,13 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
     load = no_load(state)
     pairs, blocks = term.pairs, len(term.pairs.needed)
     code, lists, content = term.code, term.list_code, (term.arranged, pairs, term.sums)
-    placed, on_sites = (pairs, term.sites, state), (term.sites, term.forces_in_slots, state, load)
+    placed, on_sites = (pairs, term.sites, state), (term.sites, state, load, term.forces_in_slots)
     lanes, useful = lanes_of(term), useful_pairs(term, state)
     forces = milliseconds(run_blocks, code, "forces", content, blocks)
     gather = milliseconds(run_blocks, code, "gather", content, blocks)
     follow = milliseconds(run_blocks, lists, "follow", pairs, blocks)
     sites = milliseconds(run_blocks, lists, "place", placed, blocks)
-    sites += milliseconds(run_once, code, "hand_over", on_sites)
+    sites += milliseconds(run_blocks, code, "load", on_sites, blocks_of(len(state.position)))
     build = (  # in their order: each needs what the one before it leaves
         milliseconds(run_blocks, lists, "wrap", placed, blocks)
         + milliseconds(run_blocks, lists, "bin", placed, blocks)
