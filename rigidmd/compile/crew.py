@@ -38,6 +38,7 @@ SLEEPS, BELL = 0, 1
 JOB = 1 << 24
 CLOSED = JOB - 1  # in place of the next block while a job is written down
 SYMBOL = "rigidmd_crew"
+ALLOCATE, ACQUIRE, RELEASE = "PyThread_allocate_lock", "PyThread_acquire_lock", "PyThread_release_lock"
 #: A thread that waits looks again and again for so long, in seconds, before it sleeps: longer than from one task to the
 #: next, shorter than another program would mind.
 WAIT = 50e-6
@@ -115,13 +116,13 @@ def _of_python(name: str, *more: ir.Constant):
 @intrinsic
 def _sleep(typing, bell):
     """Sleep until the bell is rung, once for each ring."""
-    return _of_python("PyThread_acquire_lock", ir.IntType(32)(1))(typing, bell)
+    return _of_python(ACQUIRE, ir.IntType(32)(1))(typing, bell)
 
 
 @intrinsic
 def _ring(typing, bell):
     """Wake the thread that sleeps on a bell."""
-    return _of_python("PyThread_release_lock")(typing, bell)
+    return _of_python(RELEASE)(typing, bell)
 
 
 @intrinsic
@@ -236,6 +237,8 @@ class _Crew:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(own))  # helpers may still look at it while Python ends
         self.cells = own[-own.ctypes.data % 64 // 8 :]
         llvmlite.binding.add_symbol(SYMBOL, self.cells.ctypes.data)
+        for name in (ACQUIRE, RELEASE):
+            llvmlite.binding.add_symbol(name, ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value)
         self.wanted = MOST_THREADS
         self.hired = 0
         self.code: list = []
@@ -294,7 +297,7 @@ class _Crew:
 
 def _bell() -> int:
     """A lock of Python's that is taken: who takes it sleeps until it is released."""
-    allocate, acquire = ctypes.pythonapi.PyThread_allocate_lock, ctypes.pythonapi.PyThread_acquire_lock
+    allocate, acquire = getattr(ctypes.pythonapi, ALLOCATE), getattr(ctypes.pythonapi, ACQUIRE)
     allocate.restype, acquire.argtypes = ctypes.c_void_p, (ctypes.c_void_p, ctypes.c_int)
     lock = allocate()
     acquire(lock, 1)
