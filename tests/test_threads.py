@@ -12,6 +12,7 @@ from conftest import ROOT, small_scene
 
 from rigidmd import Simulation
 from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
+from rigidmd.compile.crew import _crew
 from rigidmd.compile.machine import MOST_THREADS
 
 
@@ -104,19 +105,35 @@ def test_the_helpers_help_and_then_sleep():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_forked_process_has_a_crew_of_its_own():
-    counted(16)
+    seen = np.zeros((16, 2))
+    code = Code(count=(_count, (seen, 10)))
     child = os.fork()
     if child == 0:
         done = 1
         try:
-            alone = counted(16, 10, 100)  # without helpers, then with new ones
-            set_threads(1)
+            _run(code, seen, 10, 100)  # without helpers, then with new ones
             set_threads(MOST_THREADS)
-            done = 0 if (alone[:, 0] == 100).all() and (counted(16, 10, 100)[:, 0] == 100).all() else 2
+            _run(code, seen, 10, 100)
+            done = 0 if (seen[:, 0] == 200).all() and _crew.hired == MOST_THREADS - 1 else 2
         finally:
             os._exit(done)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert (counted(16, 10, 100)[:, 0] == 100).all()
+
+
+ALONE = """
+import threading
+from test_threads import counted, set_threads
+set_threads(1)
+counted(16)
+assert threading.active_count() == 1, threading.enumerate()
+"""
+
+
+def test_one_thread_that_is_asked_for_has_no_helpers():
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests")))}
+    done = subprocess.run([sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 MORE = """

@@ -14,7 +14,7 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
 from rigidmd.compile import ahead
-from rigidmd.compile.crew import begin, spread
+from rigidmd.compile.crew import begin, share_out
 from rigidmd.compile.kernels import kernel, options_of
 from rigidmd.compile.numba_private import callback, kept_callback, uncounted
 
@@ -275,7 +275,7 @@ def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
         _jump(address, parcel, 0)
     else:
-        spread(address, parcel, blocks)
+        share_out(address, parcel, blocks)
 
 
 def call(code, name, parcel):

@@ -215,7 +215,7 @@ def _look(crew, looks):
 
 
 @intrinsic
-def spread(typing, address, parcel, blocks):
+def share_out(typing, address, parcel, blocks):
     """Call the task at an address for every block of its parcel, on all threads. `begin` must have been called."""
 
     def emit(context, builder, signature, arguments):
@@ -258,7 +258,7 @@ class _Crew:
         self.hire()
 
     def hire(self) -> None:
-        """Hire the helpers that are missing, and let as many help as are wanted."""
+        """Hire the helpers that are missing, and let as many help as are wanted. Does nothing before `begin`."""
         if not self.code:
             return
         with self._hiring:
@@ -312,6 +312,6 @@ begin = _crew.begin
 
 def set_threads(count: int) -> None:
     """Let so many threads compute, the leader and its helpers; results do not depend on it."""
-    if count != _crew.wanted:
-        _crew.wanted = count
+    _crew.wanted = count
+    if count - 1 != _crew.cells[HELPERS]:  # so it is after a fork too
         _crew.hire()
