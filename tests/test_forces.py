@@ -224,7 +224,7 @@ def test_lists_begin_with_about_the_room_they_need(edge):
 
 
 def test_blocks_of_lists_grow_in_number_with_the_edge_of_the_box():
-    for sites, blocks in ((900, 1), (12_288, 16), (1_000_000, 20), (2_000_000, 25)):
+    for sites, blocks in ((100, 1), (900, 16), (12_288, 16), (1_000_000, 20), (2_000_000, 25)):
         bounds = clusters_of(sites, np.float64).bounds
         assert len(bounds) == blocks + 1
         assert bounds[0] == 0 and bounds[-1] * lane_count(np.float64) >= sites and (np.diff(bounds) > 0).all()

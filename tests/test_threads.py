@@ -72,7 +72,9 @@ def test_a_block_may_have_blocks_of_its_own():
 
 
 def test_two_simulations_at_once_have_the_bits_of_each_alone():
-    scenes = [small_scene({"spce": 216}, 19.0, seed=seed, output={"trajectory": False}) for seed in (1, 2)]
+    stage = {"ensemble": "nve", "duration_ps": 1.0}
+    own = {"stages": [stage], "start": {"temperature_K": 90.0}, "output": {"trajectory": False}}
+    scenes = [small_scene({"argon": 500}, 30.0, seed=seed, **own) for seed in (1, 2)]
     alone = [Simulation(scene).run().state for scene in scenes]
     together = [None, None]
 
