@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 
+import numba
 import numpy as np
 import pytest
 from conftest import ROOT, small_scene
@@ -69,6 +70,23 @@ def test_a_block_may_have_blocks_of_its_own():
     inner, seen = Code(count=(_count, (np.zeros((1, 2)), 10))), np.zeros((20, 30, 2))
     _run_within(Code(within=(_count_within, (inner, seen))), inner, seen)
     assert (seen[:, :, 0] == 1).all()
+
+
+@numba.njit(nogil=True)
+def _run_freely(code, seen, work, times):
+    _run(code, seen, work, times)
+
+
+def test_two_leaders_at_once_each_have_their_blocks_done_once():
+    """Without Python's lock, so that each finds the crew at work for the other."""
+    found = [np.zeros((16, 2)), np.zeros((40, 2))]
+    code = Code(count=(_count, (found[0], 10)))
+    both = [threading.Thread(target=_run_freely, args=(code, seen, 10, 20_000)) for seen in found]
+    for one in both:
+        one.start()
+    for one in both:
+        one.join()
+    assert all((seen[:, 0] == 20_000).all() for seen in found)
 
 
 def test_two_simulations_at_once_have_the_bits_of_each_alone():

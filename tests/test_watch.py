@@ -139,6 +139,28 @@ def test_a_load_that_is_no_number(name):
     assert str(found) == f"the {name.removesuffix('_body')} on molecule 6 (spce) is not finite"
 
 
+@pytest.mark.parametrize("name", ["force", "torque_body", "velocity", "angular_momentum_body"])
+def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
+    """One number of one molecule grows through its limit: found at the same size as if each molecule were looked at."""
+    system = build(small_scene({"spce": 20, "nitrogen": 20}, 30.0))
+    load, _ = system.engine().evaluate(system.state)
+    verlet, number = SCHEMES["velocity_verlet"], getattr(load if name in load._fields else system.state, name)
+
+    def findings(m):
+        for size in np.geomspace(1.0, 1e9, 180):
+            number[m, 1] = size
+            found = watch.step_finding(system, system.scene.watch, system.state, load, verlet, 0.002, 250.0)
+            yield found and str(found)
+        number[m, 1] = 0.0
+
+    for m in (3, 23):
+        quick = list(findings(m))
+        with monkeypatch.context() as patched:
+            patched.setattr(watch, "_is_mild", lambda *_: False)
+            assert quick == list(findings(m))
+        assert quick[0] is None and quick[-1] is not None
+
+
 def test_a_thermostat_is_held_to_its_own_time_only():
     """A drift that a thermostat carries off may add up to any size; within its time constant it may not."""
     nvt = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]

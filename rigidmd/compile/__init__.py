@@ -12,13 +12,12 @@ from rigidmd.compile.code import (
     call,
     call_blocks,
     compile_together,
-    jump_to,
     laid_down,
     opened,
     packed,
     task,
 )
-from rigidmd.compile.crew import set_threads
+from rigidmd.compile.crew import jump_to, set_threads
 from rigidmd.compile.kernels import PAIR_FLAGS, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 

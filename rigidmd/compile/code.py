@@ -13,8 +13,7 @@ from numba.core.errors import TypingError
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
-from rigidmd.compile import ahead
-from rigidmd.compile.crew import begin, share_out
+from rigidmd.compile import ahead, crew
 from rigidmd.compile.kernels import kernel, options_of
 from rigidmd.compile.numba_private import callback, kept_callback, uncounted
 
@@ -77,7 +76,7 @@ class Task:
         """Address of the machine code for a parcel of this type, which is compiled or read from the cache."""
         if parcel not in self.compiled:
             ahead.wait_for(*self.name, parcel)
-            begin()
+            crew.begin()
             code = callback(self.function, (parcel, types.intp), self.options)
             self.compiled[parcel] = code
         return self.compiled[parcel].address
@@ -90,7 +89,7 @@ class Task:
     def is_ready(self, parcel: Parcel) -> bool:
         """Whether `address` has nothing to compile."""
         if parcel not in self.compiled:
-            begin()
+            crew.begin()
             code = kept_callback(self.function, (parcel, types.intp), self.options)
             if code is None:
                 return False
@@ -257,25 +256,12 @@ def _uncounted(context, builder, kind: types.Type, value):
     return value
 
 
-@intrinsic
-def jump_to(typing, address, content, block):
-    """Call the task at an address for a value that `laid_down` has written at another."""
-
-    def emit(context, builder, signature, arguments):
-        kind = ir.FunctionType(ir.VoidType(), [ADDRESS, ir.IntType(64)])
-        parcel = builder.inttoptr(arguments[1], ADDRESS)
-        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), [parcel, arguments[2]])
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.intp), emit
-
-
 @kernel
 def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
         _jump(address, parcel, 0)
     else:
-        share_out(address, parcel, blocks)
+        crew.share_out(address, parcel, blocks)
 
 
 def call(code, name, parcel):

@@ -6,8 +6,8 @@ that are awake take blocks too, each the next one, until there are none. Nobody 
 block: one that sleeps, or whose core is busy with another program, is not missed. So a task costs a few exchanges of a
 line of memory between cores, not an entry into a parallel region and a barrier of all threads at its end.
 
-A leader that finds the crew at work, for another simulation or because a block has blocks of its own, does all its
-blocks alone. The blocks of a task, not the threads, decide the bits of a result.
+A leader that finds the crew at work, for another leader or because a block has blocks of its own, does all its blocks
+alone. The blocks of a task, not the threads, decide the bits of a result.
 """
 
 import ctypes
@@ -126,15 +126,15 @@ def _ring(typing, bell):
 
 
 @intrinsic
-def _do(typing, address, parcel, block):
-    """Call the machine code at an address."""
+def jump_to(typing, address, parcel, block):
+    """Call the task at an address for a parcel, or what `laid_down` has written, at another."""
 
     def emit(context, builder, signature, arguments):
         kind = ir.FunctionType(ir.VoidType(), [WORD, WORD])
         builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
         return context.get_dummy_value()
 
-    return types.void(types.int64, types.int64, types.int64), emit
+    return types.void(types.intp, types.intp, types.intp), emit
 
 
 @kernel(counted=False)
@@ -143,7 +143,7 @@ def _take(crew, ticket, address, parcel, blocks):
     last = False
     while ticket % JOB < blocks:
         if _replace(crew, TICKET, ticket, ticket + 1):
-            _do(address, parcel, ticket % JOB)
+            jump_to(address, parcel, ticket % JOB)
             last = _add(crew, DONE, 1) + 1 == blocks
         now = _read(crew, TICKET)
         if now // JOB != ticket // JOB:
@@ -179,7 +179,7 @@ def _lead(crew, address, parcel, blocks):
     helpers = _read(crew, HELPERS)
     if helpers == 0 or not _replace(crew, AT_WORK, 0, 1):
         for block in range(blocks):
-            _do(address, parcel, block)
+            jump_to(address, parcel, block)
         return
     job = (_read(crew, TICKET) // JOB + 1) * JOB
     _write(crew, TICKET, job + CLOSED)
@@ -307,7 +307,11 @@ def _bell() -> int:
 _crew = _Crew()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_crew.forget)
-begin = _crew.begin
+
+
+def begin() -> None:
+    """Make the crew ready, at the first call: a leader can then share out blocks."""
+    _crew.begin()
 
 
 def set_threads(count: int) -> None:

@@ -12,7 +12,7 @@ from rigidmd.compile import BLOCKS, MOST_BLOCKS, implements, is_a, kernel, opene
 from rigidmd.compile.lanes import lane_count, width_of
 from rigidmd.core.state import EXAMPLE
 
-# Up to this number, loops over molecules stay on one thread: they take few microseconds.
+# Up to this number, loops over molecules stay on one thread: they take a few microseconds.
 SERIAL = 128
 SHARE = 4096  # molecules of a block, where there are more blocks than the fewest
 
