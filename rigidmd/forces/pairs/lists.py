@@ -86,7 +86,8 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
     blocks, slots = len(clusters.farthest), len(clusters.order)
     rows = slots // 2
     count = len(clusters.origin) // 4
-    room = ceil(_clusters_met(cell, count, cutoff + skin) * rows / blocks)
+    most_rows = rows // count * int(np.diff(clusters.bounds).max())  # of a block
+    room = ceil(_clusters_met(cell, count, cutoff + skin) * most_rows)
     needed = np.zeros((blocks, 3), np.int64)
     needed[:, WINDOW] = _clusters_ahead(cell, count, blocks, cutoff + skin)
     skin = _fitting_skin(cell, cutoff, skin)
@@ -104,7 +105,7 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         beyond=np.zeros((rows, SHELLS), np.uint16),
         entries=np.empty((blocks, room), np.int32),
         special=np.zeros(rows, np.int32),
-        masked=np.empty((blocks, ceil(1.5 * rows / blocks), 2), np.int32),  # measured per row: argon 1.1, water 1.5
+        masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),  # measured per row: argon 1.1, water 1.5
         needed=needed,
         counters=np.zeros(4, np.int64),
     )
