@@ -13,7 +13,7 @@ from rigidmd.core.state import no_load
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.clusters import clusters_of
-from rigidmd.forces.pairs.lists import BUILDS, USABLE
+from rigidmd.forces.pairs.lists import BUILDS, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
 from rigidmd.forces.pairs.space import cell_of
 from rigidmd.forces.terms import Loading
 from rigidmd.measure.observables import observe
@@ -203,7 +203,13 @@ def test_a_list_with_little_room_grows_and_misses_nothing():
     cramped = []
     for own in engine.workspaces.values():
         blocks = len(own.pairs.entries)
-        pairs = own.pairs._replace(entries=np.empty((blocks, 3), np.int32), masked=np.empty((blocks, 1, 2), np.int32))
+        apart = np.empty((blocks, 6), own.pairs.apart.dtype)
+        pairs = own.pairs._replace(
+            entries=np.empty((blocks, 3), np.uint16),
+            masked=np.empty((blocks, 1, 2), np.int32),
+            met=np.empty((blocks, 2), np.int32),
+            apart=apart,
+        )
         pairs.counters[USABLE] = 0
         cramped.append(own._replace(pairs=pairs, sums=own.sums._replace(others=own.sums.others[:, :8].copy())))
     engine._workspaces = tuple(cramped)
@@ -213,14 +219,27 @@ def test_a_list_with_little_room_grows_and_misses_nothing():
 @pytest.mark.parametrize("edge", [31.1, None])
 def test_lists_begin_with_about_the_room_they_need(edge):
     _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)
-    begun = [(own.pairs.entries.shape[1], own.sums.others.shape[1]) for own in engine.room(state)]
+    begun = [own.pairs for own in engine.room(state)]
+    others = [own.sums.others.shape[1] for own in engine.room(state)]
     engine.evaluate(state)
-    for (entries, others), own in zip(begun, engine.workspaces.values(), strict=True):
+    for pairs, other, own in zip(begun, others, engine.workspaces.values(), strict=True):
         lanes = 4 * len(own.pairs.clusters.order) // len(own.pairs.clusters.origin)
-        needed = own.pairs.needed.max(axis=0) * (1, 1, 3 * lanes)
-        assert needed[0] <= 1.1 * entries and entries < 1.6 * needed[0] + 16
+        needed = own.pairs.needed.max(axis=0)
+        for kind, array in ((ENTRIES, pairs.entries), (MET, pairs.met)):
+            assert needed[kind] <= 1.1 * array.shape[1] and array.shape[1] < 1.6 * needed[kind] + 16
         if edge:
-            assert needed[2] <= 1.2 * others and others < 1.6 * needed[2] + 16
+            window = 3 * lanes * needed[WINDOW]
+            assert window <= 1.2 * other and other < 1.6 * window + 16
+
+
+def test_a_cutoff_within_which_are_too_many_sites_is_refused():
+    """Entries have 16 bits. A list as long would take minutes to build."""
+    _, engine, state = built({"argon": 10}, 18.0, 4, forces={"cutoff_A": 8.0})
+    engine.evaluate(state)
+    (own,) = engine.workspaces.values()
+    own.pairs.needed[0, MET_BY_ONE] = MOST_MET + 1
+    with pytest.raises(SimulationError, match="sites are within the cut-off of 8 Å: take a shorter one"):
+        own.with_room(state.cell)
 
 
 def test_blocks_of_lists_grow_in_number_with_the_edge_of_the_box():

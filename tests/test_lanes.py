@@ -60,6 +60,39 @@ def test_vectors_compute_as_arrays_do(dtype):
 
 
 @kernel(outer=True)
+def inverses(x, out):
+    width = lanes.width_of(x)
+    for i in range(0, len(x), width):
+        at = lanes.load(x, i)
+        lanes.store(out[0], i, lanes.inverse(at))
+        lanes.store(out[1], i, lanes.inverse_root(at))
+        lanes.store(out[2], i, lanes.inverse_cube(at))
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS.values())
+def test_inverses_are_accurate_to_the_last_digits(dtype):
+    """Over all fractions that an estimate of the machine can have, and sizes as of squared distances."""
+    x = np.concatenate([np.linspace(1, 4, 1 << 16), np.geomspace(1e-3, 1e6, 1 << 12)]).astype(dtype)
+    out = np.zeros((3, len(x)), dtype)
+    inverses(x, out)
+    exact = x.astype(np.longdouble)
+    for found, power in zip(out, (-1, -0.5, -1.5), strict=True):
+        assert np.abs(found * exact ** np.longdouble(-power) - 1).max() < 3 * np.finfo(dtype).eps
+
+
+@pytest.mark.skipif(SIMD_BITS == 128 or platform.machine() != "x86_64", reason="vectors are not wider than the stack")
+def test_the_stack_is_aligned_to_vectors():
+    @numba.njit
+    def aligned(x):
+        lanes.align_stack()
+        return x + 1
+
+    assert aligned(1) == 2
+    (code,) = aligned.inspect_asm().values()
+    assert f"andq\t$-{SIMD_BITS // 8}, %rsp" in code
+
+
+@kernel(outer=True)
 def part(x, out):
     width = lanes.width_of(x)
     whole, rest = lanes.parted(lanes.load(x, 0))

@@ -23,9 +23,9 @@ from rigidmd.units import COULOMB_CHARGE
 
 #: Largest error of a polynomial, relative to the function at r = 0, by the precision of the lanes: smaller than the
 #: rounding error of its evaluation, 5e-15 and 1.5e-7 for alpha times the cut-off up to 4.
-FIT_ERROR = {np.dtype(np.float64): 2e-16, np.dtype(np.float32): 3e-8}
+FIT_ERROR = {np.dtype(np.float64): 1e-15, np.dtype(np.float32): 3e-8}
 #: The number of terms is a multiple of this.
-STEP = {np.dtype(np.float64): 4, np.dtype(np.float32): 2}
+STEP = 2
 #: Intervals of a table, and coefficients of each.
 INTERVALS, TERMS = 32, 4
 #: Largest error of a table, relative as FIT_ERROR: the rounding error of the polynomial that it replaces.
@@ -115,7 +115,7 @@ def _cut(series: np.ndarray, error: float, kind: np.dtype) -> np.ndarray:
     """Coefficients of powers of t for a Chebyshev series, truncated at the given error."""
     left = np.cumsum(np.abs(series[::-1]))[::-1]
     needed = int(np.sum(left > max(error, FIT_ERROR[kind] * left[0])))
-    return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // STEP[kind]) * STEP[kind]])
+    return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // STEP) * STEP])
 
 
 def _series(x: float, power: int) -> np.ndarray:

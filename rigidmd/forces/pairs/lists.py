@@ -1,6 +1,7 @@
 """Neighbour lists: for each row of sites of one law, the clusters that may hold a site inside the cut-off.
 
-A row is two sites near one another, so whatever is loaded of a cluster serves both.
+A row is two sites near one another, so whatever is loaded of a cluster serves both. The rows of a cluster meet much the
+same clusters: these are listed once, with their distances, and an entry of a row is a place in that list.
 
 A list is valid until some site has moved more than half the skin since it was built, by translation or rotation of its
 body. The engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. The clusters
@@ -20,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.compile.lanes import zeros
+from rigidmd.compile.lanes import lane_count, zeros
 from rigidmd.core.state import CELL_CHANGED
 from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.clusters import Clusters, clusters_of
@@ -28,6 +29,7 @@ from rigidmd.forces.pairs.tree import BoxTree, box_tree
 
 IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # enough for all images of a box within reach
+MOST_MET = 2**16  # clusters that the rows of one cluster can meet
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first: inside the cut-off when the list is built; the others divide the skin
 MOST_BEYOND = 2**16 - 1
@@ -36,14 +38,15 @@ ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
 
 # Columns of PairList.needed and PairList.counters.
-ENTRIES, MASKED, WINDOW = 0, 1, 2
+ENTRIES, MASKED, MET, WINDOW, MET_BY_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 
 
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one law.
 
-    An entry is the integer IMAGES * cluster + image; `shift` has the displacement of the image.
+    Cluster c meets clusters met[b, first:end], b its block, end = near[c], first = near[c - 1] or 0 in the first of a
+    block. An entry of its rows is a place among these.
     """
 
     cutoff: float  # Å
@@ -57,23 +60,16 @@ class PairList(NamedTuple):
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     row: np.ndarray  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
     beyond: np.ndarray  # (rows, SHELLS) uint16 how many entries at the end of a row are beyond shell k
-    entries: np.ndarray  # (blocks, capacity) int32
+    entries: np.ndarray  # (blocks, capacity) uint16
     special: np.ndarray  # (rows,) int32 end of each row in masked[b]
     masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
-    needed: np.ndarray  # (blocks, 3) room expected or needed: entries, masked entries, clusters from the first on
+    near: np.ndarray  # (clusters,) int32
+    met: np.ndarray  # (blocks, capacity) int32 clusters
+    apart: np.ndarray  # (blocks, 3 capacity) from their origins, in the image that is met, to that of c, Å
+    needed: (
+        np.ndarray
+    )  # (blocks, 5) room expected or needed: entries, masked, met, clusters from the first on, met by c
     counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
-
-
-@kernel(inline=True)
-def cluster_of(entry):
-    """The cluster of an entry."""
-    return entry >> IMAGE_BITS
-
-
-@kernel(inline=True)
-def image_of(entry):
-    """The image of an entry."""
-    return entry & (IMAGES - 1)
 
 
 def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
@@ -87,8 +83,9 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
     rows = slots // 2
     count = len(clusters.origin) // 4
     most_rows = rows // count * int(np.diff(clusters.bounds).max())  # of a block
-    room = ceil(_clusters_met(cell, count, cutoff + skin) * most_rows)
-    needed = np.zeros((blocks, 3), np.int64)
+    room = ceil(_clusters_met(cell, count, cutoff + skin, 1.0) * most_rows)
+    met = ceil(_clusters_met(cell, count, cutoff + skin, 2.0) * most_rows * count / rows)
+    needed = np.zeros((blocks, 5), np.int64)
     needed[:, WINDOW] = _clusters_ahead(cell, count, blocks, cutoff + skin)
     skin = _fitting_skin(cell, cutoff, skin)
     return PairList(
@@ -103,9 +100,12 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         shift=zeros(4 * IMAGES, np.float64),
         row=np.zeros(rows, np.int32),
         beyond=np.zeros((rows, SHELLS), np.uint16),
-        entries=np.empty((blocks, room), np.int32),
+        entries=np.empty((blocks, room), np.uint16),
         special=np.zeros(rows, np.int32),
         masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),  # measured per row: argon 1.1, water 1.5
+        near=np.zeros(count, np.int32),
+        met=np.empty((blocks, met), np.int32),
+        apart=np.empty((blocks, 3 * met), dtype),
         needed=needed,
         counters=np.zeros(4, np.int64),
     )
@@ -116,16 +116,21 @@ def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
     return min(skin, LONGEST_SKIN * cell.diagonal().min()) if cutoff < inf else inf
 
 
-def _clusters_met(cell: np.ndarray, count: int, radius: float) -> float:
-    """Expected number of entries in a row; 0 if the density is not known, and the first build then finds it."""
+def _clusters_met(cell: np.ndarray, count: int, radius: float, size: float) -> float:
+    """Expected number of clusters within a radius of sites, half of them; 0 if the density is not known, and the first
+    build then finds it.
+
+    size : 1 for a row, which is small, 2 for a whole cluster
+    """
     if radius == inf:
         return count / 2 + 1
     volume = cell.diagonal().prod()
     if volume == inf:
         return 0.0
-    edge = np.cbrt(volume / count)
+    cluster = volume / count
+    edge = size * np.cbrt(cluster)
     near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3  # Steiner's formula
-    return min(0.42 * near / edge**3, count / 2) + 1  # half of them; a sixth less: measured, cubes have corners
+    return min(0.42 * near / cluster, count / 2) + 1  # a sixth less than half: measured, cubes have corners
 
 
 def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
@@ -175,7 +180,7 @@ def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
 def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
     """The list with the room that its last build needed and a tenth more, and with a skin that fits into the cell.
 
-    Raises SimulationError if the cell has become too small for the cut-off.
+    Raises SimulationError if the cell has become too small for the cut-off, or too many sites are within it.
     """
     if pairs.counters[STATUS] == CELL_CHANGED:
         if 2 * pairs.cutoff > cell.diagonal().min():
@@ -186,11 +191,20 @@ def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
         skin = _fitting_skin(cell, pairs.cutoff, pairs.skin)
         pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     blocks = len(pairs.needed)
-    entries, masked, _ = pairs.needed.max(axis=0)
+    entries, masked, met, _, of_one = pairs.needed.max(axis=0)
+    if of_one > MOST_MET:
+        raise SimulationError(
+            f"more than {MOST_MET * lane_count(pairs.apart.dtype)} sites are within the cut-off of {pairs.cutoff:g} Å: "
+            "take a shorter one, or fewer molecules"
+        )
     if entries > pairs.entries.shape[1]:
-        pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.int32))
+        pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.uint16))
     if masked > pairs.masked.shape[1]:
         pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
+    if met > pairs.met.shape[1]:
+        room = int(1.1 * met) + 16
+        apart = np.empty((blocks, 3 * room), pairs.apart.dtype)
+        pairs = pairs._replace(met=np.empty((blocks, room), np.int32), apart=apart)
     return pairs
 
 

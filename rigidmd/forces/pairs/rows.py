@@ -21,33 +21,38 @@ from rigidmd.compile.lanes import (
 )  # fmt: skip
 from rigidmd.forces.pairs.lists import (
     ENTRIES,
+    IMAGE_BITS,
     IMAGES,
     IMAGES_FOUND,
     MASK_BITS,
     MASKED,
+    MET,
+    MET_BY_ONE,
     MOST_BEYOND,
     ROUNDING,
     SHELLS,
     WINDOW,
-    cluster_of,
-    image_of,
 )  # fmt: skip
 from rigidmd.forces.pairs.tree import within_reach
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays for the rows of one cluster."""
+    """Scratch arrays for the rows of one cluster.
+
+    A candidate is the integer IMAGES * cluster + image; `PairList.shift` has the displacement of the image.
+    """
 
     stack: np.ndarray  # (levels, 2) for within_reach
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
-    entry: np.ndarray  # (room,) candidates
-    shell: np.ndarray  # (room * lanes,) shell, not rounded, of candidate n in the row of site i, at n * lanes + i
+    candidate: np.ndarray  # (room,) clusters that may be met, at last those that are
+    shell: np.ndarray  # (room * lanes,) shell, not rounded, of entry n in the row of site i, at n * lanes + i
     end: np.ndarray  # (SHELLS,) end of each shell of a row
     inner: np.ndarray  # (rows of a cluster, room) entries of the first shell
-    outer: np.ndarray  # (rows of a cluster, room) candidates of the other shells
+    outer: np.ndarray  # (rows of a cluster, room) entries of the other shells
     special: np.ndarray  # (rows of a cluster, room) entries that need a mask
     count: np.ndarray  # (3, rows of a cluster) number in inner, outer, special of each row
+    filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
 
 @kernel
@@ -64,7 +69,18 @@ def _scratch(pairs, room):
         np.empty((width // 2, room), np.int32),
         np.empty((width // 2, room), np.int32),
         np.empty((3, width // 2), np.int64),
+        np.zeros(5, np.int64),
     )
+
+
+@kernel(inline=True)
+def _cluster_of(candidate):
+    return candidate >> IMAGE_BITS
+
+
+@kernel(inline=True)
+def _image_of(candidate):
+    return candidate & (IMAGES - 1)
 
 
 @kernel(inline=True)
@@ -75,16 +91,13 @@ def fill_block(pairs, block, room):
     """
     clusters = pairs.clusters
     scratch = _scratch(pairs, room)
-    entries = masked = window = 0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         candidates = _find_candidates(pairs, c, scratch)
         if candidates > room:
             return 2 * candidates
-        entries, masked, ahead = _fill_rows(pairs, block, c, scratch, candidates, entries, masked)
-        window = max(window, ahead + c - clusters.bounds[block] + 1)
-    pairs.needed[block, ENTRIES] = entries
-    pairs.needed[block, MASKED] = masked
-    pairs.needed[block, WINDOW] = min(window, len(clusters.origin) // 4)
+        _fill_rows(pairs, block, c, scratch, candidates)
+    for k in range(len(scratch.filled)):
+        pairs.needed[block, k] = scratch.filled[k]
     return 0
 
 
@@ -97,7 +110,7 @@ def _find_candidates(pairs, c, scratch):
     tree = pairs.tree
     count = len(pairs.clusters.origin) // 4
     radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
-    entry = scratch.entry
+    into = scratch.candidate
     candidates = 0
     for image in range(pairs.counters[IMAGES_FOUND]):
         reaches = True
@@ -110,62 +123,79 @@ def _find_candidates(pairs, c, scratch):
         if not reaches:
             continue
         first = candidates
-        found = within_reach(tree, scratch.low, scratch.high, radius * radius, c, count, scratch.stack, entry, first)
-        if found > len(entry):
+        found = within_reach(tree, scratch.low, scratch.high, radius * radius, c, count, scratch.stack, into, first)
+        if found > len(into):
             return found
         for n in range(first, found):
-            ahead = entry[n] - c
+            ahead = into[n] - c
             if ahead < 0:
                 ahead += count
-            if 2 * ahead < count or (2 * ahead == count and c < entry[n]):
-                entry[candidates] = IMAGES * entry[n] + image
+            if 2 * ahead < count or (2 * ahead == count and c < into[n]):
+                into[candidates] = IMAGES * into[n] + image
                 candidates += 1
     return candidates
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
-def _fill_rows(pairs, block, c, scratch, candidates, filled, filled_masked):
-    """Fill the rows of a cluster from its candidates.
-
-    Returns the numbers of entries and masked entries of the block so far, and how far ahead on the ring the farthest
-    candidate is.
-    """
+def _fill_rows(pairs, block, c, scratch, candidates):
+    """Fill the rows of a cluster from its candidates."""
     width = width_of(pairs.clusters.local)
     rows = width // 2
-    count = len(pairs.clusters.origin) // 4
-    entries, masked = pairs.entries[block], pairs.masked[block]
+    masked, filled = pairs.masked[block], scratch.filled
     radius2 = ((pairs.cutoff + pairs.skin) * (1 + ROUNDING)) ** 2
-    farthest = 0
     scratch.count[:] = 0
+    met = 0
     for n in range(candidates):
-        _measure(pairs, c, scratch, n)
-        ahead = cluster_of(scratch.entry[n]) - c
-        farthest = max(farthest, ahead + count if ahead < 0 else ahead)
+        if _measure(pairs, c, scratch, scratch.candidate[n], met):
+            scratch.candidate[met] = scratch.candidate[n]
+            met += 1
+    _meet(pairs, block, c, scratch, met)
     for own in range(rows):
         r = rows * c + own
-        filled = _fill_row(pairs.beyond[r], entries, filled, scratch, own, width)
-        pairs.row[r] = min(filled, len(entries))
+        _fill_row(pairs.beyond[r], pairs.entries[block], scratch, own, width)
+        pairs.row[r] = min(filled[ENTRIES], pairs.entries.shape[1])
         for n in range(scratch.count[2, own]):
             entry = scratch.special[own, n]
-            first_of_row = _mask_of_lanes(pairs, 2 * r, entry, radius2)
-            second = _mask_of_lanes(pairs, 2 * r + 1, entry, radius2)
+            first_of_row = _mask_of_lanes(pairs, 2 * r, scratch.candidate[entry], radius2)
+            second = _mask_of_lanes(pairs, 2 * r + 1, scratch.candidate[entry], radius2)
             if first_of_row | second:
-                if filled_masked < len(masked):
-                    masked[filled_masked, 0] = entry
-                    masked[filled_masked, 1] = first_of_row | second << MASK_BITS
-                filled_masked += 1
-        pairs.special[r] = min(filled_masked, len(masked))
-    return filled, filled_masked, farthest
+                if filled[MASKED] < len(masked):
+                    masked[filled[MASKED], 0] = entry
+                    masked[filled[MASKED], 1] = first_of_row | second << MASK_BITS
+                filled[MASKED] += 1
+        pairs.special[r] = min(filled[MASKED], len(masked))
 
 
 @kernel(inline=True)
-def _fill_row(beyond, entries, filled, scratch, own, width):
-    """Write the entries of a row, shell by shell; returns the number of entries in the block so far.
+def _meet(pairs, block, c, scratch, met):
+    """List the clusters that the rows of a cluster meet, the first of the candidates."""
+    count = len(pairs.clusters.origin) // 4
+    there, apart, filled = pairs.met[block], pairs.apart[block], scratch.filled
+    first = filled[MET]
+    for n in range(met):
+        other, image = _cluster_of(scratch.candidate[n]), _image_of(scratch.candidate[n])
+        if first + n < len(there):
+            there[first + n] = other
+            for k in range(3):
+                apart[3 * (first + n) + k] = _apart(pairs, c, other, image, k)
+        ahead = other - c
+        if ahead < 0:
+            ahead += count
+        filled[WINDOW] = max(filled[WINDOW], min(ahead + c - pairs.clusters.bounds[block] + 1, count))
+    filled[MET] += met
+    filled[MET_BY_ONE] = max(filled[MET_BY_ONE], met)
+    pairs.near[c] = min(filled[MET], len(there))
+
+
+@kernel(inline=True)
+def _fill_row(beyond, entries, scratch, own, width):
+    """Write the entries of a row, shell by shell.
 
     `beyond` is limited by its type: entries above that limit count as if they were inside the shell.
     """
     inner, outer, end = scratch.inner[own], scratch.outer[own], scratch.end
     inners, outers = scratch.count[0, own], scratch.count[1, own]
+    filled = scratch.filled[ENTRIES]
     for k in range(SHELLS):
         end[k] = 0
     for n in range(outers):
@@ -182,14 +212,16 @@ def _fill_row(beyond, entries, filled, scratch, own, width):
             entries[filled + n] = inner[n]
         for n in range(outers):
             k = ceil(scratch.shell[width * outer[n] + 2 * own])
-            entries[end[k]] = scratch.entry[outer[n]]
+            entries[end[k]] = outer[n]
             end[k] += 1
-    return last
+    scratch.filled[ENTRIES] = last
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _measure(pairs, c, scratch, n):
-    """Add candidate n to a shell of each row of a cluster, or to the entries that need a mask.
+def _measure(pairs, c, scratch, candidate, n):
+    """Add a candidate, as entry n, to a shell of each row of a cluster, or to the entries that need a mask.
+
+    Returns whether a row has it.
 
     The sites of the cluster are the lanes, and the loop runs over the candidate's sites: there are no sums across lanes
     and no unpredictable branches.
@@ -198,8 +230,7 @@ def _measure(pairs, c, scratch, n):
     local = clusters.local
     width = width_of(local)
     count = len(clusters.origin) // 4
-    entry = scratch.entry[n]
-    other, image = cluster_of(entry), image_of(entry)
+    other, image = _cluster_of(candidate), _image_of(candidate)
     at = 3 * width * c
     x = load(local, at) + _apart(pairs, c, other, image, 0)
     y = load(local, at + width) + _apart(pairs, c, other, image, 1)
@@ -231,10 +262,11 @@ def _measure(pairs, c, scratch, n):
     store(scratch.shell, width * n, shell)
     inner = bits(shell <= 0.0) & ~special
     outer = bits(shell <= SHELLS - 1) & ~inner & ~special
-    _append(scratch.inner, scratch.count, 0, entry, inner, width)
+    _append(scratch.inner, scratch.count, 0, n, inner, width)
     _append(scratch.outer, scratch.count, 1, n, outer, width)
     if special != 0:
-        _append(scratch.special, scratch.count, 2, entry, special, width)
+        _append(scratch.special, scratch.count, 2, n, special, width)
+    return inner | outer | special != 0
 
 
 @kernel(inline=True)
@@ -246,15 +278,15 @@ def _append(rows, count, k, value, which, width):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _mask_of_lanes(pairs, i, entry, radius2):
-    """The sites of an entry's cluster that interact with site i, as bits; 0 if none is inside the radius."""
+def _mask_of_lanes(pairs, i, candidate, radius2):
+    """The sites of a candidate that interact with site i, as bits; 0 if none is inside the radius."""
     if i >= len(pairs.group):
         return 0
     clusters = pairs.clusters
     local = clusters.local
     width = width_of(local)
     everyone = (1 << width) - 1
-    c, other, image = i // width, cluster_of(entry), image_of(entry)
+    c, other, image = i // width, _cluster_of(candidate), _image_of(candidate)
     at = 2 * width * c + i
     start = 3 * width * other
     dx = local[at] + _apart(pairs, c, other, image, 0) - load(local, start)

@@ -19,6 +19,9 @@ from rigidmd.forces.pairs.lists import (
     IMAGES_FOUND,
     LONGEST_SKIN,
     MASKED,
+    MET,
+    MET_BY_ONE,
+    MOST_MET,
     STATUS,
     USABLE,
     PairList,
@@ -90,7 +93,12 @@ def refill(pairs, code):
 @kernel(counted=False)
 def _judged(pairs):
     """Whether a list that has been filled is whole, into its counters; a status code."""
-    if most_needed(pairs, ENTRIES) > pairs.entries.shape[1] or most_needed(pairs, MASKED) > pairs.masked.shape[1]:
+    if (
+        most_needed(pairs, ENTRIES) > pairs.entries.shape[1]
+        or most_needed(pairs, MASKED) > pairs.masked.shape[1]
+        or most_needed(pairs, MET) > pairs.met.shape[1]
+        or most_needed(pairs, MET_BY_ONE) > MOST_MET
+    ):
         return LIST_FULL
     pairs.counters[USABLE] = 1
     pairs.counters[BUILDS] += 1
