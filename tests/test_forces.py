@@ -197,18 +197,18 @@ def test_newton_and_no_net_torque_in_free_space():
     assert np.abs(torque).max() < 1e-14 * scale * np.abs(state.position).max()
 
 
-def test_a_list_with_little_room_grows_and_misses_nothing():
-    _, engine, state = built({"spce": 40}, 18.0, 4, forces={"cutoff_A": 8.0})
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+def test_a_list_with_little_room_grows_and_misses_nothing(precision):
+    _, engine, state = built({"spce": 40}, 18.0, 4, forces={"cutoff_A": 8.0}, precision=precision)
     expected = energies(engine, state)
     cramped = []
     for own in engine.workspaces.values():
         blocks = len(own.pairs.entries)
-        apart = np.empty((blocks, 6), own.pairs.apart.dtype)
         pairs = own.pairs._replace(
             entries=np.empty((blocks, 3), np.uint16),
             masked=np.empty((blocks, 1, 2), np.int32),
             met=np.empty((blocks, 2), np.int32),
-            apart=apart,
+            apart=np.empty((blocks, 6 if precision == "mixed" else 0), own.pairs.apart.dtype),
         )
         pairs.counters[USABLE] = 0
         cramped.append(own._replace(pairs=pairs, sums=own.sums._replace(others=own.sums.others[:, :8].copy())))

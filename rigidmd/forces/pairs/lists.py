@@ -45,8 +45,9 @@ USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one law.
 
-    Cluster c meets clusters met[b, first:end], b its block, end = near[c], first = near[c - 1] or 0 in the first of a
-    block. An entry of its rows is a place among these.
+    Cluster c meets the images met[b, first:end] of clusters: b its block, end = near[c], first = near[c - 1], or 0 for
+    the first cluster of a block. An image is the integer IMAGES * cluster + number; `shift` has its displacement. An
+    entry of a row is a place among what its cluster meets.
     """
 
     cutoff: float  # Å
@@ -64,12 +65,22 @@ class PairList(NamedTuple):
     special: np.ndarray  # (rows,) int32 end of each row in masked[b]
     masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
     near: np.ndarray  # (clusters,) int32
-    met: np.ndarray  # (blocks, capacity) int32 clusters
-    apart: np.ndarray  # (blocks, 3 capacity) from their origins, in the image that is met, to that of c, Å
-    needed: (
-        np.ndarray
-    )  # (blocks, 5) room expected or needed: entries, masked, met, clusters from the first on, met by c
+    met: np.ndarray  # (blocks, capacity) int32
+    apart: np.ndarray  # (blocks, 3 capacity) from the origins of what is met to that of c, Å; (blocks, 0) in float64
+    needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters from the first, met by one
     counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
+
+
+@kernel(inline=True)
+def cluster_of(image):
+    """The cluster of an image."""
+    return image >> IMAGE_BITS
+
+
+@kernel(inline=True)
+def number_of(image):
+    """The number of an image."""
+    return image & (IMAGES - 1)
 
 
 def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
@@ -105,10 +116,15 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),  # measured per row: argon 1.1, water 1.5
         near=np.zeros(count, np.int32),
         met=np.empty((blocks, met), np.int32),
-        apart=np.empty((blocks, 3 * met), dtype),
+        apart=_room_for_apart(blocks, met, dtype),
         needed=needed,
         counters=np.zeros(4, np.int64),
     )
+
+
+def _room_for_apart(blocks: int, met: int, dtype: type) -> np.ndarray:
+    """Room for `PairList.apart`. In float64 it would be larger than all else, and saves no time: see `loop`."""
+    return np.empty((blocks, 3 * met if dtype == np.float32 else 0), dtype)
 
 
 def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
@@ -203,7 +219,7 @@ def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
         pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
     if met > pairs.met.shape[1]:
         room = int(1.1 * met) + 16
-        apart = np.empty((blocks, 3 * room), pairs.apart.dtype)
+        apart = _room_for_apart(blocks, room, pairs.apart.dtype)
         pairs = pairs._replace(met=np.empty((blocks, room), np.int32), apart=apart)
     return pairs
 

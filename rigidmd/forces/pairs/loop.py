@@ -15,8 +15,10 @@ from rigidmd.compile.lanes import (
     align_stack,
     double,
     fill,
+    lane,
     lane_count,
     load,
+    load_four,
     mask_of,
     narrowed,
     select,
@@ -35,12 +37,14 @@ from rigidmd.forces.pairs.lists import (
     USABLE,
     WINDOW,
     PairList,
+    cluster_of,
     empty_list,
     end_of_row,
     farthest,
     lanes_of_first,
     lanes_of_second,
     most_needed,
+    number_of,
 )  # fmt: skip
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, blocks_of, load_some, virial_of_offsets
 from rigidmd.forces.pairs.update import list_code, refill, update_list
@@ -272,7 +276,7 @@ def block_forces(law, pairs, own, others, tallies, block):
             sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
             for n in range(first_special, pairs.special[i // 2]):
                 entry = first_met + masked[n, 0]
-                other, between = met[entry], _displacements(clusters, here, met[entry], apart, entry)
+                other, between = _displacements(pairs, c, here, met, apart, entry)
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
                 sums = _meet(law, pairs, block, i, other, between, masks, others, sums, tallies)
             # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
@@ -281,13 +285,12 @@ def block_forces(law, pairs, own, others, tallies, block):
             other = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
             if first_entry <= last:
-                entry = first_met + entries[first_entry]
-                other, between = met[entry], _displacements(clusters, here, met[entry], apart, entry)
+                other, between = _displacements(pairs, c, here, met, apart, first_met + entries[first_entry])
             for n in range(first_entry, last + 1):
                 entry = first_met + entries[min(n + 1, last)]
-                next_one, after = met[entry], _displacements(clusters, here, met[entry], apart, entry)
+                ahead, after = _displacements(pairs, c, here, met, apart, entry)
                 sums = _meet(law, pairs, block, i, other, between, (None, None), others, sums, tallies)
-                other, between = next_one, after
+                other, between = ahead, after
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
             first, second, totals = sums
             for k in range(3):
@@ -300,18 +303,43 @@ def block_forces(law, pairs, own, others, tallies, block):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _displacements(clusters, here, other, apart, entry):
-    """Displacements from the sites of another cluster, as vectors, to each of two sites; see `_separation`.
-
-    Where the clusters are from one another is known from the list: to find it here would take a sixth of the time of
-    pairs in single precision.
-    """
-    width = width_of(clusters.local)
+def _displacements(pairs, c, here, met, apart, entry):
+    """The cluster met, and displacements from its sites, as vectors, to each of two sites of c; see `_separation`."""
+    local = pairs.clusters.local
+    width = width_of(local)
+    other = cluster_of(met[entry])
     at = 3 * width * other
-    x = load(clusters.local, at) - spread(apart, 3 * entry)
-    y = load(clusters.local, at + width) - spread(apart, 3 * entry + 1)
-    z = load(clusters.local, at + 2 * width) - spread(apart, 3 * entry + 2)
-    return _separation(here[0], x, y, z), _separation(here[1], x, y, z)
+    dx, dy, dz = origins_apart(pairs, c, met, apart, entry)
+    x = load(local, at) - dx
+    y = load(local, at + width) - dy
+    z = load(local, at + 2 * width) - dz
+    return other, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
+
+
+def origins_apart(pairs, c, met, apart, entry):
+    """Vector from the origin of what is met to that of cluster c, Å.
+
+    In single precision it is looked up: to compute it would take a sixth of the time of all pairs.
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(origins_apart, PAIR_FLAGS, inline=True)
+def _origins_apart(pairs, c, met, apart, entry):
+    if apart.dtype.bitwidth == 32:
+
+        def looked_up(pairs, c, met, apart, entry):
+            return spread(apart, 3 * entry), spread(apart, 3 * entry + 1), spread(apart, 3 * entry + 2)
+
+        return looked_up
+
+    def computed(pairs, c, met, apart, entry):
+        origin, image = pairs.clusters.origin, met[entry]
+        there = load_four(pairs.shift, 4 * number_of(image)) + load_four(origin, 4 * cluster_of(image))
+        apart = load_four(origin, 4 * c) - there
+        return lane(apart, 0), lane(apart, 1), lane(apart, 2)
+
+    return computed
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)

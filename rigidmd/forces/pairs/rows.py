@@ -21,7 +21,6 @@ from rigidmd.compile.lanes import (
 )  # fmt: skip
 from rigidmd.forces.pairs.lists import (
     ENTRIES,
-    IMAGE_BITS,
     IMAGES,
     IMAGES_FOUND,
     MASK_BITS,
@@ -32,20 +31,19 @@ from rigidmd.forces.pairs.lists import (
     ROUNDING,
     SHELLS,
     WINDOW,
+    cluster_of,
+    number_of,
 )  # fmt: skip
 from rigidmd.forces.pairs.tree import within_reach
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays for the rows of one cluster.
-
-    A candidate is the integer IMAGES * cluster + image; `PairList.shift` has the displacement of the image.
-    """
+    """Scratch arrays for the rows of one cluster."""
 
     stack: np.ndarray  # (levels, 2) for within_reach
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
-    candidate: np.ndarray  # (room,) clusters that may be met, at last those that are
+    candidate: np.ndarray  # (room,) images of clusters that may be met, at last those that are
     shell: np.ndarray  # (room * lanes,) shell, not rounded, of entry n in the row of site i, at n * lanes + i
     end: np.ndarray  # (SHELLS,) end of each shell of a row
     inner: np.ndarray  # (rows of a cluster, room) entries of the first shell
@@ -71,16 +69,6 @@ def _scratch(pairs, room):
         np.empty((3, width // 2), np.int64),
         np.zeros(5, np.int64),
     )
-
-
-@kernel(inline=True)
-def _cluster_of(candidate):
-    return candidate >> IMAGE_BITS
-
-
-@kernel(inline=True)
-def _image_of(candidate):
-    return candidate & (IMAGES - 1)
 
 
 @kernel(inline=True)
@@ -168,16 +156,17 @@ def _fill_rows(pairs, block, c, scratch, candidates):
 
 @kernel(inline=True)
 def _meet(pairs, block, c, scratch, met):
-    """List the clusters that the rows of a cluster meet, the first of the candidates."""
+    """List what the rows of a cluster meet: the first of the candidates."""
     count = len(pairs.clusters.origin) // 4
     there, apart, filled = pairs.met[block], pairs.apart[block], scratch.filled
     first = filled[MET]
     for n in range(met):
-        other, image = _cluster_of(scratch.candidate[n]), _image_of(scratch.candidate[n])
+        other, image = cluster_of(scratch.candidate[n]), number_of(scratch.candidate[n])
         if first + n < len(there):
-            there[first + n] = other
-            for k in range(3):
-                apart[3 * (first + n) + k] = _apart(pairs, c, other, image, k)
+            there[first + n] = scratch.candidate[n]
+            if len(apart) > 0:
+                for k in range(3):
+                    apart[3 * (first + n) + k] = _apart(pairs, c, other, image, k)
         ahead = other - c
         if ahead < 0:
             ahead += count
@@ -230,7 +219,7 @@ def _measure(pairs, c, scratch, candidate, n):
     local = clusters.local
     width = width_of(local)
     count = len(clusters.origin) // 4
-    other, image = _cluster_of(candidate), _image_of(candidate)
+    other, image = cluster_of(candidate), number_of(candidate)
     at = 3 * width * c
     x = load(local, at) + _apart(pairs, c, other, image, 0)
     y = load(local, at + width) + _apart(pairs, c, other, image, 1)
@@ -286,7 +275,7 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     local = clusters.local
     width = width_of(local)
     everyone = (1 << width) - 1
-    c, other, image = i // width, _cluster_of(candidate), _image_of(candidate)
+    c, other, image = i // width, cluster_of(candidate), number_of(candidate)
     at = 2 * width * c + i
     start = 3 * width * other
     dx = local[at] + _apart(pairs, c, other, image, 0) - load(local, start)
