@@ -1,7 +1,7 @@
 """Neighbour lists: for each row of sites of one law, the clusters that may hold a site inside the cut-off.
 
 A row is two sites near one another, so whatever is loaded of a cluster serves both. The rows of a cluster meet much the
-same clusters: these are listed once, with their distances, and an entry of a row is a place in that list.
+same clusters: these are listed once, with the vectors between, and an entry of a row is a place in that list.
 
 A list is valid until some site has moved more than half the skin since it was built, by translation or rotation of its
 body. The engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. The clusters
@@ -123,7 +123,7 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
 
 
 def _room_for_apart(blocks: int, met: int, dtype: type) -> np.ndarray:
-    """Room for `PairList.apart`. In float64 it would be larger than all else, and saves no time: see `loop`."""
+    """Room for `PairList.apart`. In float64 it would be larger than all else, and save no time."""
     return np.empty((blocks, 3 * met if dtype == np.float32 else 0), dtype)
 
 

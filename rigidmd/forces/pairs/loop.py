@@ -336,8 +336,8 @@ def _origins_apart(pairs, c, met, apart, entry):
     def computed(pairs, c, met, apart, entry):
         origin, image = pairs.clusters.origin, met[entry]
         there = load_four(pairs.shift, 4 * number_of(image)) + load_four(origin, 4 * cluster_of(image))
-        apart = load_four(origin, 4 * c) - there
-        return lane(apart, 0), lane(apart, 1), lane(apart, 2)
+        vector = load_four(origin, 4 * c) - there
+        return lane(vector, 0), lane(vector, 1), lane(vector, 2)
 
     return computed
 
