@@ -154,6 +154,7 @@ def test_the_pair_loops_of_water_are_vectorised(precision):
             assembly = fresh._library.get_asm_str()
             assert len(re.findall(rf"v?mul{suffix}\s.*%{register}", assembly)) > 10
             assert not re.search(r"v?sqrts[sd]|v?divs[sd]", assembly)  # no pair by itself
+            assert SIMD_BITS == 128 or f"andq\t$-{SIMD_BITS // 8}, %rsp" in assembly
 
 
 MIXED, DROPLET = ({"tip4p2005": 60, "nitrogen": 30, "argon": 20}, 18.0), ({"spce": 60}, None)
