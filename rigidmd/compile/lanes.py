@@ -76,6 +76,19 @@ def load(typing, array, index):
 
 
 @intrinsic
+def item(typing, array, index):
+    """array[index] for an index that is not negative. Numba tests others at each access, inside the pair loop."""
+    if not _is_row(array):
+        return None
+
+    def emit(context, builder, signature, arguments):
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        return builder.load(builder.gep(data, [arguments[1]]))
+
+    return array.dtype(array, types.intp), emit
+
+
+@intrinsic
 def load_beside(typing, array, index, other):
     """`load` with the number of lanes that vectors of another array have."""
     signature, emit = _load(Lanes(array.dtype, COUNT[other.dtype]), array)
@@ -294,6 +307,33 @@ def smaller_of_two(typing, x):
         return builder.select(builder.fcmp_ordered("<", value, beside), value, beside)
 
     return x(x), emit
+
+
+@intrinsic
+def rounded_up(typing, x):
+    """The smallest whole number not below x, in each lane."""
+    return x(x), lambda c, b, s, arguments: _call(
+        b, f"llvm.ceil.{_suffix(arguments[0].type)}", arguments[0].type, *arguments
+    )
+
+
+@intrinsic
+def store_alternate(typing, array, index, x):
+    """Write lanes 0, 2, 4, ... of a vector, whole numbers from 0 to 127, to an array of bytes from an index on."""
+    if not _is_row(array) or array.dtype != types.uint8:
+        return None
+    count = x.count // 2
+
+    def emit(context, builder, signature, arguments):
+        target, index, value = arguments
+        order = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(0, x.count, 2)))
+        whole = builder.fptosi(value, ir.VectorType(ir.IntType(32), x.count))
+        half = builder.trunc(builder.shuffle_vector(whole, whole, order), ir.VectorType(ir.IntType(8), count))
+        data = context.make_array(array)(context, builder, target).data
+        builder.store(half, builder.bitcast(builder.gep(data, [index]), half.type.as_pointer()), align=1)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, x), emit
 
 
 def inverse(x):

@@ -27,7 +27,7 @@ class Clusters(NamedTuple):
     boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is moved back into the brick
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
     local: np.ndarray  # (3 slots,) positions relative to the origins, Å
-    square: np.ndarray  # (3 slots,) squared distances from the origins when sorted, Å²; later scratch for others
+    half_square: np.ndarray  # (3 slots,) half the squared distances from the origins when sorted, Å²; later scratch
     reference: np.ndarray  # (3 slots,) `local` when last sorted
     moved: np.ndarray  # (slots,) displacement of each site since then, Å
     farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
@@ -50,7 +50,7 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
         boxes=np.zeros((sites, 3), np.int32),
         origin=zeros(4 * count, np.float64),
         local=zeros(3 * slots, dtype),
-        square=zeros(3 * slots, dtype),
+        half_square=zeros(3 * slots, dtype),
         reference=zeros(3 * slots, dtype),
         moved=zeros(slots, dtype),
         extent=np.zeros((blocks, 6)),
@@ -217,13 +217,13 @@ def settle_block(clusters, cell, sites, state, group, block):
                 clusters.slot[i] = slot
             clusters.group[slot] = group[i]
             clusters.moved[slot] = 0.0
-            clusters.square[slot] = 0.0
+            clusters.half_square[slot] = 0.0
             at = _in_brick(clusters.boxes, cell, i, place(sites, state, sites.molecule[i], i))
             for k in range(3):
                 n = slot + 2 * width * c + k * width
                 clusters.local[n] = at[k] - origin[4 * c + k]
                 reference[n] = clusters.local[n]
-                clusters.square[slot] += clusters.local[n] ** 2
+                clusters.half_square[slot] += 0.5 * clusters.local[n] ** 2
 
 
 @kernel(inline=True)
@@ -252,10 +252,10 @@ def settle_again(clusters):
     width = width_of(clusters.local)
     for slot in range(len(clusters.order)):
         clusters.moved[slot] = 0.0
-        clusters.square[slot] = 0.0
+        clusters.half_square[slot] = 0.0
         for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
             clusters.local[n] = clusters.reference[n]
-            clusters.square[slot] += clusters.local[n] ** 2
+            clusters.half_square[slot] += 0.5 * clusters.local[n] ** 2
     clusters.farthest[:] = 0.0
 
 

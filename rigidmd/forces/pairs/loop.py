@@ -15,6 +15,7 @@ from rigidmd.compile.lanes import (
     align_stack,
     double,
     fill,
+    item,
     lane,
     lane_count,
     load,
@@ -73,7 +74,7 @@ class PairForces(NamedTuple):
         pairs = empty_list(setup.cell, self.group, reach, law.cutoff, setup.skin, setup.dtype)
         blocks, slots = len(pairs.needed), len(pairs.clusters.order)
         sums = Sums(
-            own=pairs.clusters.square,  # no list is built while forces are summed
+            own=pairs.clusters.half_square,  # no list is built while forces are summed
             others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
             tallies=np.zeros((blocks, TALLY_SIZE)),
         )
@@ -146,8 +147,12 @@ def pair_forces(law: NamedTuple, sites: BodySites | CentralSites, group: np.ndar
 
 
 def _diameter(sites: BodySites | CentralSites) -> float:
-    """An upper bound on the distance between sites of a molecule, Å."""
-    return 2 * float(np.linalg.norm(sites.offsets(), axis=1).max()) if isinstance(sites, BodySites) else 0.0
+    """An upper bound on the distance between sites of a molecule, Å: the longest diagonal of boxes around them."""
+    if not isinstance(sites, BodySites) or not len(sites.molecule):
+        return 0.0
+    starts, offsets = np.unique(sites.kind[np.diff(sites.first) > 0]), sites.offset_body
+    extents = np.maximum.reduceat(offsets, starts) - np.minimum.reduceat(offsets, starts)
+    return float(np.linalg.norm(extents, axis=1).max())
 
 
 def pair(law, i, j, r2):
@@ -261,11 +266,12 @@ def block_forces(law, pairs, own, others, tallies, block):
         tallies[block] = 0.0
     entries = pairs.entries[block]
     masked = pairs.masked[block]
-    met, apart = pairs.met[block], pairs.apart[block]
+    first = clusters.bounds[block]
     zero = fill(0.0, clusters.local)
     moved = farthest(pairs)
     first_met = first_entry = first_special = 0
-    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+    for c in range(first, clusters.bounds[block + 1]):
+        met, apart = pairs.met[block, first_met:], pairs.apart[block, 3 * first_met :]
         for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
             here = (
@@ -275,27 +281,25 @@ def block_forces(law, pairs, own, others, tallies, block):
             still = (zero, zero, zero)
             sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
             for n in range(first_special, pairs.special[i // 2]):
-                entry = first_met + masked[n, 0]
-                other, between = _displacements(pairs, c, here, met, apart, entry)
+                other, between = _displacements(pairs, c, here, met, apart, masked[n, 0])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
-                sums = _meet(law, pairs, block, i, other, between, masks, others, sums, tallies)
+                sums = _meet(law, pairs, first, i, other, between, masks, others, sums, tallies)
             # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
             # processor's queues before those of the next entry could enter.
             last = end_of_row(pairs, i // 2, moved) - 1
             other = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
             if first_entry <= last:
-                other, between = _displacements(pairs, c, here, met, apart, first_met + entries[first_entry])
+                other, between = _displacements(pairs, c, here, met, apart, item(entries, first_entry))
             for n in range(first_entry, last + 1):
-                entry = first_met + entries[min(n + 1, last)]
-                ahead, after = _displacements(pairs, c, here, met, apart, entry)
-                sums = _meet(law, pairs, block, i, other, between, (None, None), others, sums, tallies)
+                ahead, after = _displacements(pairs, c, here, met, apart, item(entries, min(n + 1, last)))
+                sums = _meet(law, pairs, first, i, other, between, (None, None), others, sums, tallies)
                 other, between = ahead, after
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
-            first, second, totals = sums
+            on_one, on_two, totals = sums
             for k in range(3):
-                own[at + k * width] = total(first[k])
-                own[at + k * width + 1] = total(second[k])
+                own[at + k * width] = total(on_one[k])
+                own[at + k * width + 1] = total(on_two[k])
             if tallies is not None:
                 for k, of in enumerate((0, 1, 2, 3, 2, 4, 5, 3, 5, 6)):
                     tallies[block, k] += total(totals[of])
@@ -307,7 +311,7 @@ def _displacements(pairs, c, here, met, apart, entry):
     """The cluster met, and displacements from its sites, as vectors, to each of two sites of c; see `_separation`."""
     local = pairs.clusters.local
     width = width_of(local)
-    other = cluster_of(met[entry])
+    other = cluster_of(item(met, entry))
     at = 3 * width * other
     dx, dy, dz = origins_apart(pairs, c, met, apart, entry)
     x = load(local, at) - dx
@@ -334,7 +338,7 @@ def _origins_apart(pairs, c, met, apart, entry):
         return looked_up
 
     def computed(pairs, c, met, apart, entry):
-        origin, image = pairs.clusters.origin, met[entry]
+        origin, image = pairs.clusters.origin, item(met, entry)
         there = load_four(pairs.shift, 4 * number_of(image)) + load_four(origin, 4 * cluster_of(image))
         vector = load_four(origin, 4 * c) - there
         return lane(vector, 0), lane(vector, 1), lane(vector, 2)
@@ -350,22 +354,23 @@ def _separation(here, x, y, z):
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _meet(law, pairs, block, i, other, between, masks, others, sums, tallies):
-    """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too."""
+def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
+    """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too.
+
+    first : the first cluster of the block
+    """
     width = width_of(pairs.clusters.local)
-    first, second, totals = sums
+    on_one, on_two, totals = sums
     gx, gy, gz, totals = _act(law, i, width * other, between[0], masks[0], totals, tallies)
     hx, hy, hz, totals = _act(law, i + 1, width * other, between[1], masks[1], totals, tallies)
-    ahead = other - pairs.clusters.bounds[block]
-    if ahead < 0:
-        ahead += len(pairs.clusters.origin) // 4
-    at = 3 * width * ahead
+    turn = len(pairs.clusters.origin) // 4 if other < first else 0
+    at = 3 * width * (other - first + turn)
     store(others, at, load(others, at) - (gx + hx))
     store(others, at + width, load(others, at + width) - (gy + hy))
     store(others, at + 2 * width, load(others, at + 2 * width) - (gz + hz))
     return (
-        (first[0] + gx, first[1] + gy, first[2] + gz),
-        (second[0] + hx, second[1] + hy, second[2] + hz),
+        (on_one[0] + gx, on_one[1] + gy, on_one[2] + gz),
+        (on_two[0] + hx, on_two[1] + hy, on_two[2] + hz),
         totals,
     )
 

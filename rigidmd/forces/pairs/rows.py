@@ -1,6 +1,6 @@
 """The rows of a neighbour list: which clusters go into which row and shell, and which of them need a mask."""
 
-from math import ceil, inf
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -9,14 +9,17 @@ from rigidmd.compile import PAIR_FLAGS, kernel
 from rigidmd.compile.lanes import (
     bits,
     fill,
+    item,
     larger,
     load,
     load_beside,
     root,
+    rounded_up,
+    select,
     smaller,
     smaller_of_two,
     spread,
-    store,
+    store_alternate,
     width_of,
 )  # fmt: skip
 from rigidmd.forces.pairs.lists import (
@@ -36,6 +39,10 @@ from rigidmd.forces.pairs.lists import (
 )  # fmt: skip
 from rigidmd.forces.pairs.tree import within_reach
 
+SPECIAL = SHELLS  # where a candidate that needs a mask counts, after the shells
+BEYOND = SHELLS + 1  # where one counts that a row does not meet
+KINDS = SHELLS + 2
+
 
 class Scratch(NamedTuple):
     """Scratch arrays for the rows of one cluster."""
@@ -44,29 +51,25 @@ class Scratch(NamedTuple):
     low: np.ndarray  # (3,) box of the cluster, moved by an image
     high: np.ndarray  # (3,)
     candidate: np.ndarray  # (room,) images of clusters that may be met, at last those that are
-    shell: np.ndarray  # (room * lanes,) shell, not rounded, of entry n in the row of site i, at n * lanes + i
-    end: np.ndarray  # (SHELLS,) end of each shell of a row
-    inner: np.ndarray  # (rows of a cluster, room) entries of the first shell
-    outer: np.ndarray  # (rows of a cluster, room) entries of the other shells
-    special: np.ndarray  # (rows of a cluster, room) entries that need a mask
-    count: np.ndarray  # (3, rows of a cluster) number in inner, outer, special of each row
+    close: np.ndarray  # (room,) those of them that may need a mask
+    kind: np.ndarray  # (room * rows,) uint8 shell of entry n in row k of the cluster, at n * rows + k
+    place: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind; then where the next of them goes
+    sorted: np.ndarray  # (rows of a cluster, room) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
 
 @kernel
 def _scratch(pairs, room):
-    width = width_of(pairs.clusters.local)
+    rows = width_of(pairs.clusters.local) // 2
     return Scratch(
         np.empty((len(pairs.tree.level), 2), np.int64),
         np.empty(3),
         np.empty(3),
         np.empty(room, np.int64),
-        np.empty(room * width, pairs.clusters.local.dtype),
-        np.empty(SHELLS, np.int64),
-        np.empty((width // 2, room), np.int32),
-        np.empty((width // 2, room), np.int32),
-        np.empty((width // 2, room), np.int32),
-        np.empty((3, width // 2), np.int64),
+        np.empty(room, np.int64),
+        np.empty(rows * (room + 1), np.uint8),  # one more, since what no row has is written too
+        np.empty((rows, KINDS), np.uint32),  # unsigned: no index is checked for being negative
+        np.empty((rows, room), np.uint16),
         np.zeros(5, np.int64),
     )
 
@@ -131,19 +134,16 @@ def _fill_rows(pairs, block, c, scratch, candidates):
     rows = width // 2
     masked, filled = pairs.masked[block], scratch.filled
     radius2 = ((pairs.cutoff + pairs.skin) * (1 + ROUNDING)) ** 2
-    scratch.count[:] = 0
-    met = 0
-    for n in range(candidates):
-        if _measure(pairs, c, scratch, scratch.candidate[n], met):
-            scratch.candidate[met] = scratch.candidate[n]
-            met += 1
+    met = _find_kinds(pairs, c, scratch, candidates)
     _meet(pairs, block, c, scratch, met)
+    _sort_by_kind(pairs, c, scratch, met)
     for own in range(rows):
         r = rows * c + own
-        _fill_row(pairs.beyond[r], pairs.entries[block], scratch, own, width)
+        here = scratch.sorted[own]
+        _write_row(pairs.entries[block], here, scratch.place[own, SHELLS - 1], filled)
         pairs.row[r] = min(filled[ENTRIES], pairs.entries.shape[1])
-        for n in range(scratch.count[2, own]):
-            entry = scratch.special[own, n]
+        for n in range(scratch.place[own, SHELLS - 1], scratch.place[own, SPECIAL]):
+            entry = np.int64(here[n])
             first_of_row = _mask_of_lanes(pairs, 2 * r, scratch.candidate[entry], radius2)
             second = _mask_of_lanes(pairs, 2 * r + 1, scratch.candidate[entry], radius2)
             if first_of_row | second:
@@ -177,93 +177,129 @@ def _meet(pairs, block, c, scratch, met):
 
 
 @kernel(inline=True)
-def _fill_row(beyond, entries, scratch, own, width):
-    """Write the entries of a row, shell by shell.
+def _sort_by_kind(pairs, c, scratch, met):
+    """Write the entries of each row of a cluster by their kinds; `place` then has the end of each kind.
+
+    The rows go together: an entry waits for the one before it in its row, and meanwhile the other rows have theirs.
+    """
+    rows = width_of(pairs.clusters.local) // 2
+    place, kind = scratch.place, scratch.kind
+    place[:] = 0
+    for n in range(met):
+        for own in range(rows):
+            place[own, item(kind, n * rows + own)] += 1
+    for own in range(rows):
+        _begin_kinds(pairs.beyond[rows * c + own], place[own])
+    for n in range(met):
+        for own in range(rows):
+            k = item(kind, n * rows + own)
+            scratch.sorted[own, place[own, k]] = n
+            place[own, k] += 1
+
+
+@kernel(inline=True)
+def _begin_kinds(beyond, place):
+    """Where the entries of each kind begin in a row, from their numbers, and how many are beyond each shell.
 
     `beyond` is limited by its type: entries above that limit count as if they were inside the shell.
     """
-    inner, outer, end = scratch.inner[own], scratch.outer[own], scratch.end
-    inners, outers = scratch.count[0, own], scratch.count[1, own]
-    filled = scratch.filled[ENTRIES]
+    inside = 0
     for k in range(SHELLS):
-        end[k] = 0
-    for n in range(outers):
-        end[ceil(scratch.shell[width * outer[n] + 2 * own])] += 1
-    last = filled + inners
-    beyond[0] = min(outers, MOST_BEYOND)
-    for k in range(1, SHELLS):
-        size = end[k]
-        end[k] = last
-        last += size
-        beyond[k] = min(filled + inners + outers - last, MOST_BEYOND)
-    if last <= len(entries):
-        for n in range(inners):
-            entries[filled + n] = inner[n]
-        for n in range(outers):
-            k = ceil(scratch.shell[width * outer[n] + 2 * own])
-            entries[end[k]] = outer[n]
-            end[k] += 1
-    scratch.filled[ENTRIES] = last
+        inside += place[k]
+    begin = 0
+    for k in range(KINDS):
+        size = place[k]
+        place[k] = begin
+        begin += size
+        if k < SHELLS:
+            beyond[k] = min(inside - begin, MOST_BEYOND)
+
+
+@kernel(inline=True)
+def _write_row(entries, found, count, filled):
+    """Append the first `count` found to the entries, if there is room."""
+    first = filled[ENTRIES]
+    filled[ENTRIES] += count
+    if filled[ENTRIES] <= len(entries):
+        for n in range(count):
+            entries[first + n] = found[n]
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
-def _measure(pairs, c, scratch, candidate, n):
-    """Add a candidate, as entry n, to a shell of each row of a cluster, or to the entries that need a mask.
+def _find_kinds(pairs, c, scratch, candidates):
+    """Reduce the candidates to those that a row of the cluster has, and find their kinds; returns their number.
 
-    Returns whether a row has it.
+    There are no unpredictable branches: the processor works on several candidates at a time.
+    """
+    rows = width_of(pairs.clusters.local) // 2
+    candidate, close = scratch.candidate, scratch.close
+    last = len(pairs.clusters.origin) // 4 - 1  # the cluster that may have slots without a site
+    met = closes = 0
+    for n in range(candidates):
+        image = candidate[n]
+        other = cluster_of(image)
+        has_row, is_close = _measure(pairs, c, scratch.kind, image, rows * met)
+        candidate[met] = image
+        close[closes] = met
+        met += has_row
+        closes += is_close | (other == c) | (other == last) | (c == last)
+    for n in range(closes):
+        if close[n] < met:
+            _set_aside(pairs, c, scratch.kind, candidate[close[n]], rows * close[n])
+    return met
 
-    The sites of the cluster are the lanes, and the loop runs over the candidate's sites: there are no sums across lanes
-    and no unpredictable branches.
+
+@kernel(fastmath=PAIR_FLAGS, inline=True)
+def _measure(pairs, c, kind, candidate, at):
+    """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry needed a mask.
+
+    Returns whether a row has it, and whether some sites are as near as those of one group can be.
+
+    The sites of the cluster are the lanes, and the loop runs over the candidate's sites: there are no sums across
+    lanes.
     """
     clusters = pairs.clusters
     local = clusters.local
     width = width_of(local)
-    count = len(clusters.origin) // 4
     other, image = cluster_of(candidate), number_of(candidate)
-    at = 3 * width * c
-    x = load(local, at) + _apart(pairs, c, other, image, 0)
-    y = load(local, at + width) + _apart(pairs, c, other, image, 1)
-    z = load(local, at + 2 * width) + _apart(pairs, c, other, image, 2)
-    # |x|² - 2 x y + |y|²: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|², is subtracted.
-    x2 = x * x + y * y + z * z
-    x, y, z = -2.0 * x, -2.0 * y, -2.0 * z
-    nearest2 = fill(inf, local)
+    begin = 3 * width * c
+    x = load(local, begin) + _apart(pairs, c, other, image, 0)
+    y = load(local, begin + width) + _apart(pairs, c, other, image, 1)
+    z = load(local, begin + 2 * width) + _apart(pairs, c, other, image, 2)
+    # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|²,
+    # is subtracted.
+    nearest = fill(inf, local)
     for lane in range(width):
-        at = 3 * width * other + lane
-        product = spread(clusters.square, width * other + lane) + z * spread(local, at + 2 * width)
-        nearest2 = smaller(nearest2, product + y * spread(local, at + width) + x * spread(local, at))
-    nearest2 = nearest2 + x2 * (1 - 0.1 * ROUNDING)
+        there = 3 * width * other + lane
+        rest = spread(clusters.half_square, width * other + lane) - z * spread(local, there + 2 * width)
+        nearest = smaller(nearest, rest - y * spread(local, there + width) - x * spread(local, there))
+    nearest2 = 2.0 * nearest + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
+    distance = root(larger(smaller_of_two(nearest2), 0.0)) * (1 - ROUNDING)
+    shell = fill(0.0, local)
+    if pairs.cutoff < inf:
+        shell = (distance - pairs.cutoff) * pairs.shells_per_A
+    within = shell <= SHELLS - 1
+    store_alternate(kind, at, select(within, rounded_up(larger(shell, 0.0)), float(BEYOND)))
+    return bits(within) != 0, bits(nearest2 <= pairs.reach2) != 0
+
+
+@kernel(inline=True)
+def _set_aside(pairs, c, kind, candidate, at):
+    """Set the kind of a candidate to SPECIAL in the rows for which it needs a mask."""
+    clusters = pairs.clusters
+    width = width_of(clusters.local)
+    other, last = cluster_of(candidate), len(clusters.origin) // 4 - 1
     everyone = (1 << width) - 1
-    special = 0
-    if other == c or c == count - 1 or other == count - 1:
-        special = everyone
-    elif bits(nearest2 <= pairs.reach2) != 0:
-        group = load_beside(clusters.group, width * c, local)
+    special = everyone
+    if other != c and c != last and other != last:
+        group = load_beside(clusters.group, width * c, clusters.local)
         mates = group < group
         for lane in range(width):
             mates = mates | (group == clusters.group[width * other + lane])
         special = bits(mates)
-        special = 3 * ((special | special >> 1) & everyone // 3)  # both sites of the row
-    nearest = root(larger(smaller_of_two(nearest2), 0.0)) * (1 - ROUNDING)
-    shell = fill(0.0, local)
-    if pairs.cutoff < inf:
-        shell = (nearest - pairs.cutoff) * pairs.shells_per_A
-    store(scratch.shell, width * n, shell)
-    inner = bits(shell <= 0.0) & ~special
-    outer = bits(shell <= SHELLS - 1) & ~inner & ~special
-    _append(scratch.inner, scratch.count, 0, n, inner, width)
-    _append(scratch.outer, scratch.count, 1, n, outer, width)
-    if special != 0:
-        _append(scratch.special, scratch.count, 2, n, special, width)
-    return inner | outer | special != 0
-
-
-@kernel(inline=True)
-def _append(rows, count, k, value, which, width):
-    """Append a value to the lists of some rows of a cluster, without branches: half of them would be mispredicted."""
     for own in range(width // 2):
-        rows[own, count[k, own]] = value
-        count[k, own] += which >> 2 * own & 1
+        if special >> 2 * own & 3:
+            kind[at + own] = SPECIAL
 
 
 @kernel(fastmath=PAIR_FLAGS, inline=True)
