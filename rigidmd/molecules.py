@@ -325,6 +325,15 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
     return tuple(filled)
 
 
+def of_each(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
+    """values[k] (own, ...) of each molecule of species k, one molecule after the other; species (n,)."""
+    counts = np.array([len(own) for own in values])
+    begin, own = np.cumsum(counts) - counts, counts[species]
+    rows = np.repeat(begin[species] - np.cumsum(own) + own, own)
+    rows += np.arange(len(rows))
+    return np.concatenate(values)[rows]
+
+
 def named_sites(species: list[Molecule], name: str) -> list[np.ndarray]:
     """Which sites of each species a name means: those of this name, or else of this element; SPECIES.NAME of one."""
     owner, _, own = name.rpartition(".")

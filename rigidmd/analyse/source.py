@@ -43,7 +43,7 @@ def of_folder(
     path = record.folder / output.trajectory
     if not path.is_file():
         raise OutputError(f"{record.folder}: its trajectory {output.trajectory} is not there")
-    sites = len(system.sites.molecule)
+    sites = system.site_count
     most = max(2, MOST_NUMBERS // (3 * sites + 18 * len(system.model.species)))
     frames = read_frames(path, sites, most)
     tensor = read_tensor(record.folder / TENSOR_FILE)

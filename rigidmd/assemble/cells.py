@@ -124,11 +124,14 @@ def pairs_within(
         inside -= np.floor(inside)
         margin = radius * np.linalg.norm(inverse, axis=0)  # in fractional coordinates
         shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
-        owners, images = [], []
+        faces = np.flatnonzero(((inside <= margin) | (inside >= 1 - margin)).any(axis=1))
+        owners, images = [owner], [inside]
         for shift in shifts:
-            image = inside + shift
-            owners.append(np.flatnonzero(((image >= -margin) & (image <= 1 + margin)).all(axis=1)))
-            images.append(image[owners[-1]])
+            if any(shift):
+                image = inside[faces] + shift
+                near = ((image >= -margin) & (image <= 1 + margin)).all(axis=1)
+                owners.append(faces[near])
+                images.append(image[near])
         owner, points = np.concatenate(owners), np.concatenate(images) @ cell
     i, j = KDTree(points).query_pairs(radius, output_type="ndarray").T
     return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)

@@ -83,7 +83,7 @@ def _body(system: BodySystem) -> str:
 def _molecules(system: System) -> str:
     """Species, degrees of freedom, terms, stages, memory."""
     scene, freedom = system.scene, system.freedom
-    lines = [f"{scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites"]
+    lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
         freely = "frozen" if system.model.inverse_mass[k] == 0 else f"{m.degrees_of_freedom} degrees of freedom each"

@@ -23,7 +23,7 @@ from rigidmd.forces.waves.errors import (
     wave_error,
     wave_radius_for,
 )
-from rigidmd.molecules import Molecule
+from rigidmd.molecules import Molecule, of_each
 from rigidmd.scene import MolecularScene
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 from rigidmd.validation import settled
@@ -50,7 +50,7 @@ class Charged(NamedTuple):
     @property
     def charge_e(self) -> np.ndarray:
         """Charges (s,) in e."""
-        return np.concatenate([self.species[k].charges[self.chosen[k]] for k in self.species_index])
+        return of_each([m.charges[c] for m, c in zip(self.species, self.chosen, strict=True)], self.species_index)
 
     @property
     def summed(self) -> Charges:

@@ -1,5 +1,6 @@
 """Overlaps: sites of different molecules that are too close."""
 
+from collections.abc import Callable, Iterator
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ import numpy as np
 from rigidmd.assemble.cells import pairs_within
 from rigidmd.assemble.momenta import mobile
 from rigidmd.core.state import State
+from rigidmd.molecules import Molecule, of_each
 
 if TYPE_CHECKING:
     from rigidmd.assemble.system import System
@@ -22,27 +24,68 @@ INSIDE = 0.2
 def overlaps(system: "System") -> list[str]:
     """Faults: overlapping molecules, at most five of them named."""
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
-    sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
+    cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
+    widest = max((sigma.max() for sigma in cores), default=0.0)
+    wanted = (inside, every_site), (OVERLAP * widest, _repelling)
+    near = {(i, j): apart for i, j, apart in close_pairs(system, system.state, *wanted)}
+    sigma = of_each(cores, system.model.species) if near else np.zeros(0)
     faults = []
-    for i, j, distance in close_pairs(system, system.state, max(OVERLAP * sigma.max(), inside)):
-        a, b = system.sites.molecule[[i, j]]
+    for i, j in sorted(near):
         both = sigma[i] > 0 and sigma[j] > 0
-        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
+        if near[i, j] <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
+            a, b = system.sites.molecule[[i, j]]
             faults.append(
                 f"molecules {a + 1} and {b + 1} overlap: {system.sites.name[i]} and {system.sites.name[j]} "
-                f"are {distance:.3f} Å apart"
+                f"are {near[i, j]:.3f} Å apart"
             )
     return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
 
 
-def close_pairs(system: "System", state: State, radius: float) -> list[tuple[int, int, float]]:
-    """Sites (i, j) of different molecules, not both frozen, within `radius` of each other, and their distances, Å."""
-    cell = state.cell if state.volume < inf else None
-    i, j, distance = pairs_within(system.site_positions(state), cell, radius)
-    a, b, free = system.sites.molecule[i], system.sites.molecule[j], mobile(system.model)
-    kept = (a != b) & (free[a] | free[b])
-    near = {}
-    for one, other, apart in zip(i[kept].tolist(), j[kept].tolist(), distance[kept].tolist(), strict=True):
-        pair = min(one, other), max(one, other)
-        near[pair] = min(apart, near.get(pair, inf))
+def every_site(molecule: Molecule) -> np.ndarray:
+    """The sites of a molecule, as indices."""
+    return np.arange(len(molecule.masses))
+
+
+def _repelling(molecule: Molecule) -> np.ndarray:
+    return np.flatnonzero(molecule.epsilon > 0)
+
+
+def close_pairs(
+    system: "System", state: State, *wanted: tuple[float, Callable[[Molecule], np.ndarray]]
+) -> list[tuple[int, int, float]]:
+    """Sites (i, j) of different molecules, not both frozen, that are close to each other, and their distances, Å.
+
+    wanted : radii, and the sites of a molecule (indices) of which those within a radius are close
+    """
+    species, reach = system.species, 0.0
+    for radius, sites_of in wanted:
+        arm = max(np.linalg.norm(m.positions_body[sites_of(m)], axis=1).max(initial=0.0) for m in species)
+        reach = max(reach, radius + 2 * arm if arm <= system.smallest_diameter else inf)
+    crowded = np.arange(len(state.position))
+    if reach < inf:  # then few centres are as near as that; all sites would take five times as long
+        crowded = np.unique(np.concatenate(pairs_within(state.position, _cell(state), reach)[:2]))
+    near: dict[tuple[int, int], float] = {}
+    for radius, sites_of in wanted if len(crowded) else ():
+        for i, j, apart in _close_among(system, state, crowded, radius, [sites_of(m) for m in species]):
+            pair = min(i, j), max(i, j)
+            near[pair] = min(apart, near.get(pair, inf))
     return [(*pair, near[pair]) for pair in sorted(near)]
+
+
+def _close_among(
+    system: "System", state: State, molecules: np.ndarray, radius: float, chosen: list[np.ndarray]
+) -> Iterator[tuple[int, int, float]]:
+    """The pairs of `close_pairs` among some molecules, of the sites chosen[k] (indices) of species k."""
+    index = system.model.species
+    kinds, counts = index[molecules], np.array([len(m.masses) for m in system.species])[index]
+    owner = np.repeat(molecules, np.array([len(own) for own in chosen])[kinds])
+    site = (np.cumsum(counts) - counts)[owner] + of_each(chosen, kinds)
+    offset = of_each([m.positions_body[own] for m, own in zip(system.species, chosen, strict=True)], kinds)
+    i, j, distance = pairs_within(system.positions_of(state, owner, offset), _cell(state), radius)
+    a, b, free = owner[i], owner[j], mobile(system.model)
+    kept = (a != b) & (free[a] | free[b])
+    return zip(site[i[kept]].tolist(), site[j[kept]].tolist(), distance[kept].tolist(), strict=True)
+
+
+def _cell(state: State) -> np.ndarray | None:
+    return state.cell if state.volume < inf else None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.memory import free_memory, in_words, memory_fault
+from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene
 from rigidmd.validation import settled
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Bytes that a system takes while it is built; measured: 310 of argon, 500 of nitrogen, 640 of SPC/E, 690 of TIP4P.
 FOR_MOLECULE, FOR_SITE = 200, 130
+#: Of a site in `System.sites`, which trajectories need.
+OF_COLUMNS = 56
 #: Of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85 kB.
 FOR_SAMPLE = 2700
 FEWER = "take fewer molecules, a smaller box or a shorter cut-off"
@@ -54,10 +57,12 @@ def check_room(system: "System") -> None:
 
 
 def bytes_of(system: "System") -> int:
-    """Bytes of the arrays of a run. The state counts four times: the start, the one that moves, the last good one,
-    forces and torques."""
-    fixed = (system.engine().room(system.state), system.model, system.sites)
-    return 4 * array_bytes(system.state) + array_bytes(fixed)
+    """Bytes of the arrays of a run. There are three states, the start, the one that moves and the last good one, and
+    two loads, of steps and of looks."""
+    state = system.state
+    columns = OF_COLUMNS * system.site_count if system.scene.output.trajectory else 0
+    fixed = (system.engine().room(state), system.model)
+    return 3 * array_bytes(state) + 2 * array_bytes(no_load(state)) + array_bytes(fixed) + columns
 
 
 def array_bytes(value: tuple) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import inf
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.laws.lennard_jones import Tail, sum_of
 from rigidmd.forces.pairs.space import Space, space_of, wrap
 from rigidmd.mechanics.rotor import NoRotor, split_rotor
-from rigidmd.molecules import Molecule
+from rigidmd.molecules import Molecule, of_each
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.own import not_given
 from rigidmd.units import GRAM_PER_CM3
@@ -55,7 +56,6 @@ class System:
     constants: dict[str, float]  # constant energies, u Å²/ps²
     constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
     tail: Tail | None  # the tail correction, where the scene asks for it
-    sites: Sites
     residue_number: np.ndarray  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
     from_lattice: bool
     left_out: list[str]
@@ -64,6 +64,28 @@ class System:
     told: dict[str, Callable] = field(default_factory=dict)  # what Python computes: name of a term -> what is asked
     thermostat: Any = None  # of the user's own, in place of that of every stage
     own: dict[str, str] = field(default_factory=dict)  # terms of the user's own by name, in words
+
+    @cached_property
+    def sites(self) -> Sites:
+        """Every site, made when it is first asked for: a run needs them only to write a trajectory."""
+        owner = np.repeat(np.arange(len(self.model.species)), self._own_sites)
+        return Sites(
+            owner,
+            self.of_sites(lambda m: m.positions_body),
+            self.of_sites(lambda m: np.array(m.site_names, dtype=object)),
+            self.of_sites(lambda m: np.array(m.elements, dtype=object)),
+            self.of_sites(lambda m: m.masses),
+        )
+
+    @property
+    def site_count(self) -> int:
+        """The number of sites."""
+        return int(self._own_sites.sum())
+
+    @property
+    def _own_sites(self) -> np.ndarray:
+        """The number of sites of each molecule (n,)."""
+        return np.array([len(m.masses) for m in self.species])[self.model.species]
 
     @property
     def density(self) -> float:
@@ -131,12 +153,16 @@ class System:
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values for all sites (s,), from `of`, which gives those of one molecule."""
-        values = [of(m) for m in self.species]
-        return np.concatenate([values[k] for k in self.model.species])
+        return of_each([of(m) for m in self.species], self.model.species)
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
-        return self.centres(state, wrapped)[self.sites.molecule] + self._arms(state)
+        owner = self.sites.molecule
+        return self.centres(state, wrapped)[owner] + _arms(state, owner, self.sites.offset_body)
+
+    def positions_of(self, state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
+        """Positions (k, 3) of points fixed in molecules (k,) at offsets (k, 3), lab frame, Å, not wrapped."""
+        return state.position[molecule] + _arms(state, molecule, offset_body)
 
     def centres(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Centres of mass (n, 3), lab frame, Å; wrapped: inside the box."""
@@ -149,12 +175,14 @@ class System:
             return velocity
         omega = state.angular_momentum_body * self.model.inverse_inertia[self.model.species]
         lab = np.einsum("nij,nj->ni", state.rotation, omega)
-        return velocity + np.cross(lab[self.sites.molecule], self._arms(state))
+        return velocity + np.cross(lab[self.sites.molecule], _arms(state, self.sites.molecule, self.sites.offset_body))
 
-    def _arms(self, state: State) -> np.ndarray:
-        if len(state.rotation) == 0:
-            return np.zeros_like(self.sites.offset_body)
-        return np.einsum("sij,sj->si", state.rotation[self.sites.molecule], self.sites.offset_body)
+
+def _arms(state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
+    """Vectors (k, 3) from the centres of molecules (k,) to points at offsets (k, 3) in the body frame, lab frame, Å."""
+    if len(state.rotation) == 0:
+        return np.zeros_like(offset_body)
+    return np.einsum("sij,sj->si", state.rotation[molecule], offset_body)
 
 
 def build(scene: MolecularScene, bare: bool = False) -> System:
@@ -194,7 +222,6 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
         constants=acting.constants,
         constant_pressure=acting.pressure,
         tail=acting.tail,
-        sites=_sites(species, index),
         residue_number=number,
         from_lattice=scene.structure is None,
         left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
@@ -270,19 +297,4 @@ def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Mo
         inertia,
         rotor.inverse_inertia,
         rotor if inertia.any() else NoRotor(),
-    )
-
-
-def _sites(species: list[Molecule], index: np.ndarray) -> Sites:
-    counts = np.array([len(m.masses) for m in species])[index]
-
-    def each(values) -> np.ndarray:
-        return np.concatenate([values[k] for k in index])
-
-    return Sites(
-        np.repeat(np.arange(len(index)), counts),
-        each([m.positions_body for m in species]),
-        each([np.array(m.site_names, dtype=object) for m in species]),
-        each([np.array(m.elements, dtype=object) for m in species]),
-        each([m.masses for m in species]),
     )

@@ -14,7 +14,7 @@ from rigidmd.forces.pairs.loop import pair_forces
 from rigidmd.forces.pairs.sites import groups, sites_of
 from rigidmd.forces.pairs.space import Space
 from rigidmd.mechanics.rotor import NoRotor
-from rigidmd.molecules import Molecule, named_sites
+from rigidmd.molecules import Molecule, named_sites, of_each
 from rigidmd.scene import MolecularScene
 from rigidmd.units import KJ_PER_MOL
 
@@ -104,7 +104,7 @@ def _lennard_jones(
     ]
     kinds = sorted({pair for of_species in pairs for pair in of_species})
     of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
-    kind = np.concatenate([of_species[k] for k in index])
+    kind = of_each(of_species, index)
     sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
     special = {
         (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)

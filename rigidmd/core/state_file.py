@@ -73,7 +73,7 @@ def read_state(path: Path) -> Saved:
     if bad := _damaged(arrays, names):
         raise StructureError(str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"])
     kinds = (getattr(example, key).dtype for key in State._fields)
-    state = State(*(np.array(arrays[key], kind) for key, kind in zip(State._fields, kinds, strict=True)))
+    state = State(*(np.asarray(arrays[key], kind, order="C") for key, kind in zip(State._fields, kinds, strict=True)))
     return Saved(state, names, species, arrays.get("residue_number"), arrays.get("models"))
 
 
@@ -92,7 +92,7 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     if "cell" not in bad and not _is_cell(arrays["cell"]):
         bad.add("cell")
     bad |= {key for key in ("species", "residue_number") if key in arrays and arrays[key].dtype.kind != "i"}
-    if "species" not in bad and not np.isin(arrays["species"], np.arange(len(names))).all():
+    if "species" not in bad and not ((arrays["species"] >= 0) & (arrays["species"] < len(names))).all():
         bad.add("species")
     if "rotation" not in bad and m:
         gap = np.swapaxes(arrays["rotation"], 1, 2) @ arrays["rotation"] - np.eye(3)

@@ -114,7 +114,7 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     engine = system.engine_of(charged, system.scene.precision)
     _, tallies = engine.evaluate(state)
-    real, force = _real_part(system), np.zeros((len(system.sites.molecule), 3))
+    real, force = _real_part(system), np.zeros((system.site_count, 3))
     for workspace in engine.workspaces.values():
         if isinstance(workspace, (PairWorkspace, EwaldWorkspace, PmeWorkspace)):
             force = force + workspace.site_force

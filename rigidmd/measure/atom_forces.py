@@ -76,7 +76,7 @@ def of_sites(system: System, engine: Engine, state: State, load: Load, atoms: np
 
     engine : has just evaluated `load` at the state. What acts on whole molecules, such as gravity, is `shared`.
     """
-    force = np.zeros((len(system.sites.molecule), 3))
+    force = np.zeros((system.site_count, 3))
     arm = _arms(system, state)
     for name, workspace in engine.workspaces.items():
         sites = getattr(workspace, "sites", None)

@@ -70,7 +70,7 @@ def summarise(
         "interrupted": interrupted,
         "molecules": len(system.model.species),
         "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),
-        "sites": len(system.sites.molecule),
+        "sites": system.site_count,
         "degrees_of_freedom": system.freedom.total,
         "degrees_of_freedom_translation": system.freedom.translation,
         "degrees_of_freedom_rotation": system.freedom.rotation,

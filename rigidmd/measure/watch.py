@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.body import BodySystem
-from rigidmd.assemble.overlaps import OVERLAP, close_pairs
+from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
@@ -241,7 +241,7 @@ def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | N
     charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
     found = []
     reach = max(OVERLAP * sigma.max(), near.max() * system.smallest_diameter)
-    for i, j, distance in close_pairs(system, state, reach):
+    for i, j, distance in close_pairs(system, state, (reach, every_site)):
         repel = sigma[i] > 0 and sigma[j] > 0
         size = (sigma[i] + sigma[j]) / 2 if repel else system.smallest_diameter
         bare = not repel and charge[i] * charge[j] < 0

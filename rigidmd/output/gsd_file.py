@@ -20,6 +20,7 @@ from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
 from rigidmd.mechanics.rotation import to_quaternion
+from rigidmd.molecules import of_each
 from rigidmd.output.connections import charges, connections
 
 #: Å; a viewer draws the central particle as a dot.
@@ -143,7 +144,7 @@ class GsdFile:
             np.array([label(m.name, *both) for both in zip(own, m.site_names, strict=True)], dtype=object)
             for m, own in zip(self._system.species, names, strict=True)
         ]
-        return np.concatenate([labels[k] for k in self._system.model.species])
+        return of_each(labels, self._system.model.species)
 
     def _frame(self, state: State, time: float, step: int) -> Any:
         system, sites = self._system, self._constituent

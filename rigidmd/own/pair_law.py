@@ -14,7 +14,7 @@ from rigidmd.forces.laws.lennard_jones import Tail
 from rigidmd.forces.laws.own import OwnLaw, tail_of
 from rigidmd.forces.pairs.loop import PairForces, pair_forces
 from rigidmd.forces.pairs.sites import groups, sites_of
-from rigidmd.molecules import Molecule, named_sites
+from rigidmd.molecules import Molecule, named_sites, of_each
 from rigidmd.scene.forces import usual_start
 from rigidmd.validation import meant
 
@@ -84,7 +84,8 @@ class PairLaw:
             raise LawError("no site of the scene takes part in it")
         index = system.model.species
         sites = sites_of(index, [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)])
-        kind = np.concatenate([np.array([kinds.number[kinds.of_species[k][i]] for i in chosen[k]], int) for k in index])
+        own = zip(kinds.of_species, chosen, strict=True)
+        kind = of_each([np.array([kinds.number[of[i]] for i in c], int) for of, c in own], index)
         shape = shape_of(name, cutoff, start)
         count = len(kinds.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple

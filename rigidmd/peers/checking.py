@@ -43,7 +43,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     size = sum(abs(ours.components[name]) for name in system.terms if name in ours.components) + kinetic
     force_error = system.force_error or 0.0
     reach = _reach(system)
-    sites = len(system.sites.molecule)
+    sites = system.site_count
     slack = force_error * reach * (SHARE * sites + ERRORS * np.sqrt(sites))
     lines = []
     for name in every:

@@ -17,7 +17,7 @@ from rigidmd.core.state import State
 from rigidmd.forces.laws.coulomb import ReactionField
 from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.waves.mesh import Pme
-from rigidmd.molecules import Molecule
+from rigidmd.molecules import Molecule, of_each
 from rigidmd.peers.bodies import Bodies, Points
 from rigidmd.peers.mass_points import SAME, MassPoints, mass_points
 from rigidmd.peers.portrait import Portrait, strange
@@ -145,8 +145,8 @@ def _coordinates(portrait: Portrait, bodies: list[MassPoints], state: State) -> 
     at, velocity = system.site_positions(state), system.site_velocities(state)
     extra = Points(
         np.repeat(np.arange(len(species)), [_extra(system.species[k], bodies[k]) for k in species]),
-        np.concatenate([bodies[k].position_body[bodies[k].site < 0] for k in species]),
-        np.concatenate([bodies[k].mass[bodies[k].site < 0] for k in species]),
+        of_each([body.position_body[body.site < 0] for body in bodies], species),
+        of_each([body.mass[body.site < 0] for body in bodies], species),
     )
     more, more_velocity = _points_at(portrait, extra, state)
     width = DECIMALS + 5

@@ -15,6 +15,7 @@ from rigidmd.errors import EngineError
 from rigidmd.forces.laws.endings import Plain, Switched
 from rigidmd.forces.laws.lennard_jones import LennardJones
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
+from rigidmd.molecules import of_each
 from rigidmd.peers.bodies import Points
 from rigidmd.peers.formulas import coulomb_formula, lennard_jones_formula
 from rigidmd.peers.mass_points import MassPoints, mass_points
@@ -131,11 +132,11 @@ def layout(portrait: Portrait) -> Layout:
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),
-        np.concatenate([bodies[k].position_body for k in species]),
-        np.concatenate([bodies[k].mass for k in species]),
+        of_each([body.position_body for body in bodies], species),
+        of_each([body.mass for body in bodies], species),
     )
     return Layout(
-        np.concatenate([mass[k] for k in species]),
+        of_each(mass, species),
         np.repeat(np.arange(len(species)), count),
         np.repeat(first, sites) + within,
         np.concatenate([first[i] + local[k] for i, k in enumerate(species)]),

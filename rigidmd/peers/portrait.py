@@ -14,6 +14,7 @@ from rigidmd.forces.laws.coulomb import ReactionField
 from rigidmd.forces.laws.lennard_jones import LennardJones
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.pairs.loop import PairForces
+from rigidmd.molecules import of_each
 
 #: Terms that the portrait has a place for; all others are fields and forces of the user's own.
 KNOWN = (
@@ -102,7 +103,7 @@ def portrait(system: System) -> Portrait:
     return Portrait(
         system=system,
         kinds=kinds,
-        kind=np.concatenate([of_species[k] for k in index]),
+        kind=of_each(of_species, index),
         frozen=(system.model.inverse_mass == 0)[index],
         sigma=sigma,
         epsilon=epsilon,

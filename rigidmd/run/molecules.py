@@ -439,7 +439,7 @@ class MolecularSimulation(Simulation):
         system, asked = self.system, self.scene.threads or 0
         more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
         first = (
-            f"{self.scene.name}: {len(system.model.species)} molecules, {len(system.sites.molecule)} sites, "
+            f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
             f"{system.freedom.total} degrees of freedom; {self.threads} threads{more}"
         )
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
