@@ -153,7 +153,16 @@ class Sampler(Observer):
         if finding := watch.sample_finding(run.system, run.scene.watch, rows[since], now):
             raise finding
         self._check.rescale(seen.kinetic)
-        self.last_good = Good(moment.step, moment.time, run.state.copy())
+        self._keep(moment.step, moment.time)
+
+    def _keep(self, step: int, time: float) -> None:
+        """Keep the present state as the last good one, in the memory of the one before."""
+        now, before = self._run.state, self.last_good and self.last_good.state
+        if before is None or any(there.shape != here.shape for there, here in zip(before, now, strict=True)):
+            before = now.copy()
+        for there, here in zip(before, now, strict=True):
+            there[:] = here
+        self.last_good = Good(step, time, before)
 
     def memory(self) -> Checkpoint:
         """The samples, and what the checks remember."""
@@ -166,7 +175,7 @@ class Sampler(Observer):
         self.samples = Samples.of_table(kept.arrays["samples"], stages, tuple(run.system.own))
         self._begins = {int(stage): int(row) for stage, row in kept.told["begins"]}
         self._check.thermal = kept.told["thermal"]
-        self.last_good = Good(int(run.state.step[NOW]), float(run.state.time[NOW]), run.state.copy())
+        self._keep(int(run.state.step[NOW]), float(run.state.time[NOW]))
 
     def failed(self, run: "MolecularSimulation") -> str:
         """Save the last good state."""

@@ -32,7 +32,7 @@ IMAGES = 1 << IMAGE_BITS  # enough for all images of a box within reach
 MOST_MET = 2**16  # clusters that the rows of one cluster can meet
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first: inside the cut-off when the list is built; the others divide the skin
-MOST_BEYOND = 2**16 - 1
+MOST_BEYOND = 2**8 - 1
 LONGEST_SKIN = 0.45  # of the smallest edge
 ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
@@ -60,7 +60,7 @@ class PairList(NamedTuple):
     tree: BoxTree
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     row: np.ndarray  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
-    beyond: np.ndarray  # (rows, SHELLS) uint16 how many entries at the end of a row are beyond shell k
+    beyond: np.ndarray  # (rows, SHELLS) uint8 how many entries at the end of a row are beyond shell k
     entries: np.ndarray  # (blocks, capacity) uint16
     special: np.ndarray  # (rows,) int32 end of each row in masked[b]
     masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
@@ -95,7 +95,7 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
     count = len(clusters.origin) // 4
     most_rows = rows // count * int(np.diff(clusters.bounds).max())  # of a block
     room = ceil(_clusters_met(cell, count, cutoff + skin, 1.0) * most_rows)
-    met = ceil(_clusters_met(cell, count, cutoff + skin, 2.0) * most_rows * count / rows)
+    met = ceil(_clusters_met(cell, count, cutoff + skin, 1.75) * most_rows * count / rows)
     needed = np.zeros((blocks, 5), np.int64)
     needed[:, WINDOW] = _clusters_ahead(cell, count, blocks, cutoff + skin)
     skin = _fitting_skin(cell, cutoff, skin)
@@ -110,7 +110,7 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         tree=box_tree(count),
         shift=zeros(4 * IMAGES, np.float64),
         row=np.zeros(rows, np.int32),
-        beyond=np.zeros((rows, SHELLS), np.uint16),
+        beyond=np.zeros((rows, SHELLS), np.uint8),
         entries=np.empty((blocks, room), np.uint16),
         special=np.zeros(rows, np.int32),
         masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),  # measured per row: argon 1.1, water 1.5
@@ -136,7 +136,7 @@ def _clusters_met(cell: np.ndarray, count: int, radius: float, size: float) -> f
     """Expected number of clusters within a radius of sites, half of them; 0 if the density is not known, and the first
     build then finds it.
 
-    size : 1 for a row, which is small, 2 for a whole cluster
+    size : 1 for a row, which is small, 1.75 for a whole cluster: water needs 1.6 to 1.7
     """
     if radius == inf:
         return count / 2 + 1
