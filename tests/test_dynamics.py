@@ -9,17 +9,18 @@ from rigidmd.assemble.momenta import draw_momenta
 from rigidmd.assemble.system import build
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import HEAT, State, state_of
+from rigidmd.core.state import HEAT, State, no_load, state_of
 from rigidmd.dynamics import baths
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.dynamics.ramps import steady
+from rigidmd.dynamics.sums import sums_over
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.pairs.sites import blocks_of
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
-from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.mechanics.rotation import orthogonality_error, random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN
@@ -129,6 +130,30 @@ def test_schemes_are_palindromes_and_run_backwards(dimer, name):
     there.velocity[:] *= -1
     there.angular_momentum_body[:] *= -1
     assert off(run(engine, there, 0.001, 100, scheme=scheme), state) < 1e-11
+
+
+@pytest.mark.parametrize("molecules", [{"spce": 5, "argon": 4}, {"argon": 6}, {"nitrogen": 4, "tip4p": 3}])
+def test_sums_are_those_of_numpy(molecules):
+    system, _, state = built(molecules, 30.0, 3)
+    model, load = system.model, no_load(state)
+    rng = np.random.default_rng(1)
+    for array in load:
+        array[:] = rng.normal(size=array.shape)
+    found, mass = sums_over(model, state, load), model.mass[model.species][:, None]
+    inverse = model.inverse_inertia[model.species][: len(state.rotation)]
+    assert found.momentum == pytest.approx((mass * state.velocity).sum(axis=0), rel=1e-12, abs=1e-9)
+    assert found.flow == pytest.approx((mass * state.velocity).T @ state.velocity, rel=1e-12, abs=1e-9)
+    assert found.translation == pytest.approx(found.flow.trace())
+    assert found.rotation == pytest.approx((inverse * state.angular_momentum_body**2).sum(), rel=1e-12)
+    assert found.force == pytest.approx((load.force**2 / mass).sum(), rel=1e-12)
+    assert found.torque == pytest.approx((inverse * load.torque_body**2).sum(), rel=1e-12)
+    if len(state.rotation):
+        state.rotation[1] += 1e-6
+    assert sums_over(model, state).orthogonality == pytest.approx(orthogonality_error(state.rotation), abs=1e-15)
+    assert sums_over(model, state)[2:4] == (0, 0)
+    if len(state.rotation):
+        state.rotation[0, 1, 1] = np.nan
+        assert np.isnan(sums_over(model, state).orthogonality)
 
 
 def test_time_can_be_reversed(liquid):

@@ -8,9 +8,8 @@ import numpy as np
 from rigidmd.assemble.momenta import Freedom
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.advance import Model
+from rigidmd.dynamics.sums import sums_over
 from rigidmd.engines import Engine
-from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 
@@ -123,19 +122,15 @@ def observe(
         components["tail" if system.own else "lennard_jones_tail"] = system.tail.energy(volume)
         beyond = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
-    model = system.model
-    mass = model.mass[model.species]
-    translation, rotation = kinetic_energies(system, state)
+    sums = sums_over(system.model, state, load)
+    translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
     slant = verlet_step**2 / 12
-    translation_unbiased = translation + slant * _weighed_squares(load.force, model.inverse_mass, model)
-    rotation_unbiased = rotation
-    if len(load.torque_body):
-        rotation_unbiased += slant * _weighed_squares(load.torque_body, model.inverse_inertia, model)
+    translation_unbiased = translation + slant * sums.force
+    rotation_unbiased = rotation + slant * sums.torque
     freedom = freedom or system.freedom
     pressure = np.full((3, 3), nan)
     if volume < inf:
-        flow = (mass * state.velocity.T) @ state.velocity
-        pressure = (flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * np.eye(3)
+        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * np.eye(3)
     return Observation(
         components=components,
         virial=virial,
@@ -147,24 +142,16 @@ def observe(
         temperature_translation_unbiased=_temperature(translation_unbiased, freedom.translation),
         temperature_rotation_unbiased=_temperature(rotation_unbiased, freedom.rotation),
         pressure_tensor=pressure,
-        momentum=mass @ state.velocity,
-        orthogonality=orthogonality_error(state.rotation),
+        momentum=sums.momentum,
+        orthogonality=sums.orthogonality,
         load=load,
     )
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:
     """Of translation and rotation, u Å²/ps²."""
-    model, rotation = system.model, 0.0
-    if len(state.angular_momentum_body):
-        rotation = 0.5 * _weighed_squares(state.angular_momentum_body, model.inverse_inertia, model)
-    return 0.5 * _weighed_squares(state.velocity, model.mass, model), rotation
-
-
-def _weighed_squares(values: np.ndarray, weights: np.ndarray, model: Model) -> float:
-    """Sum of the squares of values (n, 3) with weights of each species, (species,) or (species, 3)."""
-    own = weights[model.species]
-    return float(np.einsum("nk,nk,nk->" if own.ndim == 2 else "nk,nk,n->", values, values, own))
+    sums = sums_over(system.model, state)
+    return 0.5 * sums.translation, 0.5 * sums.rotation
 
 
 def _temperature(kinetic: float, freedom: int) -> float:

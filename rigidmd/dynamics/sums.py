@@ -1,0 +1,73 @@
+"""Sums over the molecules of a state, for a look at a run: one pass, where NumPy takes a dozen with arrays between."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import kernel
+from rigidmd.core.state import Load, State
+from rigidmd.dynamics.advance import Model
+
+NO_LOAD = Load(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+class Sums(NamedTuple):
+    """In u, Å, ps."""
+
+    translation: float  # sum m V²
+    rotation: float  # sum L . I^-1 L
+    force: float  # sum F²/m
+    torque: float  # sum n . I^-1 n
+    momentum: np.ndarray  # (3,) sum m V
+    flow: np.ndarray  # (3, 3) sum m V (x) V
+    orthogonality: float  # largest entry of |Q^T Q - 1|; NaN if one is
+
+
+def sums_over(model: Model, state: State, load: Load = NO_LOAD) -> Sums:
+    """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
+    found, momentum, flow = np.zeros(5), np.zeros(3), np.zeros((3, 3))
+    _sum(
+        model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
+        state.angular_momentum_body, load.force, load.torque_body, found, momentum, flow,
+    )  # fmt: skip
+    translation, rotation, force, torque, orthogonality = map(float, found)
+    return Sums(translation, rotation, force, torque, momentum, flow, orthogonality)
+
+
+@kernel(outer=True)
+def _sum(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found, p, flow):
+    px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
+    for m in range(len(velocity)):
+        own = mass[species[m]]
+        x, y, z = velocity[m, 0], velocity[m, 1], velocity[m, 2]
+        px += own * x
+        py += own * y
+        pz += own * z
+        xx += own * x * x
+        yy += own * y * y
+        zz += own * z * z
+        xy += own * x * y
+        xz += own * x * z
+        yz += own * y * z
+    for m in range(len(force)):
+        pushed += inverse_mass[species[m]] * (force[m, 0] ** 2 + force[m, 1] ** 2 + force[m, 2] ** 2)
+    for m in range(len(angular)):
+        for k in range(3):
+            turning += inverse_inertia[species[m], k] * angular[m, k] ** 2
+    for m in range(len(torque)):
+        for k in range(3):
+            twisted += inverse_inertia[species[m], k] * torque[m, k] ** 2
+    for m in range(len(rotation)):
+        for j in range(3):
+            for k in range(j, 3):
+                entry = -1.0 if j == k else 0.0
+                for i in range(3):
+                    entry += rotation[m, i, j] * rotation[m, i, k]
+                if not abs(entry) <= worst and worst == worst:  # NaN is kept
+                    worst = abs(entry)
+    found[0], found[1], found[2], found[3], found[4] = xx + yy + zz, turning, pushed, twisted, worst
+    p[0], p[1], p[2] = px, py, pz
+    flow[0, 0], flow[1, 1], flow[2, 2] = xx, yy, zz
+    flow[0, 1] = flow[1, 0] = xy
+    flow[0, 2] = flow[2, 0] = xz
+    flow[1, 2] = flow[2, 1] = yz
