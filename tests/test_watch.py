@@ -328,6 +328,22 @@ def test_the_stiffest_libration_of_water_is_found_in_few_directions():
         stable_step.DIRECTIONS = before
 
 
+def test_in_a_large_system_a_slab_tells_the_stiffest_motion(monkeypatch):
+    scene = small_scene(
+        {"spce": 300}, 20.8, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]
+    )  # fmt: skip
+    simulation = Simulation(scene)
+    state = simulation.run().state
+    state.position[7] += [41.6, 0.0, -20.8]  # in which box a molecule is does not matter
+    whole = stiffest(simulation.system, state)
+    for most in (60, 120):
+        monkeypatch.setattr("rigidmd.measure.stable_step.MOST_DISPLACED", most)
+        found = stiffest(simulation.system, state)
+        x = simulation.system.centres(state, wrapped=True)[:, 0]
+        assert np.sum(x < x[found.molecule]) < most
+        assert 0.8 * whole.rate < found.rate < 1.001 * whole.rate  # the stiffest of fewer
+
+
 def test_a_step_that_is_too_long_is_told_before_the_first_one(tmp_path):
     warnings = []
     watch = {"move": False, "turn_rad": False, "energy": False}

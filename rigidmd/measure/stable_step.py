@@ -11,6 +11,7 @@ from rigidmd.assemble.species import species_of
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import DRIFT, KICK, RK4, Scheme, Solver
 from rigidmd.core.state import Load, State
+from rigidmd.engines.cpu import Engine
 from rigidmd.forces.body.fields import SteadyForce
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.mechanics.rotor import SplitRotor
@@ -22,6 +23,8 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND
 DIRECTIONS = 16
 #: Displacement for a difference of forces, in smallest diameters.
 SMALL = 1e-5
+#: Most molecules that are displaced for it: the stiffest motion is local, and each direction takes 48 B of each.
+MOST_DISPLACED = 50_000
 #: For larger systems the estimate is made only if it costs less than 1 % of the stage.
 SMALL_SYSTEM = 1000
 #: Rms amplitudes of the stiffest motions of a liquid at its temperature, as angles and in diameters. Measured by
@@ -60,37 +63,43 @@ class Stiffest(NamedTuple):
     molecule: int  # with the largest share in it
 
 
-def stiffest(system: System, state: State) -> Stiffest | None:
+def stiffest(system: System, state: State, engine: Engine | None = None) -> Stiffest | None:
     """The fastest small motion of all molecules together; None if no restoring force acts.
 
     The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of one random vector
-    (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one force evaluation.
+    (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one force evaluation. In large systems only
+    a slab of `MOST_DISPLACED` molecules moves.
+
+    engine : of this system; a new one if not given
     """
-    model, engine = system.model, system.engine()
-    mass = np.sqrt(model.inverse_mass[model.species])[:, None]
-    inertia = np.sqrt(model.inverse_inertia[model.species])[: len(state.rotation)]
-    radius = np.array([m.radius for m in system.species])[model.species][: len(state.rotation), None]
+    model, engine = system.model, engine or system.engine()
+    moving = np.arange(len(state.position))
+    if len(moving) > MOST_DISPLACED:
+        moving = np.sort(np.argpartition(system.centres(state, wrapped=True)[:, 0], MOST_DISPLACED)[:MOST_DISPLACED])
+    turning = moving[: len(state.rotation)]
+    mass = np.sqrt(model.inverse_mass[model.species[moving]])[:, None]
+    inertia = np.sqrt(model.inverse_inertia[model.species[turning]])
+    radius = np.array([m.radius for m in system.species])[model.species[turning], None]
 
     def parts(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Shifts and turns of molecules along a mass-weighted vector."""
-        cut = state.position.size
+        cut = 3 * len(moving)
         return mass * vector[:cut].reshape(-1, 3), inertia * vector[cut:].reshape(-1, 3)
 
     def weighted(load: Load) -> np.ndarray:
-        return np.concatenate([(mass * load.force).ravel(), (inertia * load.torque_body).ravel()])
+        return np.concatenate([(mass * load.force[moving]).ravel(), (inertia * load.torque_body[turning]).ravel()])
 
-    here = weighted(engine.evaluate(state)[0])
+    here, moved = weighted(engine.evaluate(state)[0]), state.copy()
     vector = np.random.default_rng(0).standard_normal(here.size)
-    vector *= np.concatenate([np.broadcast_to(mass, state.position.shape).ravel(), inertia.ravel()]) > 0
+    vector *= np.concatenate([np.repeat(mass, 3), inertia.ravel()]) > 0
     basis, matrix = [vector / np.linalg.norm(vector)], np.zeros((DIRECTIONS, DIRECTIONS))
     for k in range(DIRECTIONS):
         shift, turn = parts(basis[k])
         reach = max(np.abs(shift).max(initial=0.0), np.abs(radius * turn).max(initial=0.0))
         h = SMALL * system.smallest_diameter / reach
-        moved = state.copy()
-        moved.position[:] += h * shift
+        moved.position[moving] = state.position[moving] + h * shift
         if len(turn):
-            moved.rotation[:] = state.rotation @ from_vector(h * turn)
+            moved.rotation[turning] = state.rotation[turning] @ from_vector(h * turn)
         image = (here - weighted(engine.evaluate(moved)[0])) / h
         for j, other in enumerate(basis):
             matrix[j, k] = other @ image
@@ -107,9 +116,9 @@ def stiffest(system: System, state: State) -> Stiffest | None:
     if values[-1] <= 0:
         return None
     mode = (np.array(basis).T @ vectors[:, -1]) ** 2
-    share = mode[: state.position.size].reshape(-1, 3).sum(axis=1)
-    share[: len(state.rotation)] += mode[state.position.size :].reshape(-1, 3).sum(axis=1)
-    return Stiffest(sqrt(values[-1]), int(share.argmax()))
+    share = mode[: 3 * len(moving)].reshape(-1, 3).sum(axis=1)
+    share[: len(turning)] += mode[3 * len(moving) :].reshape(-1, 3).sum(axis=1)
+    return Stiffest(sqrt(values[-1]), int(moving[share.argmax()]))
 
 
 def long_steps(scene: MolecularScene) -> list[str]:

@@ -266,12 +266,13 @@ class MolecularSimulation(Simulation):
         self._stage = k
         if self.scene.stages[k].is_minimisation:
             return self._enter_minimisation(k)
-        if self.scene.stages[k].is_open:
+        if was_open := self.scene.stages[k].is_open:
             self._choose(k)
         self._estimate(k)
         # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
-        # bit.
-        self.engine = self._engine_of(k)
+        # bit. Those of the start, if nothing has moved since, are what new ones would be.
+        if k or was_open or self.scene.engine.is_other or (self._relief is not None and self._relief.steps):
+            self.engine = self._engine_of(k)
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
         self.state = self.engine.begin(self.state, row)
         self.state.begin_stretch()
@@ -310,7 +311,7 @@ class MolecularSimulation(Simulation):
             self.system, stage.steps * stage.scheme.force_evaluations
         ):
             return
-        found = stiffest(self.system, self.state)
+        found = stiffest(self.system, self.state, None if self.scene.engine.is_other else self.engine)
         if found is None:
             return
         self._stable[k] = stable_angle(stage.scheme) / found.rate
