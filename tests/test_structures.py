@@ -9,12 +9,13 @@ import ase
 import ase.io
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import built, small_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rigidmd.assemble.atoms import element_of, element_of_mass
 from rigidmd.assemble.cells import basis_in_words, basis_of, pairs_within, reduced, standard_rotation
+from rigidmd.assemble.overlaps import close_pairs, every_site
 from rigidmd.assemble.structure import read_structure
 from rigidmd.assemble.structure_files import read_geometry
 from rigidmd.assemble.system import build
@@ -629,6 +630,25 @@ def test_pairs_within_a_radius_in_any_cell():
         i, j, distance = pairs_within(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
         assert {(max(a, b), min(a, b)) for a, b in zip(i, j, strict=True) if a != b} == wanted
         assert distance.max(initial=0.0) <= radius
+
+
+@pytest.mark.parametrize(
+    "counts", [{"spce": 40}, {"spce": 30, "argon": 15}, {"benzene_trappe": 15}, {"hf_jorgensen": 40}]
+)
+def test_close_sites_are_those_of_all_pairs(counts):
+    """Benzene is larger than its sites: there all sites are searched, of water those of molecules that are close."""
+    system, _, state = built(counts, 14.0, 1, spread=1.2, forces={"cutoff_A": 6.0})
+    wanted = (0.9, every_site), (2.4, lambda m: np.flatnonzero(m.epsilon > 0))
+    at, owner = system.site_positions(state), system.sites.molecule
+    repels = system.of_sites(lambda m: m.epsilon > 0)
+    step = at[:, None] - at
+    apart = np.linalg.norm(step - 14.0 * np.rint(step / 14.0), axis=2)
+    close = (apart <= 0.9) | (apart <= 2.4) & (repels & repels[:, None])
+    close &= np.triu(owner != owner[:, None])
+    found = close_pairs(system, state, *wanted)
+    assert len(found) > 5
+    assert [pair[:2] for pair in found] == [tuple(pair) for pair in np.argwhere(close).tolist()]
+    assert [pair[2] for pair in found] == pytest.approx(apart[close].tolist())
 
 
 # formats
