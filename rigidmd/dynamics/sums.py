@@ -26,7 +26,7 @@ class Sums(NamedTuple):
 def sums_over(model: Model, state: State, load: Load = NO_LOAD) -> Sums:
     """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
     found, momentum, flow = np.zeros(5), np.zeros(3), np.zeros((3, 3))
-    _sum(
+    _add_up(
         model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
         state.angular_momentum_body, load.force, load.torque_body, found, momentum, flow,
     )  # fmt: skip
@@ -35,7 +35,7 @@ def sums_over(model: Model, state: State, load: Load = NO_LOAD) -> Sums:
 
 
 @kernel(outer=True)
-def _sum(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found, p, flow):
+def _add_up(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found, p, flow):
     px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
     for m in range(len(velocity)):
         own = mass[species[m]]

@@ -84,8 +84,8 @@ class PairLaw:
             raise LawError("no site of the scene takes part in it")
         index = system.model.species
         sites = sites_of(index, [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)])
-        own = zip(kinds.of_species, chosen, strict=True)
-        kind = of_each([np.array([kinds.number[of[i]] for i in c], int) for of, c in own], index)
+        numbers_of = [[kinds.number[entry] for entry in of if entry is not None] for of in kinds.of_species]
+        kind = of_each([np.array(own, int) for own in numbers_of], index)
         shape = shape_of(name, cutoff, start)
         count = len(kinds.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple

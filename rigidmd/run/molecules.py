@@ -311,7 +311,7 @@ class MolecularSimulation(Simulation):
             self.system, stage.steps * stage.scheme.force_evaluations
         ):
             return
-        found = stiffest(self.system, self.state, None if self.scene.engine.is_other else self.engine)
+        found = stiffest(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
         if found is None:
             return
         self._stable[k] = stable_angle(stage.scheme) / found.rate
