@@ -27,16 +27,16 @@ def overlaps(system: "System") -> list[str]:
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
     widest = max((sigma.max() for sigma in cores), default=0.0)
     wanted = (inside, every_site), (OVERLAP * widest, _repelling)
-    near = {(i, j): apart for i, j, apart in close_pairs(system, system.state, *wanted)}
+    near = close_pairs(system, system.state, *wanted)
     sigma = of_each(cores, system.model.species) if near else np.zeros(0)
     faults = []
-    for i, j in sorted(near):
+    for i, j, distance in near:
         both = sigma[i] > 0 and sigma[j] > 0
-        if near[i, j] <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
+        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
             a, b = system.sites.molecule[[i, j]]
             faults.append(
                 f"molecules {a + 1} and {b + 1} overlap: {system.sites.name[i]} and {system.sites.name[j]} "
-                f"are {near[i, j]:.3f} Å apart"
+                f"are {distance:.3f} Å apart"
             )
     return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
 
@@ -76,8 +76,7 @@ def _close_among(
     system: "System", state: State, molecules: np.ndarray, radius: float, chosen: list[np.ndarray]
 ) -> Iterator[tuple[int, int, float]]:
     """The pairs of `close_pairs` among some molecules, of the sites chosen[k] (indices) of species k."""
-    index = system.model.species
-    kinds, counts = index[molecules], np.array([len(m.masses) for m in system.species])[index]
+    kinds, counts = system.model.species[molecules], system.own_sites
     owner = np.repeat(molecules, np.array([len(own) for own in chosen])[kinds])
     site = (np.cumsum(counts) - counts)[owner] + of_each(chosen, kinds)
     offset = of_each([m.positions_body[own] for m, own in zip(system.species, chosen, strict=True)], kinds)

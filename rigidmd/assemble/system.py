@@ -68,7 +68,7 @@ class System:
     @cached_property
     def sites(self) -> Sites:
         """Every site, made when it is first asked for: a run needs them only to write a trajectory."""
-        owner = np.repeat(np.arange(len(self.model.species)), self._own_sites)
+        owner = np.repeat(np.arange(len(self.model.species)), self.own_sites)
         return Sites(
             owner,
             self.of_sites(lambda m: m.positions_body),
@@ -80,10 +80,10 @@ class System:
     @property
     def site_count(self) -> int:
         """The number of sites."""
-        return int(self._own_sites.sum())
+        return int(self.own_sites.sum())
 
     @property
-    def _own_sites(self) -> np.ndarray:
+    def own_sites(self) -> np.ndarray:
         """The number of sites of each molecule (n,)."""
         return np.array([len(m.masses) for m in self.species])[self.model.species]
 

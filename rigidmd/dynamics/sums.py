@@ -5,10 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.core.state import Load, State
+from rigidmd.core.state import EXAMPLE, Load, State
 from rigidmd.dynamics.advance import Model
-
-NO_LOAD = Load(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 class Sums(NamedTuple):
@@ -23,7 +21,7 @@ class Sums(NamedTuple):
     orthogonality: float  # largest entry of |Q^T Q - 1|; NaN if one is
 
 
-def sums_over(model: Model, state: State, load: Load = NO_LOAD) -> Sums:
+def sums_over(model: Model, state: State, load: Load = EXAMPLE[1]) -> Sums:
     """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
     found, momentum, flow = np.zeros(5), np.zeros(3), np.zeros((3, 3))
     _add_up(

@@ -128,7 +128,7 @@ def layout(portrait: Portrait) -> Layout:
         mass.append(own)
     count = np.array([len(own) for own in mass])[species]
     first = np.cumsum(count) - count
-    sites = np.array([len(m.masses) for m in system.species])[species]
+    sites = system.own_sites
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),

@@ -157,12 +157,13 @@ class Sampler(Observer):
 
     def _keep(self, step: int, time: float) -> None:
         """Keep the present state as the last good one, in the memory of the one before."""
-        now, before = self._run.state, self.last_good and self.last_good.state
-        if before is None or any(there.shape != here.shape for there, here in zip(before, now, strict=True)):
-            before = now.copy()
-        for there, here in zip(before, now, strict=True):
-            there[:] = here
-        self.last_good = Good(step, time, before)
+        now, kept = self._run.state, self.last_good and self.last_good.state
+        if kept is None or any(there.shape != here.shape for there, here in zip(kept, now, strict=True)):
+            kept = now.copy()
+        else:
+            for there, here in zip(kept, now, strict=True):
+                there[:] = here
+        self.last_good = Good(step, time, kept)
 
     def memory(self) -> Checkpoint:
         """The samples, and what the checks remember."""
