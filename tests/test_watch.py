@@ -135,7 +135,9 @@ def test_a_load_that_is_no_number(name):
     system = build(water(2.0))
     load, _ = system.engine().evaluate(system.state)
     getattr(load, name)[5, 1] = np.nan
-    found = watch.step_finding(system, system.scene.watch, system.state, load, SCHEMES["velocity_verlet"], 0.002, 250.0)
+    check = watch.StepCheck(system, system.scene.watch)
+    check.thermal = 250.0
+    found = check.next_step(system.state, load, SCHEMES["velocity_verlet"], 0.002)
     assert str(found) == f"the {name.removesuffix('_body')} on molecule 6 (spce) is not finite"
 
 
@@ -146,17 +148,20 @@ def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
     load, _ = system.engine().evaluate(system.state)
     verlet, number = SCHEMES["velocity_verlet"], getattr(load if name in load._fields else system.state, name)
 
+    check = watch.StepCheck(system, system.scene.watch)
+    check.thermal = 250.0
+
     def findings(m):
         for size in np.geomspace(1.0, 1e9, 180):
             number[m, 1] = size
-            found = watch.step_finding(system, system.scene.watch, system.state, load, verlet, 0.002, 250.0)
+            found = check.next_step(system.state, load, verlet, 0.002)
             yield found and str(found)
         number[m, 1] = 0.0
 
     for m in (3, 23):
         quick = list(findings(m))
         with monkeypatch.context() as patched:
-            patched.setattr(watch, "_is_mild", lambda *_: False)
+            patched.setattr(check, "_is_mild", lambda *_: False)
             assert quick == list(findings(m))
         assert quick[0] is None and quick[-1] is not None
 
@@ -246,9 +251,9 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluate, advance = Engine.evaluate, Engine.advance
     monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state))
 
-    def counted(self, state, scheme, dt, until):
+    def counted(self, state, scheme, dt, until, looked=False):
         loads.append(until - state.step[NOW])
-        return advance(self, state, scheme, dt, until)
+        return advance(self, state, scheme, dt, until, looked)
 
     monkeypatch.setattr(Engine, "advance", counted)
     ends, costs = [], []

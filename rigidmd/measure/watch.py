@@ -79,78 +79,6 @@ def thermal_energy(system: System, kinetic: float) -> float:
     return max(2 * kinetic / max(system.freedom.total, 1), wells)
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def step_finding(
-    system: System, limits: Watch, state: State, load: Load, scheme: Scheme, dt: float, thermal: float
-) -> Finding | None:
-    """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
-
-    load : at this state or at the last kick; thermal : see `thermal_energy`
-    """
-    for what, values in (("force", load.force), ("torque", load.torque_body)):
-        if not np.isfinite(values).all():
-            m = int((~np.isfinite(values).all(axis=1)).argmax())
-            return Finding(f"the {what} on {named(system, m)} is not finite", m)
-    if _is_mild(system, limits, state, load, scheme, dt, thermal):
-        return None
-    model = system.model
-    if limits.kick and thermal > 0:
-        size = kicks(model, load, thermal, dt * max(map(abs, scheme.kicks)))
-        if size.max() > limits.kick:
-            m = int(size.argmax())
-            seen = f"one kick changes a momentum of {named(system, m)} by {size[m]:.3g} times its thermal size"
-            return Finding(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
-    stride = dt * max(map(abs, scheme.drifts))
-    if limits.move:
-        way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
-        m, diameter = int(way.argmax()), system.smallest_diameter
-        if way[m] > limits.move * diameter:
-            seen = f"{named(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
-            seen += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
-            return Finding(seen, m, shorter=way[m] / diameter / limits.move)
-    if limits.turn_rad and len(state.rotation):
-        omega = state.angular_momentum_body * (model.inverse_inertia * _arms(system))[model.species]
-        angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
-        m = int(angle.argmax())
-        if angle[m] > limits.turn_rad:
-            seen = f"{named(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
-            return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
-    return None
-
-
-def _is_mild(
-    system: System, limits: Watch, state: State, load: Load, scheme: Scheme, dt: float, thermal: float
-) -> bool:
-    """Whether no molecule can exceed a limit, by the largest of all forces, velocities and so on: nearly always, and
-    five times as fast as to look at each of 4096 waters."""
-    model, stride = system.model, dt * max(map(abs, scheme.drifts))
-    force, torque, velocity, momentum = map(
-        _largest, (load.force, load.torque_body, state.velocity, state.angular_momentum_body)
-    )
-    if limits.kick and thermal > 0:
-        kick = dt * max(map(abs, scheme.kicks)) / np.sqrt(thermal)
-        largest = np.sqrt(model.inverse_mass.max()) * force
-        if torque > 0:
-            largest = max(largest, torque / np.sqrt(model.inertia[model.inertia > 0].min()))
-        if not kick * largest <= limits.kick:
-            return False
-    if limits.move and not np.sqrt(3) * stride * velocity <= limits.move * system.smallest_diameter:
-        return False
-    if not (limits.turn_rad and len(state.rotation)):
-        return True
-    return bool(np.sqrt(3) * stride * momentum * (model.inverse_inertia * _arms(system)).max() <= limits.turn_rad)
-
-
-def _largest(values: np.ndarray) -> float:
-    """The largest size of a number in an array; 0 of an empty one."""
-    return float(max(values.max(initial=0.0), -values.min(initial=0.0)))
-
-
-def _arms(system: System) -> np.ndarray:
-    """Distances (species, 3) of sites from the axes, in radii: of a spin, what counts is the move of the sites."""
-    return np.array([axis_distances(m) / (m.radius or 1.0) for m in system.species])
-
-
 class StepCheck:
     """Checks of the next step of a run of molecules.
 
@@ -160,17 +88,82 @@ class StepCheck:
     def __init__(self, system: System, limits: Watch):
         self._system, self._limits = system, limits
         self.thermal = 0.0  # u Å²/ps²; 0 before the first sample
+        model = system.model
+        # Distances of sites from the axes, in radii: of a spin, what counts is the move of the sites.
+        arms = [axis_distances(m) / (m.radius or 1.0) for m in system.species]
+        self._per_momentum = model.inverse_inertia * np.array(arms)  # (species, 3)
+        self._diameter = system.smallest_diameter
+        self._mass_root = np.sqrt(model.inverse_mass.max())  # of the lightest, inverse; 0 if all are frozen
+        self._inertia_root = np.sqrt(model.inertia[model.inertia > 0].min(initial=inf))
 
     def rescale(self, kinetic: float) -> None:
         """Take the scale of momenta from a kinetic energy, u Å²/ps²."""
         self.thermal = thermal_energy(self._system, kinetic)
 
     def finding(self, state: State, load: Load, stage: Stage) -> Finding | None:
-        """What is wrong with the next step of a state in a stage, if it has steps; load : see `step_finding`."""
+        """`next_step` of a stage, if it has steps."""
         if stage.is_minimisation:
             return None
-        dt = stage.timestep_fs * FEMTOSECOND
-        return step_finding(self._system, self._limits, state, load, stage.scheme, dt, self.thermal)
+        return self.next_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def next_step(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
+        """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
+
+        load : at this state or at the last kick
+        """
+        system, limits, model = self._system, self._limits, self._system.model
+        if self._is_mild(state, load, scheme, dt):
+            return None
+        for what, values in (("force", load.force), ("torque", load.torque_body)):
+            if not np.isfinite(values).all():
+                m = int((~np.isfinite(values).all(axis=1)).argmax())
+                return Finding(f"the {what} on {named(system, m)} is not finite", m)
+        if limits.kick and self.thermal > 0:
+            size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
+            if size.max() > limits.kick:
+                m = int(size.argmax())
+                seen = f"one kick changes a momentum of {named(system, m)} by {size[m]:.3g} times its thermal size"
+                return Finding(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
+        stride = dt * max(map(abs, scheme.drifts))
+        if limits.move:
+            way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
+            m, diameter = int(way.argmax()), self._diameter
+            if way[m] > limits.move * diameter:
+                seen = f"{named(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
+                seen += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
+                return Finding(seen, m, shorter=way[m] / diameter / limits.move)
+        if limits.turn_rad and len(state.rotation):
+            omega = state.angular_momentum_body * self._per_momentum[model.species]
+            angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
+            m = int(angle.argmax())
+            if angle[m] > limits.turn_rad:
+                seen = f"{named(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
+                return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
+        return None
+
+    def _is_mild(self, state: State, load: Load, scheme: Scheme, dt: float) -> bool:
+        """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces, velocities and
+        so on: nearly always, and five times as fast as to look at each of 4096 waters."""
+        limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
+        force, torque = _largest(load.force), _largest(load.torque_body)
+        if not force + torque < inf:
+            return False
+        if limits.kick and self.thermal > 0:
+            kick = dt * max(map(abs, scheme.kicks)) / np.sqrt(self.thermal)
+            if not kick * max(force * self._mass_root, torque / self._inertia_root) <= limits.kick:
+                return False
+        if limits.move and not np.sqrt(3) * stride * _largest(state.velocity) <= limits.move * self._diameter:
+            return False
+        if not (limits.turn_rad and len(state.rotation)):
+            return True
+        spin = _largest(state.angular_momentum_body) * self._per_momentum.max()
+        return bool(np.sqrt(3) * stride * spin <= limits.turn_rad)
+
+
+def _largest(values: np.ndarray) -> float:
+    """The largest size of a number in an array, NaN if one is; 0 of an empty one."""
+    return float(max(values.max(initial=0.0), -values.min(initial=0.0)))
 
 
 def axis_distances(molecule: Molecule) -> np.ndarray:

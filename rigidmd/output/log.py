@@ -6,7 +6,7 @@ The first columns are those of OpenMM's StateDataReporter.
 import csv
 import io
 from collections.abc import Sequence
-from math import isnan
+from operator import attrgetter
 from pathlib import Path
 
 from rigidmd.core.files import AppendedFile
@@ -32,7 +32,9 @@ class Log:
     """
 
     def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None, own: Sequence[str] = ()):
-        self._columns, self._own = columns(tensor, own), own
+        self._columns = columns(tensor, own)
+        shared = [name for name in self._columns if name not in own]
+        self._values = attrgetter(*shared)
         self._file = AppendedFile(path, kept)
         if kept is None:
             self._append(list(self._columns.values()))
@@ -44,9 +46,8 @@ class Log:
 
     def write(self, sample: Sample) -> None:
         """Add a line."""
-        rounded = sample._replace(time=round(sample.time, 9))
-        row = [rounded.value(name, self._own) for name in self._columns]
-        self._append([None if isinstance(x, float) and isnan(x) else x for x in row])
+        row = [*self._values(sample._replace(time=round(sample.time, 9))), *sample.own]
+        self._append([None if x != x else x for x in row])  # NaN
 
     def close(self) -> None:
         """Close the file."""

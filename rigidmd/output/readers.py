@@ -14,7 +14,7 @@ from MDAnalysis.coordinates.TRR import TRRReader
 from MDAnalysis.coordinates.XTC import XTCReader
 from MDAnalysis.coordinates.XYZ import XYZReader
 
-from rigidmd.assemble.cells import angles_deg
+from rigidmd.assemble.cells import edges_and_angles
 from rigidmd.assemble.gsd_format import GsdReader
 from rigidmd.assemble.traj_format import TrajReader
 
@@ -23,7 +23,7 @@ def dimensions(cell: np.ndarray) -> list[float] | None:
     """A cell (3, 3) in MDAnalysis' form; None without a box."""
     if cell[0, 0] == inf:
         return None
-    return [*np.linalg.norm(cell, axis=1), *angles_deg(cell)]
+    return edges_and_angles(cell)
 
 
 class _Sites(ReaderBase):

@@ -405,8 +405,14 @@ class Simulation(Base):
                     ahead = [n - count % n for count, n in zip(counts, every, strict=True) if n]
                     ahead += [max(1, int(PIECE / pace))] if pace > 0 else []
                     to = min([stretch.steps, *(done + steps for steps in ahead)])
+                    shown = [
+                        (n > 0 and (self._counted(observer, stretch) + to) % n == 0)
+                        or (to == stretch.steps and observer.ends)
+                        for observer, n in zip(observers, every, strict=True)
+                    ]
+                    looked = any(now and observer.reads_energies for now, observer in zip(shown, observers, strict=True))
                     began = clock.perf_counter()
-                    self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to)
+                    self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
                     place = place._replace(seconds=place.seconds + seconds)
@@ -414,11 +420,6 @@ class Simulation(Base):
                         raise NotFiniteError(self.state)
                     advanced(stretch.dt * (to - done))
                     done = to
-                    shown = [
-                        (n > 0 and (self._counted(observer, stretch) + done) % n == 0)
-                        or (done == stretch.steps and observer.ends)
-                        for observer, n in zip(observers, every, strict=True)
-                    ]
                     self._show(observers, self._moment(place, done), shown)
                     if self._keeper.time_is_up:
                         self._interrupted = self._out_of_time = True

@@ -2,19 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import nan
+from math import hypot, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from rigidmd.assemble.cells import angles_deg
+from rigidmd.assemble.cells import edges_and_angles
 from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.compile.machine import threads_for
-from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
+from rigidmd.core.state import NOW, TAKEN, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.measure import watch
@@ -341,31 +341,30 @@ class MolecularSimulation(Simulation):
         stage = self.scene.stages[moment.stage]
         is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
         step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
-        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage))
+        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage), moved=True)
 
     def sample_of(self, moment: Moment) -> Sample:
         """A line of the log. Its drift is counted from the last sample before its stage."""
-        seen = moment.observation
-        conserved = seen.energy - float(self.state.books.sum()) / KJ_PER_MOL
+        seen: Observation = moment._seen
+        potential, kinetic = seen.potential / KJ_PER_MOL, seen.kinetic / KJ_PER_MOL
+        heat, work, taken = (self.state.books / KJ_PER_MOL).tolist()
+        conserved = potential + kinetic - (heat + work + taken)
         self._conserved = conserved
         volume, stage = self.state.volume, self.scene.stages[moment.stage]
         boxed = volume < np.inf
-        cell, books = self.state.cell, self.state.books / KJ_PER_MOL
-        edges = np.linalg.norm(cell, axis=1) if boxed else np.full(3, nan)
-        angles = angles_deg(cell) if boxed else np.full(3, nan)
-        tensor = seen.pressure_tensor_bar
-        mass = float(self.system.model.mass[self.system.model.species].sum())
+        a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = seen.pressure_tensor_bar.tolist()
         # another engine may not tell what its thermostat takes out
         known = not stage.is_minimisation and getattr(self.engine, "counts_heat", True)
         return Sample(
             step=moment.step,
             time=moment.time,
-            potential=seen.potential,
-            kinetic=seen.kinetic,
-            energy=seen.energy,
+            potential=potential,
+            kinetic=kinetic,
+            energy=potential + kinetic,
             temperature=seen.temperature,
             volume=volume * 1e-3 if boxed else nan,
-            density=mass / volume / GRAM_PER_CM3 if boxed else nan,
+            density=self.system.mass / volume / GRAM_PER_CM3 if boxed else nan,
             stage_name=stage.label,
             temperature_translation=seen.temperature_translation,
             temperature_rotation=seen.temperature_rotation,
@@ -373,25 +372,25 @@ class MolecularSimulation(Simulation):
             temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
             pressure_bar=seen.pressure_bar,
             drift=conserved - self._origins.setdefault(moment.stage, conserved) if known else nan,
-            momentum=float(np.linalg.norm(seen.momentum)),
+            momentum=hypot(*seen.momentum.tolist()),
             orthogonality=seen.orthogonality,
-            a=float(edges[0]),
-            b=float(edges[1]),
-            c=float(edges[2]),
-            alpha=float(angles[0]),
-            beta=float(angles[1]),
-            gamma=float(angles[2]),
-            heat=float(books[HEAT]),
-            work=float(books[WORK]),
-            pressure_xx=float(tensor[0, 0]),
-            pressure_yy=float(tensor[1, 1]),
-            pressure_zz=float(tensor[2, 2]),
-            pressure_xy=float(tensor[0, 1]),
-            pressure_xz=float(tensor[0, 2]),
-            pressure_yz=float(tensor[1, 2]),
+            a=a,
+            b=b,
+            c=c,
+            alpha=alpha,
+            beta=beta,
+            gamma=gamma,
+            heat=heat,
+            work=work,
+            pressure_xx=xx,
+            pressure_yy=yy,
+            pressure_zz=zz,
+            pressure_xy=xy,
+            pressure_xz=xz,
+            pressure_yz=yz,
             conserved=conserved,
             stage=moment.stage,
-            own=tuple(seen.components[name] for name in self.system.own),
+            own=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.own),
         )
 
     def _own_observers(self) -> list[Observer]:

@@ -25,7 +25,11 @@ class Moment:
         self.step = step
         self.time = time
         self.stage = stage
-        self.state = State(*(_read_only(array) for array in run.state))
+
+    @cached_property
+    def state(self) -> State:
+        """The state of the run."""
+        return State(*(_read_only(array) for array in self._run.state))
 
     @cached_property
     def _seen(self) -> Any:
@@ -37,7 +41,7 @@ class Moment:
         """The line of the log; for molecules only."""
         return cast("MolecularSimulation", self._run).sample_of(self)
 
-    @property
+    @cached_property
     def observation(self) -> Any:
         """The observation: a `Reading` for molecules, in the units of the log; a `Pose` for a body, in SI units."""
         return getattr(self._seen, "reading", self._seen)
