@@ -73,6 +73,17 @@ def patience(system: System) -> int:
     return max(20, PATIENCE // len(system.model.species))
 
 
+def is_worth_it(system: System) -> bool:
+    """Whether checks between samples come clearly more often than samples, which check too."""
+    interval = system.scene.output.log_interval_ps
+    steps = [
+        inf if stage.is_open else interval / (stage.timestep_fs * FEMTOSECOND)
+        for stage in system.scene.stages
+        if not stage.is_minimisation
+    ]
+    return max(steps, default=0.0) > 1.5 * patience(system)
+
+
 def thermal_energy(system: System, kinetic: float) -> float:
     """kT of this kinetic energy, or the deepest well if that is larger: sets the scale of momenta; u Å²/ps²."""
     wells = max((m.epsilon.max() for m in system.species), default=0.0)

@@ -399,7 +399,7 @@ class MolecularSimulation(Simulation):
         check = watch.StepCheck(self.system, self.scene.watch)
         self._sampler = Sampler(self, interval, check)
         observers: list[Observer] = [self._sampler]
-        if not self.scene.engine.is_other:  # others look after their own steps
+        if not self.scene.engine.is_other and watch.is_worth_it(self.system):  # others look after their own steps
             observers.append(StepWatch(self, check))
         files: list[Observer] = []
         if output.trajectory:

@@ -44,7 +44,7 @@ class Throughout(Section):
 class Output(Section):
     """Files in the folder of the run."""
 
-    log_interval_ps: Interval = 0.05
+    log_interval_ps: Interval = 0.1
     """Time between lines of log.csv"""
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
