@@ -4,6 +4,7 @@ No check evaluates forces: states, loads and samples are those that the run has 
 for the pair of sites that causes it.
 """
 
+from collections.abc import Iterable
 from math import inf, sqrt
 from typing import NamedTuple
 
@@ -255,8 +256,23 @@ def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | N
     return min(own or found, key=lambda pair: pair.share, default=None)
 
 
+def _worst_pair(
+    system: System, molecule: int | None, states: Iterable[tuple[str, State]]
+) -> tuple[str, Pair | None]:
+    """Moment and sites of the first overlap of this molecule; without one, of the first of all."""
+    first: tuple[str, Pair | None] = ("", None)
+    for where, state in states:
+        if all(np.isfinite(array).all() for array in state):
+            pair = pair_in_core(system, state, molecule)
+            if pair is not None and (molecule is None or molecule in system.sites.molecule[[pair.first, pair.second]]):
+                return where, pair
+            if first[1] is None:
+                first = where, pair
+    return first
+
+
 def explained(
-    system: System, error: SimulationError, states: list[tuple[str, State]], dt: float, stable: float | None
+    system: System, error: SimulationError, states: Iterable[tuple[str, State]], dt: float, stable: float | None
 ) -> str:
     """The finding in full: what was seen, the likely cause, what to try.
 
@@ -272,18 +288,15 @@ def explained(
         finding = error
     else:
         return str(error)
-    text, pair = str(finding), None
-    for where, state in () if finding.boiled else states:
-        if all(np.isfinite(array).all() for array in state):
-            pair = pair_in_core(system, state, finding.molecule)
-        if pair:
-            a, b = (
-                f"{system.sites.name[site]} of {named(system, system.sites.molecule[site])}"
-                for site in (pair.first, pair.second)
-            )
-            whose = "the smallest" if pair.bare else "their"
-            text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.share:.2g} of {whose} diameter"
-            break
+    text = str(finding)
+    where, pair = ("", None) if finding.boiled else _worst_pair(system, finding.molecule, states)
+    if pair is not None:
+        a, b = (
+            f"{system.sites.name[site]} of {named(system, system.sites.molecule[site])}"
+            for site in (pair.first, pair.second)
+        )
+        whose = "the smallest" if pair.bare else "their"
+        text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.share:.2g} of {whose} diameter"
     likely, advice = _cause(system, finding, pair, dt, stable)
     return f"{text}. Likely cause: {likely}. Try {advice}"
 

@@ -1,6 +1,6 @@
 """Runs of molecules: relief of overlaps, stages of all ensembles, samples."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import hypot, nan
 from pathlib import Path
@@ -53,6 +53,10 @@ if TYPE_CHECKING:
     import ase
 
     from rigidmd.peers.engines import OtherEngine
+
+
+#: States between the last good one and a failure that are searched for its cause.
+REPLAYED = 20
 
 
 class MolecularSimulation(Simulation):
@@ -426,9 +430,26 @@ class MolecularSimulation(Simulation):
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:
-        good = self._sampler.last_good
-        states = [("", self.state), *([(f"at step {good.step}, ", good.state)] if good else [])]
-        return watch.explained(self.system, error, states, self.stretch.dt, self._stable.get(self._stage))
+        return watch.explained(self.system, error, self._suspects(), self.stretch.dt, self._stable.get(self._stage))
+
+    def _suspects(self) -> Iterator[tuple[str, State]]:
+        """States of a run that failed, with the words for their moments: now; the last good one; those between, which
+        are computed again, because soon after a collapse nothing is where it was."""
+        yield "", self.state
+        if (good := self._sampler.last_good) is None:
+            return
+        yield f"at step {good.step}, ", good.state
+        steps = int(self.state.step[NOW]) - good.step
+        if isinstance(self.engine, Engine) and steps > 0 and not self.scene.stages[self._stage].is_minimisation:
+            state = good.state.copy()
+            self.engine.forget()
+            for k in range(1, REPLAYED):
+                to = good.step + steps * k // REPLAYED
+                try:
+                    self.engine.advance(state, self.stretch.row, self.stretch.dt, to)
+                except SimulationError:
+                    return
+                yield f"at step {to}, ", state
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""
