@@ -14,7 +14,7 @@ from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.compile.machine import threads_for
-from rigidmd.core.state import NOW, TAKEN, State, state_of
+from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.measure import watch
@@ -350,9 +350,8 @@ class MolecularSimulation(Simulation):
     def sample_of(self, moment: Moment) -> Sample:
         """A line of the log. Its drift is counted from the last sample before its stage."""
         seen: Observation = moment._seen
-        potential, kinetic = seen.potential / KJ_PER_MOL, seen.kinetic / KJ_PER_MOL
-        heat, work, taken = (self.state.books / KJ_PER_MOL).tolist()
-        conserved = potential + kinetic - (heat + work + taken)
+        energy, books = seen.energy / KJ_PER_MOL, self.state.books / KJ_PER_MOL
+        conserved = energy - float(books.sum())
         self._conserved = conserved
         volume, stage = self.state.volume, self.scene.stages[moment.stage]
         boxed = volume < np.inf
@@ -363,9 +362,9 @@ class MolecularSimulation(Simulation):
         return Sample(
             step=moment.step,
             time=moment.time,
-            potential=potential,
-            kinetic=kinetic,
-            energy=potential + kinetic,
+            potential=seen.potential / KJ_PER_MOL,
+            kinetic=seen.kinetic / KJ_PER_MOL,
+            energy=energy,
             temperature=seen.temperature,
             volume=volume * 1e-3 if boxed else nan,
             density=self.system.mass / volume / GRAM_PER_CM3 if boxed else nan,
@@ -384,8 +383,8 @@ class MolecularSimulation(Simulation):
             alpha=alpha,
             beta=beta,
             gamma=gamma,
-            heat=heat,
-            work=work,
+            heat=float(books[HEAT]),
+            work=float(books[WORK]),
             pressure_xx=xx,
             pressure_yy=yy,
             pressure_zz=zz,
