@@ -37,7 +37,7 @@ THIN = 0.01
 #: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
 #: Most moves of molecules between two checks; for a body, evaluations of its forces, and looks.
-PATIENCE, BODY_PATIENCE, LOOKS = 100_000, 1_000_000, 512
+PATIENCE, BODY_PATIENCE, LOOKS = 250_000, 1_000_000, 512
 
 
 class Finding(SimulationError):

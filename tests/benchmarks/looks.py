@@ -1,0 +1,80 @@
+"""What looks cost: steps a second of a run with its default output, against those of the engine alone.
+
+    python tests/benchmarks/looks.py --workloads 216,W1,W2,W3 --rounds 5
+
+Both move the same start at constant energy in steps of 2 fs, in turns in one process. The run is that of `rigidmd run`: a
+log, a trajectory, a checkpoint, the estimate of the longest stable step. Its time is that from the first step to the last
+file. The engine takes its steps in one piece, as in peers.py. 216: the smallest box of scaling.py; the others are those of
+peers.py.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from peers import WORKLOADS, choice, start_of
+from scaling import STEP, relax
+from scaling import scene as small
+
+from rigidmd import Scene, Simulation
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import NOW
+
+SMALL = "216"
+VERLET = SCHEMES["velocity_verlet"]
+WARM_UP = 200
+
+
+def scene(name: str, folder: Path, duration: float, **output) -> Scene:
+    """The scene of a workload, for so many ps."""
+    more = {"precision": "mixed", "stages": [{"duration_ps": duration, "timestep_fs": 1e3 * STEP}], "output": output}
+    if name == SMALL:
+        return Scene.from_dict(small(1, **more), folder)
+    return Scene.from_dict(WORKLOADS[name].scene(**more), folder)
+
+
+def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
+    """Median steps a second of the engine and of the run, and the median of their ratios."""
+    alone = Simulation(scene(name, folder, 1.0, trajectory=False))
+    engine, state = alone.engine, alone.state
+
+    def of_engine(steps: int) -> float:
+        began = time.perf_counter()
+        engine.advance(state, VERLET, STEP, int(state.step[NOW]) + steps)
+        return steps / (time.perf_counter() - began)
+
+    def of_run(steps: int) -> float:
+        with tempfile.TemporaryDirectory() as out:
+            whole = scene(name, folder, steps * STEP)
+            return steps / Simulation(whole, Path(out) / "run").run(progress=False).summary["wall_s"]
+
+    of_engine(WARM_UP)
+    steps = max(100, round(seconds * of_engine(WARM_UP)))
+    of_run(100)
+    found = [(of_engine(steps), of_run(steps)) for _ in range(rounds)]
+    engine_speed, run_speed = map(statistics.median, zip(*found, strict=True))
+    return {"engine": engine_speed, "run": run_speed, "ratio": statistics.median(run / bare for bare, run in found)}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    names = [SMALL, *WORKLOADS]
+    parser.add_argument("--workloads", type=choice(names), default=names, help=f"of {','.join(names)}; all")
+    parser.add_argument("--rounds", type=int, default=5, help="5")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement; 10")
+    asked = parser.parse_args()
+    print("| | engine, steps/s | run, steps/s | run over engine |\n|---|---|---|---|")
+    for name in asked.workloads:
+        with tempfile.TemporaryDirectory() as made:
+            folder = Path(made) if name == SMALL else start_of(name, "own").sites_file.parent
+            if name == SMALL:
+                relax(folder)
+            found = measure(name, folder, asked.rounds, asked.seconds)
+        print(f"| {name} | {found['engine']:.4g} | {found['run']:.4g} | {found['ratio']:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
