@@ -16,12 +16,13 @@ from conftest import MOLECULES, ROOT, built, small_scene
 import rigidmd
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.rows import row as row_of_stage
-from rigidmd.assemble.system import build
+from rigidmd.assemble.system import System, build
 from rigidmd.cli import main
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import NOW, TAKEN, State
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.forces.pairs.lists import BUILDS
 from rigidmd.measure.observables import observe
 from rigidmd.output import progress
 from rigidmd.output.log import columns
@@ -664,10 +665,25 @@ def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch
 
 
 def test_a_look_at_a_state_that_was_changed_from_outside_is_anew():
-    system, engine, state = built({"argon": 20}, 25.0)
+    _, engine, state = built({"argon": 20}, 25.0)
     row = SCHEMES["velocity_verlet"]
     engine.advance(state, row, 1e-3, 5, looked=True)
     known = engine.look(state)[1]["lennard_jones"].energy
     state.position[0, 0] += 0.5
     engine.forget()
     assert engine.look(state)[1]["lennard_jones"].energy != known
+
+
+def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
+    """Two stages make two engines, each with lists of its own; the start makes none of its own."""
+    made, engine_of = [], System.engine_of
+    monkeypatch.setattr(System, "engine_of", lambda *given: made.append(engine_of(*given)) or made[-1])
+    stages = [{"duration_ps": 0.01}, {"duration_ps": 0.01}]
+    simulation = Simulation(small_scene({"argon": 20}, 25.0, stages=stages))
+    simulation.start_from(simulation.state)
+    made.clear()
+    simulation._reset()
+    simulation.run()
+    used = [engine for engine in made if engine.workspaces]
+    assert len(used) == 2
+    assert [int(engine.workspaces["lennard_jones"].pairs.counters[BUILDS]) for engine in used] == [1, 1]

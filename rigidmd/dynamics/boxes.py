@@ -21,7 +21,7 @@ from rigidmd.dynamics.gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
 from rigidmd.forces.pairs.space import volume_of
-from rigidmd.forces.terms import PLAIN, TALLIED, load_now
+from rigidmd.forces.terms import TALLIED, load_now
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))

@@ -194,8 +194,8 @@ class Engine:
     def _told(self, load: Load, loading: Loading) -> tuple[Load, dict[str, Tally]]:
         """Copies of a load and of the tallies of its terms."""
         tallies = loading.loader.tallies.copy()
-        told = {name: Tally(float(own[0]), own[1:].reshape(3, 3)) for name, own in zip(self.names, tallies, strict=False)}
-        return Load(load.force.copy(), load.torque_body.copy()), told
+        told = [Tally(float(own[0]), own[1:].reshape(3, 3)) for own in tallies]
+        return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, told, strict=False))
 
     def snapshot(self) -> State:
         """A copy of the state that was last moved."""

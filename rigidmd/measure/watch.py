@@ -256,9 +256,7 @@ def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | N
     return min(own or found, key=lambda pair: pair.share, default=None)
 
 
-def _worst_pair(
-    system: System, molecule: int | None, states: Iterable[tuple[str, State]]
-) -> tuple[str, Pair | None]:
+def _worst_pair(system: System, molecule: int | None, states: Iterable[tuple[str, State]]) -> tuple[str, Pair | None]:
     """Moment and sites of the first overlap of this molecule; without one, of the first of all."""
     first: tuple[str, Pair | None] = ("", None)
     for where, state in states:

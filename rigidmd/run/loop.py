@@ -406,11 +406,11 @@ class Simulation(Base):
                     ahead += [max(1, int(PIECE / pace))] if pace > 0 else []
                     to = min([stretch.steps, *(done + steps for steps in ahead)])
                     shown = [
-                        (n > 0 and (self._counted(observer, stretch) + to) % n == 0)
-                        or (to == stretch.steps and observer.ends)
-                        for observer, n in zip(observers, every, strict=True)
+                        self._is_due(observer, n, stretch, to) for observer, n in zip(observers, every, strict=True)
                     ]
-                    looked = any(now and observer.reads_energies for now, observer in zip(shown, observers, strict=True))
+                    looked = any(
+                        due and observer.reads_energies for observer, due in zip(observers, shown, strict=True)
+                    )
                     began = clock.perf_counter()
                     self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
                     seconds = clock.perf_counter() - began
@@ -450,6 +450,12 @@ class Simulation(Base):
     def _counted(observer: Observer, stretch: Stretch) -> int:
         """Steps before a stretch that an observer counts: intervals of time may continue from the previous stretch."""
         return stretch.counted if observer.interval is not None else 0
+
+    @classmethod
+    def _is_due(cls, observer: Observer, every: int, stretch: Stretch, done: int) -> bool:
+        """Whether an observer looks after so many steps of a stretch."""
+        last = done == stretch.steps and observer.ends
+        return last or (every > 0 and (cls._counted(observer, stretch) + done) % every == 0)
 
     @staticmethod
     def _show(observers: list[Observer], moment: Moment, due: list[bool]) -> None:
