@@ -21,7 +21,7 @@ class Moment:
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
-        self._run = run
+        self._run, self._state = run, run.state
         self.step = step
         self.time = time
         self.stage = stage
@@ -29,7 +29,7 @@ class Moment:
     @cached_property
     def state(self) -> State:
         """The state of the run."""
-        return State(*(_read_only(array) for array in self._run.state))
+        return State(*(_read_only(array) for array in self._state))
 
     @cached_property
     def _seen(self) -> Any:
