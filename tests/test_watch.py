@@ -455,3 +455,34 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
         )
         said.append(done.stdout.strip() or done.stderr)
     assert said == ["2.0", "3.0"]
+
+
+def test_what_went_wrong_is_found_between_looks(monkeypatch):
+    """Soon after a collapse nothing is where it was; the state at which it is seen is found by computing again."""
+    ion = {"name": "ion", "count": 5, "sites": [site("X", 20.0, charge=-1.0)]}
+    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.05, "timestep_fs": 1.0},
+              {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "nose_hoover", "duration_ps": 2.0,
+               "timestep_fs": 1.0}]  # fmt: skip
+    scene = small_scene({}, 20.0, molecules=[{"model": "tip4p2005", "count": 20}, ion], stages=stages)
+    pair_in_core, seen = watch.pair_in_core, []
+
+    def only_between(system, state, molecule):
+        seen.append(int(state.step[NOW]))
+        return pair_in_core(system, state, molecule) if len(seen) > 2 else None
+
+    monkeypatch.setattr(watch, "pair_in_core", only_between)
+    said = stopped(scene)
+    assert any(f"at step {step}, " in said for step in seen[2:])
+    assert "Likely cause: a charge on a site without repulsion" in said
+
+
+def test_a_long_way_back_is_not_computed_again(monkeypatch):
+    monkeypatch.setattr(watch, "patience", lambda system: 20)
+    monkeypatch.setattr(watch, "PATIENCE", 1)
+    advanced, advance = [], Engine.advance
+    monkeypatch.setattr(
+        Engine, "advance", lambda self, state, *rest: advanced.append(state) or advance(self, state, *rest)
+    )
+    scene = water(16.0, stages=[{"duration_ps": 160.0, "timestep_fs": 16.0}])
+    stopped(scene)
+    assert len({id(state) for state in advanced}) <= 2  # that of compiling, that of the run

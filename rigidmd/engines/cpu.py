@@ -219,6 +219,7 @@ class Engine:
         pairs = zip(self.names, own, strict=False)
         self._workspaces = tuple(recalled(workspace, kept.get(name, {})) for name, workspace in pairs) or own
         self.load, self._stale = no_load(state), LOAD not in kept
+        self._loadings.pop("steps", None)  # what it knows of energies belongs to another moment
         if LOAD in kept:
             _fill(self.load, kept[LOAD])
         if BOX in kept:

@@ -433,19 +433,21 @@ class MolecularSimulation(Simulation):
 
     def _suspects(self) -> Iterator[tuple[str, State]]:
         """States of a run that failed, with the words for their moments: now; the last good one; those between, which
-        are computed again, because soon after a collapse nothing is where it was."""
+        are computed again if that is soon done, because after a collapse nothing is where it was."""
         yield "", self.state
         if (good := self._sampler.last_good) is None:
             return
         yield f"at step {good.step}, ", good.state
-        steps = int(self.state.step[NOW]) - good.step
-        if isinstance(self.engine, Engine) and steps > 0 and not self.scene.stages[self._stage].is_minimisation:
-            state = good.state.copy()
+        steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.stretch.row
+        short = 0 < steps * len(system.model.species) <= REPLAYED * watch.PATIENCE
+        if short and isinstance(self.engine, Engine) and not (self.stretch.act or system.told):
+            same = good.state.bath.shape == self.state.bath.shape
+            state = good.state.copy() if same else self.engine.begin(good.state, row)
             self.engine.forget()
             for k in range(1, REPLAYED):
                 to = good.step + steps * k // REPLAYED
                 try:
-                    self.engine.advance(state, self.stretch.row, self.stretch.dt, to)
+                    self.engine.advance(state, row, self.stretch.dt, to)
                 except SimulationError:
                     return
                 yield f"at step {to}, ", state
