@@ -251,9 +251,9 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluate, advance = Engine.evaluate, Engine.advance
     monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state))
 
-    def counted(self, state, scheme, dt, until, looked=False):
+    def counted(self, state, scheme, dt, until):
         loads.append(until - state.step[NOW])
-        return advance(self, state, scheme, dt, until, looked)
+        return advance(self, state, scheme, dt, until)
 
     monkeypatch.setattr(Engine, "advance", counted)
     ends, costs = [], []

@@ -113,7 +113,7 @@ def edges_and_angles(cell: np.ndarray) -> list[float]:
     a, b, c = cell.tolist()
     edges = [hypot(*edge) for edge in (a, b, c)]
     pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
-    angles = [degrees(acos(max(-1.0, min(1.0, sum(map(mul, u, v)) / size)))) for u, v, size in pairs]
+    angles = [degrees(acos(max(min(sum(map(mul, u, v)) / size, 1.0), -1.0))) for u, v, size in pairs]
     return [*edges, *angles]
 
 

@@ -74,15 +74,15 @@ def patience(system: System) -> int:
     return max(20, PATIENCE // len(system.model.species))
 
 
-def is_worth_it(system: System) -> bool:
-    """Whether checks between samples come clearly more often than samples, which check too."""
+def steps_between(system: System) -> int | None:
+    """Steps between two checks besides those of samples; None where samples come at least as often."""
     interval = system.scene.output.log_interval_ps
     steps = [
         inf if stage.is_open else interval / (stage.timestep_fs * FEMTOSECOND)
         for stage in system.scene.stages
         if not stage.is_minimisation
     ]
-    return max(steps, default=0.0) > 1.5 * patience(system)
+    return patience(system) if max(steps, default=0.0) > patience(system) else None
 
 
 def thermal_energy(system: System, kinetic: float) -> float:

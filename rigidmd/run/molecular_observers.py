@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class LogFile(Observer):
     """log.csv: a line for each sample, written to disk at once."""
 
-    ends = reads_energies = True
+    ends = True
 
     def __init__(self, interval: float, tensor: bool):
         self.interval, self._tensor = interval, tensor
@@ -66,8 +66,6 @@ class LogFile(Observer):
 
 class PressureTensor(Observer):
     """pressure_tensor.csv: the pressure tensor at an interval of its own; without a folder in memory."""
-
-    reads_energies = True
 
     def __init__(self, interval: float):
         self.interval = interval
@@ -124,7 +122,7 @@ class Good(NamedTuple):
 class Sampler(Observer):
     """Keeps samples, checks each against the limits of the scene, and keeps the last state that was good."""
 
-    ends = reads_energies = True
+    ends = True
 
     def __init__(self, run: "MolecularSimulation", interval: float, check: watch.StepCheck):
         self.interval = interval
@@ -195,7 +193,7 @@ class StepWatch(Observer):
     ends = True
 
     def __init__(self, run: "MolecularSimulation", check: watch.StepCheck):
-        self.steps = watch.patience(run.system)
+        self.steps = watch.steps_between(run.system)
         self._run, self._check = run, check
 
     def see(self, moment: Moment) -> None:

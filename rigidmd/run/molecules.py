@@ -14,7 +14,7 @@ from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.compile.machine import threads_for
-from rigidmd.core.state import HEAT, NOW, TAKEN, WORK, State, state_of
+from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.measure import watch
@@ -345,7 +345,7 @@ class MolecularSimulation(Simulation):
         stage = self.scene.stages[moment.stage]
         is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
         step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
-        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage), moved=True)
+        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage))
 
     def sample_of(self, moment: Moment) -> Sample:
         """A line of the log. Its drift is counted from the last sample before its stage."""
@@ -402,7 +402,7 @@ class MolecularSimulation(Simulation):
         check = watch.StepCheck(self.system, self.scene.watch)
         self._sampler = Sampler(self, interval, check)
         observers: list[Observer] = [self._sampler]
-        if not self.scene.engine.is_other and watch.is_worth_it(self.system):  # others look after their own steps
+        if not self.scene.engine.is_other:  # others look after their own steps
             observers.append(StepWatch(self, check))
         files: list[Observer] = []
         if output.trajectory:
@@ -441,11 +441,12 @@ class MolecularSimulation(Simulation):
         steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.stretch.row
         short = 0 < steps * len(system.model.species) <= REPLAYED * watch.PATIENCE
         if short and isinstance(self.engine, Engine) and not (self.stretch.act or system.told):
-            same = good.state.bath.shape == self.state.bath.shape
-            state = good.state.copy() if same else self.engine.begin(good.state, row)
+            state = good.state.copy()
+            if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
+                state = self.engine.begin(state, row)
+                state.begin_stretch()
             self.engine.forget()
-            for k in range(1, REPLAYED):
-                to = good.step + steps * k // REPLAYED
+            for to in sorted({good.step + steps * k // REPLAYED for k in range(1, REPLAYED)} - {good.step}):
                 try:
                     self.engine.advance(state, row, self.stretch.dt, to)
                 except SimulationError:
