@@ -316,7 +316,7 @@ def test_a_kernel_is_compiled_once_for_all_constant_arguments():
 
 
 def compiled_functions():
-    """(name, tree, whether it is a task or inlined, whether it has fastmath, the options) of all compiled functions."""
+    """(name, tree, the options) of all compiled functions."""
     for path in (ROOT / "rigidmd").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
@@ -325,28 +325,12 @@ def compiled_functions():
                 if kind in ("kernel", "task", "implements"):
                     keys = {key.arg: ast.unparse(key.value) for key in call.keywords}
                     name = ast.unparse(call.args[0]).rpartition(".")[2] if kind == "implements" else node.name
-                    fast = "fastmath" in keys or (kind == "implements" and len(call.args) > 1)
-                    yield name, node, kind == "task" or keys.get("inline") == "True", fast, keys
-
-
-def test_what_has_fastmath_is_never_called_by_name():
-    """A second copy of it, compiled by itself, may add in another order, and which copy runs depends on the process."""
-    found = list(compiled_functions())
-    fast = {name for name, _, _, has, _ in found if has}
-    assert {"pair", "block_forces", "radial"} <= fast
-    while more := {
-        name
-        for name, tree, *_ in found
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and ast.unparse(call.func).rpartition(".")[2] in fast and name not in fast
-    }:
-        fast |= more
-    assert [name for name, _, inlined, *_ in found if name in fast and not inlined] == []
+                    yield name, node, keys
 
 
 def test_loops_without_counted_references_take_elements_by_their_index():
     """Iterating over a view of an array, uncounted, ended in a crash; over ranges and tuples it is safe."""
-    uncounted = [(name, tree) for name, tree, *_, keys in compiled_functions() if keys.get("counted") == "False"]
+    uncounted = [(name, tree) for name, tree, keys in compiled_functions() if keys.get("counted") == "False"]
     assert {"block_forces", "place_block", "update_list"} <= {name for name, _ in uncounted}
     strange = []
     for name, tree in uncounted:

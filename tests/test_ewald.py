@@ -14,7 +14,7 @@ from scipy.special import erfc, hyp1f1
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.compile import PAIR_FLAGS, kernel, lanes
+from rigidmd.compile import kernel, lanes
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
@@ -142,7 +142,7 @@ def test_a_table_serves_where_it_is_accurate_enough():
         assert screening_of_lanes(alpha, cutoff, np.float64) == screening(alpha, cutoff)
 
 
-@kernel(fastmath=PAIR_FLAGS, outer=True)
+@kernel(outer=True)
 def screened_pairs(law, r2, energy, force):
     for i in range(0, len(r2), lanes.width_of(r2)):
         at = lanes.load(r2, i)

@@ -307,6 +307,31 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
         Loading((own,), called=False).bind((own._replace(sites=sites),), state, no_load(state))
 
 
+WAVY = {"name": "wavy", "energy": "A*exp(-B*r) - C/r**6 + 0.1*sin(r)*log(r)", "truncation": "force_switch",
+        "parameters": {"Ar": {"A": 4e5, "B": 3.7, "C": 5e3}, "Kr": {"A": 6e5, "B": 3.6, "C": 6e3}}}  # fmt: skip
+ALIKE = {
+    "one kind": ({"argon": 60}, 20.0, {"truncation": "smooth_switch"}),
+    "no box": ({"spce": 20, "argon": 6}, None, {}),
+    "charges": ({"spce": 30, "nitrogen": 15}, 16.0, {"truncation": "switch"}),
+    "damped": ({"spce": 30}, 16.0, {"electrostatics": "damped_shifted_force"}),
+    "a text": ({"argon": 30, "krypton": 30}, 20.0, {"lennard_jones": False, "custom": [WAVY]}),
+}
+
+
+@pytest.mark.parametrize("precision", ["mixed", "double"])
+@pytest.mark.parametrize("name", ALIKE)
+def test_forces_have_the_same_bits_with_their_energies_and_without(name, precision):
+    """A run must not depend on who looks at it, and looks take the energies of its own steps."""
+    counts, edge, forces = ALIKE[name]
+    forces = forces | ({"cutoff_A": 7.0} if edge else {})
+    _, engine, state = built(counts, edge, 3, spread=0.05, forces=forces, precision=precision)
+    for _ in range(3):
+        move(engine, state, SCHEMES["velocity_verlet"], 1e-3, 4)
+        load, _ = engine.evaluate(state)
+        assert np.array_equal(load.force, engine.load.force)
+        assert np.array_equal(load.torque_body, engine.load.torque_body)
+
+
 def test_the_list_is_rebuilt_for_moves_and_for_turns():
     system, engine, state = built({"spce": 30}, 16.0, 6, forces={"cutoff_A": 7.0, "skin_A": 0.8})
     oracle = Oracle(system)

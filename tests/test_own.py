@@ -16,7 +16,7 @@ import rigidmd
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.compile import PAIR_FLAGS, kernel, lanes
+from rigidmd.compile import kernel, lanes
 from rigidmd.compile.numba_private import Index
 from rigidmd.core import own_code
 from rigidmd.errors import SceneError, SimulationError
@@ -49,7 +49,7 @@ def points(**sections) -> rigidmd.MolecularScene:
 # --- functions of vectors --------------------------------------------------------------------------------------------
 
 
-@kernel(fastmath=PAIR_FLAGS, outer=True)
+@kernel(outer=True)
 def every_function(x, y, out):
     for i in range(0, len(x), lanes.width_of(x)):
         a, b = lanes.load(x, i), lanes.load(y, i)
@@ -59,7 +59,7 @@ def every_function(x, y, out):
 
 
 @pytest.mark.parametrize("dtype, error", [(np.float64, 4.5e-16), (np.float32, 2e-7)])
-def test_functions_of_vectors_are_right_to_the_last_digits_under_the_flags_of_a_pair_loop(dtype, error):
+def test_functions_of_vectors_are_right_to_the_last_digits(dtype, error):
     rng = np.random.default_rng(1)
     n = 4096
     x = (10 ** rng.uniform(-2, 1.9, n)).astype(dtype)

@@ -78,7 +78,7 @@ class Clockwork:
         """As `Engine.begin`."""
         return state.copy()
 
-    def advance(self, state, scheme, dt, until):
+    def advance(self, state, scheme, dt, until, looked=False):
         """As `Engine.advance`."""
         steps, self.at = max(0, until - self.at), until
         if self.at > self.lasts:

@@ -11,14 +11,16 @@ import time
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from conftest import MOLECULES, ROOT, small_scene
+from conftest import MOLECULES, ROOT, built, small_scene
 
 import rigidmd
 from rigidmd.assemble.describe import describe
+from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.cli import main
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import NOW, TAKEN, State
+from rigidmd.engines.cpu import Engine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.forces.pairs.lists import BUILDS
 from rigidmd.measure.observables import observe
@@ -616,6 +618,94 @@ def test_output_goes_to_runs_by_default(tmp_path):
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert forced.returncode == 0
+
+
+NPT = {"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0}
+ROWS = {
+    "nve": {},
+    "langevin": {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "langevin"},
+    "nose_hoover": {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "nose_hoover"},
+    "srkn_6": {"integrator": "srkn_6"},
+    "pefrl": {"integrator": "pefrl"},  # it ends with a drift
+    "chin_4a": {"integrator": "chin_4a"},
+    "stochastic_cell": NPT,
+    "monte_carlo": NPT | {"barostat": "monte_carlo"},
+    "piston": {"ensemble": "nph", "pressure_bar": 1.0},
+}
+
+
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+@pytest.mark.parametrize("name", ROWS)
+def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
+    """They are those of an evaluation, to the bit, and the run goes on as if nobody had looked."""
+    forces = {"cutoff_A": 5.5, "electrostatics": "pme", "tail_correction": True}
+    stage = {"duration_ps": 1.0} | ROWS[name]
+    system, engine, start = built(
+        {"spce": 20, "nitrogen": 12}, 12.0, 3, spread=0.05, forces=forces, stages=[stage], precision=precision,
+        fields={"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 3.0},
+    )  # fmt: skip
+    row, other, evaluated = row_of_stage(system, 0), system.engine(), []
+    looked, alone = engine.begin(start, row), other.begin(start, row)
+    evaluate = Engine.evaluate
+    monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(self) or evaluate(self, state))
+    for until in (7, 20, 21, 30):
+        engine.advance(looked, row, 1e-3, until, looked=True)
+        other.advance(alone, row, 1e-3, until)
+        load, tallies = engine.look(looked)
+        assert all(np.array_equal(a, b) for a, b in zip(looked, alone, strict=True))
+        expected, expected_tallies = other.look(alone)
+        assert all(np.array_equal(a, b) for a, b in zip(load, expected, strict=True))
+        for term, tally in expected_tallies.items():
+            assert tallies[term].energy == tally.energy
+            assert np.array_equal(tallies[term].virial, tally.virial)
+    if name not in ("pefrl", "chin_4a", "monte_carlo", "stochastic_cell"):
+        assert engine not in evaluated
+    if name != "piston":  # which knows the virial in any case
+        assert other in evaluated
+
+
+class Spring(rigidmd.Force):
+    """A spring to the origin, which counts how often it is asked."""
+
+    asked = 0
+
+    def on_molecules(self, state):
+        self.asked += 1
+        return 0.5 * (state.position**2).sum(), -state.position
+
+
+def test_a_look_asks_a_force_in_python_once():
+    system = build(small_scene({"argon": 10}, 25.0).with_own([spring := Spring()]))
+    engine, row = system.engine(), SCHEMES["velocity_verlet"]
+    state = engine.begin(system.state, row)
+    engine.advance(state, row, 1e-3, 5, looked=True)
+    asked = spring.asked
+    found = engine.look(state)[1]["spring"].energy
+    assert spring.asked == asked
+    assert found == engine.evaluate(state)[1]["spring"].energy
+    assert spring.asked == asked + 1
+
+
+def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
+    ends = []
+    for interval in (0.01, 0.025):
+        scene = small_scene(
+            {"argon": 40}, 20.0, precision="mixed", stages=[{"duration_ps": 0.2}], forces={"truncation": "smooth_switch"},
+            output={"log_interval_ps": interval},
+        )  # fmt: skip
+        ends.append(rigidmd.Simulation(scene, tmp_path / str(interval)).run().state)
+    assert all(np.array_equal(a, b) for a, b in zip(*ends, strict=True))
+
+
+def test_a_look_at_a_state_that_was_changed_from_outside_is_anew():
+    _, engine, state = built({"argon": 20}, 25.0)
+    row = SCHEMES["velocity_verlet"]
+    engine.advance(state, row, 1e-3, 5, looked=True)
+    known = engine.look(state)[1]["lennard_jones"].energy
+    assert engine.look(state.copy())[1]["lennard_jones"].energy == known
+    state.position[0, 0] += 0.5
+    engine.forget()
+    assert engine.look(state)[1]["lennard_jones"].energy != known
 
 
 def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):

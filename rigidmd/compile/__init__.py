@@ -18,13 +18,12 @@ from rigidmd.compile.code import (
     task,
 )
 from rigidmd.compile.crew import jump_to, set_threads
-from rigidmd.compile.kernels import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile.kernels import implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 
 __all__ = [
     "BLOCKS",
     "MOST_BLOCKS",
-    "PAIR_FLAGS",
     "SIMD_BITS",
     "Code",
     "Parcel",

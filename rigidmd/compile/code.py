@@ -97,9 +97,9 @@ class Task:
         return True
 
 
-def task(*, fastmath=False, counted=True):
+def task(*, counted=True):
     """Turn a function into a `Task`; the options are those of `kernel`."""
-    return lambda function: Task(function, **options_of(fastmath, False), **uncounted(counted))
+    return lambda function: Task(function, **options_of(False), **uncounted(counted))
 
 
 #: Tasks of each `Code` that this thread makes, while it compiles nothing; None otherwise.
@@ -274,11 +274,11 @@ def call_blocks(code, name, parcel, blocks):
     raise TypeError("compiled code only")
 
 
-@overload(call, prefer_literal=True, jit_options=options_of(False, True))
+@overload(call, prefer_literal=True, jit_options=options_of(True))
 def _call(code, name, parcel):
     return lambda code, name, parcel: _jump(address_of(code, name, parcel), parcel, 0)
 
 
-@overload(call_blocks, prefer_literal=True, jit_options=options_of(False, True))
+@overload(call_blocks, prefer_literal=True, jit_options=options_of(True))
 def _call_blocks(code, name, parcel, blocks):
     return lambda code, name, parcel, blocks: _jump_blocks(address_of(code, name, parcel), parcel, blocks)

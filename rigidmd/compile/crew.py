@@ -247,7 +247,7 @@ class _Crew:
     def begin(self) -> None:
         """Compile what the crew does, or read it from the cache, and hire the helpers that are wanted."""
         if not self.code:
-            options = options_of(False, False) | uncounted(False)
+            options = options_of(False) | uncounted(False)
             self.code = [
                 callback(function, (types.int64,) * count, options)
                 for function, count in ((_lead, 4), (_help, 2), (_look, 2))

@@ -8,19 +8,16 @@ from numba.extending import overload
 
 from rigidmd.compile.numba_private import dispatcher, uncounted
 
-# Reassociation and contraction let LLVM keep sums in registers and use FMA. The flags that assume that there are no NaN
-# and no infinity are left out: an invalid number must stay visible.
-PAIR_FLAGS = {"reassoc", "contract", "nsz", "arcp"}
 
-
-def kernel(function: Callable | None = None, *, fastmath: Any = False, inline=False, counted=True, outer=False) -> Any:
+def kernel(function: Callable | None = None, *, inline=False, counted=True, outer=False) -> Any:
     """`numba.njit`, cached on disk.
 
+    There are no fast-math flags. With them LLVM rounds a force otherwise where its energy is computed beside it, and a
+    run would depend on who looks at it; a run from the cache once differed in its last bits from one that compiled.
+    Products and sums of vectors are multiply-adds by what the source says, see `lane_types`.
+
     inline: LLVM inlines the function wherever it is called. For functions in an inner loop: a term is passed as its
-    fields, forty arguments or more, and such a call costs more than a pair of sites. Also for every function with
-    fastmath: Numba may hold two versions of a function that is called by name, one on its own and one compiled into the
-    caller, with sums in different order. Which one runs depends on what else the process has compiled: a run from the
-    cache once differed in its last bits.
+    fields, forty arguments or more, and such a call costs more than a pair of sites.
     counted: False for a loop that makes views of arrays but neither allocates nor returns arrays, and for all that it
     calls: references are then not counted. Atomic reference counting raised a vector of pairs from 7 ns to 47 ns. Such
     a loop must read elements by index: iteration over a view crashed. Its caller must not rebind, in a loop, arrays
@@ -28,18 +25,18 @@ def kernel(function: Callable | None = None, *, fastmath: Any = False, inline=Fa
     outer: True if Python calls the function.
     """
     if function is None:
-        return lambda f: kernel(f, fastmath=fastmath, inline=inline, counted=counted, outer=outer)
-    return dispatcher(function, options_of(fastmath, inline) | uncounted(counted), outer)
+        return lambda f: kernel(f, inline=inline, counted=counted, outer=outer)
+    return dispatcher(function, options_of(inline) | uncounted(counted), outer)
 
 
-def implements(stub, fastmath=False, inline=False, counted=True):
+def implements(stub, inline=False, counted=True):
     """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those of its caller."""
-    return overload(stub, jit_options=options_of(fastmath, inline) | uncounted(counted))
+    return overload(stub, jit_options=options_of(inline) | uncounted(counted))
 
 
-def options_of(fastmath, inline: bool) -> dict:
+def options_of(inline: bool) -> dict:
     """Options that every kernel has."""
-    return {"error_model": "numpy", "fastmath": fastmath} | ({"forceinline": True} if inline else {})
+    return {"error_model": "numpy"} | ({"forceinline": True} if inline else {})
 
 
 def is_a(numba_type, named_tuple) -> bool:

@@ -4,9 +4,7 @@ A formula written with Python's `math` serves single numbers and vectors alike. 
 accurate to about the last digit, in single precision to 2e-7; x**n with a constant whole n is a product, with the
 rounding error of each factor.
 
-Sums of two parts, one of them the rounding error of the other, must not be reassociated. Numba adds the fast-math flags
-of a kernel to every addition and multiplication in it, but not to calls: sums and products here are calls of `fma`,
-which LLVM turns into plain additions where a factor is 1.
+Sums of two parts, one of them the rounding error of the other, must not be reassociated: no kernel has fast-math flags.
 
 Methods: reduction of the argument by parts of ln 2 and pi/2 (Cody & Waite 1980), the logarithm with s = f/(2 + f) as in
 fdlibm, powers from a logarithm in two doubles (Dekker 1971); polynomials are truncated series.
@@ -33,7 +31,7 @@ LONGEST_ANGLE = 1e13
 
 
 class Vector:
-    """Operations on vectors of one type, which LLVM does not reassociate."""
+    """Operations on vectors of one type, each rounded as written."""
 
     def __init__(self, builder, lanes: Lanes):
         self.builder = builder
@@ -62,13 +60,13 @@ class Vector:
         return self.call("fma", a, b, c)
 
     def add(self, a, b):
-        return self.fma(a, self.number(1.0), b)
+        return self.builder.fadd(a, b)
 
     def sub(self, a, b):
-        return self.fma(b, self.number(-1.0), a)
+        return self.builder.fsub(a, b)
 
     def mul(self, a, b):
-        return self.fma(a, b, self.number(-0.0))
+        return self.builder.fmul(a, b)
 
     def div(self, a, b):
         return self.builder.fdiv(a, b)

@@ -7,13 +7,11 @@ import operator
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from rigidmd.compile.kernels import PAIR_FLAGS
 from rigidmd.compile.machine import SIMD_BITS
 
-#: The fast-math flags of operations on vectors.
-FLAGS = tuple(sorted(PAIR_FLAGS))
 #: Lanes of a vector on this machine, by the type of its numbers.
 COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
 
@@ -90,10 +88,44 @@ def _operator(functions, emit, result=lambda lanes: lanes):
             lower_builtin(function, *kinds)(lower)
 
 
-_operator([operator.add, operator.iadd], lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
-_operator([operator.sub, operator.isub], lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
-_operator([operator.mul, operator.imul], lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
-_operator([operator.truediv, operator.itruediv], lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
+# A product and a sum in one expression are one multiply-add, rounded once, chosen here and not by LLVM: what a kernel
+# computes then follows from its source alone, whatever else is compiled into it.
+
+
+def _is_product(value) -> bool:
+    return isinstance(value, ir.Instruction) and value.opname == "fmul"
+
+
+def multiply_add(builder, a, b, c):
+    """a b + c; rounded once on machines that can do so as fast as they multiply."""
+    kind = ir.FunctionType(c.type, [c.type] * 3)
+    element = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}[getattr(c.type, "element", c.type)]
+    name = f"v{c.type.count}{element}" if isinstance(c.type, ir.VectorType) else element
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.{name}"), [a, b, c])
+
+
+def add(builder, a, b):
+    """a + b, where either may be a product."""
+    if _is_product(b):
+        return multiply_add(builder, *b.operands, a)
+    if _is_product(a):
+        return multiply_add(builder, *a.operands, b)
+    return builder.fadd(a, b)
+
+
+def subtract(builder, a, b):
+    """a - b, where either may be a product."""
+    if _is_product(b):
+        return multiply_add(builder, builder.fneg(b.operands[0]), b.operands[1], a)
+    if _is_product(a):
+        return multiply_add(builder, *a.operands, builder.fneg(b))
+    return builder.fsub(a, b)
+
+
+_operator([operator.add, operator.iadd], add)
+_operator([operator.sub, operator.isub], subtract)
+_operator([operator.mul, operator.imul], lambda builder, a, b: builder.fmul(a, b))
+_operator([operator.truediv, operator.itruediv], lambda builder, a, b: builder.fdiv(a, b))
 
 
 def _compare(function, sign):

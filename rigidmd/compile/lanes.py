@@ -18,12 +18,11 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from rigidmd.compile import (
-    PAIR_FLAGS,
     SIMD_BITS,
     implements,
     lane_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
 )
-from rigidmd.compile.lane_types import COUNT, FLAGS, Lanes, Mask, filled
+from rigidmd.compile.lane_types import COUNT, Lanes, Mask, filled, multiply_add
 from rigidmd.compile.machine import PROCESSOR_FEATURES
 
 #: Whether this machine has the instructions that `picked` and the estimates of 1/x and 1/sqrt(x) use.
@@ -155,7 +154,11 @@ def align_stack(typing):
 # --- functions of lanes ----------------------------------------------------------------------------------------------
 
 
-def _call(builder, name, result, *arguments, flags=FLAGS):
+#: What LLVM needs to be told before it replaces a division or a root by the hardware's estimate and a step of Newton's.
+ESTIMATED = ("afn", "arcp", "contract", "nsz", "reassoc")
+
+
+def _call(builder, name, result, *arguments, flags=()):
     """Call an LLVM intrinsic."""
     kind = ir.FunctionType(result, [a.type for a in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments, fastmath=flags)
@@ -168,11 +171,11 @@ def _suffix(kind) -> str:
 
 
 def _square_root(builder, value):
-    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=(*FLAGS, "afn"))
+    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=ESTIMATED)
 
 
 def _inverted(builder, value):
-    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=(*FLAGS, "afn"))
+    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=ESTIMATED)
 
 
 @intrinsic
@@ -218,7 +221,7 @@ def inverse_root(x):
     raise TypeError("compiled code only")
 
 
-@implements(inverse_root, PAIR_FLAGS, inline=True)
+@implements(inverse_root, inline=True)
 def _inverse_root(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / sqrt(x)
@@ -245,11 +248,14 @@ def _inverse_root(x):
 
 
 def inverse_cube(x):
-    """1/sqrt(x)³, accurate to about the last digit."""
+    """Two numbers whose product is 1/sqrt(x)³, accurate to about the last digit.
+
+    The caller multiplies them, in one multiply-add with what is added to the cube.
+    """
     raise TypeError("compiled code only")
 
 
-@implements(inverse_cube, PAIR_FLAGS, inline=True)
+@implements(inverse_cube, inline=True)
 def _inverse_cube(x):
     if _has_estimate(x) and x.dtype == types.float32:
 
@@ -259,13 +265,13 @@ def _inverse_cube(x):
             # 5 % longer.
             y = _estimate(x)
             y2 = y * y
-            return y * y2 * (2.5 - 1.5 * x * y2)
+            return y * y2, 2.5 - 1.5 * x * y2
 
         return from_estimate
 
     def cubed(x):
         y = inverse_root(x)
-        return y * y * y
+        return y, y * y
 
     return cubed
 
@@ -341,7 +347,7 @@ def inverse(x):
     raise TypeError("compiled code only")
 
 
-@implements(inverse, PAIR_FLAGS, inline=True)
+@implements(inverse, inline=True)
 def _inverse(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / x
@@ -385,7 +391,7 @@ def larger(x, y):
     raise TypeError("compiled code only")
 
 
-@implements(larger, PAIR_FLAGS, inline=True)
+@implements(larger, inline=True)
 def _larger_of_both(x, y):
     if isinstance(x, Lanes):
         return lambda x, y: _larger(x, y)
@@ -397,7 +403,7 @@ def smaller(x, y):
     raise TypeError("compiled code only")
 
 
-@implements(smaller, PAIR_FLAGS, inline=True)
+@implements(smaller, inline=True)
 def _smaller_of_both(x, y):
     if isinstance(x, Lanes):
         return lambda x, y: _smaller(x, y)
@@ -471,7 +477,7 @@ def largest(typing, x):
     """The largest of all lanes; undefined if a lane is NaN."""
 
     def emit(context, builder, signature, arguments):
-        kind, flags = arguments[0].type, (*FLAGS, "nnan")
+        kind, flags = arguments[0].type, ("nnan",)
         return _call(builder, f"llvm.vector.reduce.fmax.{_suffix(kind)}", kind.element, *arguments, flags=flags)
 
     return x.dtype(x), emit
@@ -509,14 +515,14 @@ def polynomial(typing, coefficients, x):
         def chain(powers, y):
             total = constant(powers[-1])
             for k in powers[-2::-1]:
-                total = builder.fadd(builder.fmul(total, y, flags=FLAGS), constant(k), flags=FLAGS)
+                total = multiply_add(builder, total, y, constant(k))
             return total
 
-        square = builder.fmul(x_value, x_value, flags=FLAGS)
+        square = builder.fmul(x_value, x_value)
         even, odd = range(0, len(kinds), 2), range(1, len(kinds), 2)
         found = chain(even, square)
         if len(odd):
-            found = builder.fadd(builder.fmul(chain(odd, square), x_value, flags=FLAGS), found, flags=FLAGS)
+            found = multiply_add(builder, chain(odd, square), x_value, found)
         return found
 
     return x(coefficients, x), emit
@@ -554,17 +560,17 @@ def cubic_at(typing, coefficients, t):
                 if number.type != vector.element:
                     number = builder.fptrunc(number, vector.element)
                 parts[c] = builder.insert_element(parts[c], number, place)
-        x = builder.fsub(value, starts, flags=FLAGS)
+        x = builder.fsub(value, starts)
         curved = [builder.select(begins, zero, part) for part in parts[2:]]
 
         def sum_of(*terms):
             total = terms[-1]
             for term in terms[-2::-1]:
-                total = builder.fadd(term, builder.fmul(total, x, flags=FLAGS), flags=FLAGS)
+                total = multiply_add(builder, total, x, term)
             return total
 
         def times(k, part):
-            return builder.fmul(ir.Constant(vector, [float(k)] * lanes.count), part, flags=FLAGS)
+            return builder.fmul(ir.Constant(vector, [float(k)] * lanes.count), part)
 
         found = sum_of(*parts[:2], *curved), sum_of(parts[1], times(2, curved[0]), times(3, curved[1]))
         if not isinstance(t, Lanes):
@@ -618,7 +624,7 @@ def parted(typing, x):
 
     def emit(context, builder, signature, arguments):
         step = builder.fptosi(arguments[0], context.get_value_type(whole))
-        rest = builder.fsub(arguments[0], builder.sitofp(step, arguments[0].type), flags=FLAGS)
+        rest = builder.fsub(arguments[0], builder.sitofp(step, arguments[0].type))
         return context.make_tuple(builder, pair, (step, rest))
 
     return pair(x), emit

@@ -1,7 +1,6 @@
 """What compiles functions of users."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numba
 from numba.core.errors import NumbaError
@@ -12,6 +11,6 @@ from rigidmd.compile.kernels import options_of
 CompileError = NumbaError
 
 
-def foreign(function: Callable, fastmath: Any = False, inline: bool = False) -> Callable:
+def foreign(function: Callable, inline: bool = False) -> Callable:
     """A user's function for compiled code, with the options that a kernel has; it is not kept on disk by itself."""
-    return numba.njit(**options_of(fastmath, inline))(getattr(function, "py_func", function))
+    return numba.njit(**options_of(inline))(getattr(function, "py_func", function))

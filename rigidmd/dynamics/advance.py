@@ -11,7 +11,7 @@ from rigidmd.dynamics.baths import apply, bath_code
 from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import blocks_of
-from rigidmd.forces.terms import is_driven, total_energy_rate
+from rigidmd.forces.terms import PLAIN, TALLIED, is_driven, total_energy_rate
 from rigidmd.mechanics.groups import GROUP, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
@@ -49,6 +49,7 @@ class Row(NamedTuple):
     moment: np.ndarray  # (flows,) of the time step: when each ends, as drifts count
     every: np.ndarray  # (flows,) taken in every so many steps of a stretch
     gradient: np.ndarray | None  # (flows,) of dt²; None where no kick has one, and none is compiled
+    last: int  # the last drift
 
 
 def row_of(scheme: Scheme) -> Row:
@@ -56,20 +57,22 @@ def row_of(scheme: Scheme) -> Row:
     kind = np.array([flow.kind for flow in scheme.flows])
     fraction = np.array([flow.fraction for flow in scheme.flows])
     moment = np.cumsum(np.where(kind == DRIFT, fraction, 0.0))
-    moment[np.flatnonzero(kind == DRIFT)[-1] :] = 1.0
+    last = int(np.flatnonzero(kind == DRIFT)[-1])
+    moment[last:] = 1.0
     gradient = np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None
     every = np.array([flow.every for flow in scheme.flows])
-    return Row(kind, fraction, moment, every, gradient)
+    return Row(kind, fraction, moment, every, gradient, last)
 
 
 @kernel(outer=True)
-def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, cursor):
+def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor):
     """Step until `until` steps of dt have been taken, counted in state.step.
 
     code : see `code_of`
     terms : of a body its workspaces, of molecules a `Loader`
     probe : room for gradients; None compiles none
     heat, room : of a bath, of a box (`baths.heat_room`, `boxes.box_room`)
+    looked : whether the forces at the end are computed with their energies and virials, if a kick needs them there
     cursor (3,) : flows done in this step; whether `load` is that of the present positions (1) or that with the gradient
         (2); whether a move of the box is made and not yet judged
 
@@ -83,7 +86,8 @@ def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, 
             if row.kind[k] == KICK:
                 if probe is None:
                     if cursor[1] == 0:
-                        status = load_for(box, terms, state, load, room, row)
+                        last = looked and state.step[NOW] + 1 == until and k > row.last
+                        status = load_for(box, terms, state, load, room, row, TALLIED if last else PLAIN)
                         if status != OK:
                             return status
                         cursor[1] = 1

@@ -21,7 +21,7 @@ from rigidmd.dynamics.gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
 from rigidmd.forces.pairs.space import volume_of
-from rigidmd.forces.terms import PLAIN, TALLIED, load_now
+from rigidmd.forces.terms import TALLIED, load_now
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -134,8 +134,11 @@ def box_room(state: State) -> BoxRoom:
     )
 
 
-def load_for(box, terms, state, load, room, row):
-    """Forces and torques at the present positions, with energies in a step in which the box moves; a status code."""
+def load_for(box, terms, state, load, room, row, which):
+    """Forces and torques at the present positions; a status code.
+
+    which : PLAIN, or TALLIED for energies and virials too, which a step in which the box moves always computes
+    """
     raise TypeError("compiled code only")
 
 
@@ -150,16 +153,16 @@ def stretch(box, state, h):
 
 
 @implements(load_for, inline=True)
-def _load_for(box, terms, state, load, room, row):
+def _load_for(box, terms, state, load, room, row, which):
     if is_a(box, NoBox):
-        return lambda box, terms, state, load, room, row: load_now(terms, state, load, PLAIN)
+        return lambda box, terms, state, load, room, row, which: load_now(terms, state, load, which)
 
-    def with_energies(box, terms, state, load, room, row):
+    def with_energies(box, terms, state, load, room, row, which):
         room.known[0] = 0
         for k in range(len(row.kind)):
             if row.kind[k] == BOX and (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] == 0:
                 return tally_bodies(terms, state, load, room)
-        return load_now(terms, state, load, PLAIN)
+        return load_now(terms, state, load, which)
 
     return with_energies
 
@@ -169,7 +172,9 @@ def tally_bodies(terms, state, load, room):
     """Forces and torques, energies and virial at the present positions; a status code."""
     status = load_now(terms, state, load, TALLIED)
     for k in range(TALLY_SIZE):
-        room.tally[0, k] = terms.tally[k]
+        room.tally[0, k] = 0.0
+        for tally in terms.tallies:
+            room.tally[0, k] += tally[k]
     room.known[0] = 1 if status == OK else 0
     return status
 
@@ -244,6 +249,7 @@ def _move_box(box, model, terms, state, load, room, cursor, h, draw):
             state.books[WORK] += energy_gained(box, model, state, room)
         else:
             take_back(state, load, room)
+            terms.known[0] = 0
         return OK
 
     return try_move

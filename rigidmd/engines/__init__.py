@@ -22,12 +22,19 @@ class Engine(Protocol):
         """A copy of a state, with room for all variables that a row moves."""
         ...
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
-        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
+        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError.
+
+        looked : whether `look` follows; speed only
+        """
         ...
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
+        ...
+
+    def look(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """`evaluate` at the state that was just moved; what its last step has computed is not computed again."""
         ...
 
     def snapshot(self) -> State:

@@ -37,7 +37,7 @@ from rigidmd.forces.terms import (
     Setup,
     memory_of,
     recalled,
-    tally_one,
+    tally_now,
     with_code,
     with_room,
     workspace_of,
@@ -124,8 +124,11 @@ class Engine:
         variables = getattr(row.bath, "variables", 0) + isinstance(row.box, Piston)
         return state.copy()._replace(bath=np.zeros(variables))
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
-        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
+        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError.
+
+        looked : whether `look` follows; speed only
+        """
         row = _scheme_of(row)
         workspaces = self._prepare(state)
         keep_time(state, dt)
@@ -142,7 +145,7 @@ class Engine:
         cursor = np.array([0, not self._stale, 0], np.int64)
         if self._row is None or self._row[0] is not row:
             self._row = row, row_of(row)
-        rest = (bath, box, self._row[1], probe, self._heat, room, float(dt), int(until), cursor)
+        rest = (bath, box, self._row[1], probe, self._heat, room, float(dt), int(until), looked, cursor)
         while status := self._step(model, state, self.load, workspaces, rest):
             workspaces = self._answer(status, state)
         self._stale = cursor[1] == 0  # true also if there was no step, so that no forces were evaluated
@@ -176,18 +179,23 @@ class Engine:
         workspaces = self._prepare(state)
         if self._seen is None or len(self._seen.force) != len(state.velocity):
             self._seen = no_load(state)
-        load, tallies = self._seen, {}
-        for array in load:
-            array[:] = 0.0
-        loading = self._loading_for("looks", workspaces)
-        loader = loading.bind(workspaces, state, load)
-        for k, name in enumerate(self.names):
-            while status := tally_one(loader, k):
-                workspaces = self._answer(status, state)
-                loader = loading.bind(workspaces, state, load)
-            tally = loader.tally.copy()
-            tallies[name] = Tally(float(tally[0]), tally[1:].reshape(3, 3))
-        return Load(load.force.copy(), load.torque_body.copy()), tallies
+        load, loading = self._seen, self._loading_for("looks", workspaces)
+        while status := tally_now(loading.bind(workspaces, state, load), *load):
+            workspaces = self._answer(status, state)
+        return self._told(load, loading)
+
+    def look(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """`evaluate` at the state that was just moved; what its last step has computed is not computed again."""
+        moving = self._loadings.get("steps")
+        if state is not self._moved or self._stale or moving is None or not moving.loader.known[0]:
+            return self.evaluate(state)
+        return self._told(self.load, moving)
+
+    def _told(self, load: Load, loading: Loading) -> tuple[Load, dict[str, Tally]]:
+        """Copies of a load and of the tallies of its terms."""
+        tallies = loading.loader.tallies.copy()
+        told = [Tally(float(own[0]), own[1:].reshape(3, 3)) for own in tallies]
+        return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, told, strict=False))
 
     def snapshot(self) -> State:
         """A copy of the state that was last moved."""
@@ -211,6 +219,7 @@ class Engine:
         pairs = zip(self.names, own, strict=False)
         self._workspaces = tuple(recalled(workspace, kept.get(name, {})) for name, workspace in pairs) or own
         self.load, self._stale = no_load(state), LOAD not in kept
+        self._loadings.pop("steps", None)  # what it knows of energies belongs to another moment
         if LOAD in kept:
             _fill(self.load, kept[LOAD])
         if BOX in kept:

@@ -175,7 +175,7 @@ class OdeEngine(Engine):
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._sizes(solver, state, y)])
         return state.copy()._replace(bath=y)
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
         """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError."""
         solver = _solver_of(row)
         self._prepare(state)

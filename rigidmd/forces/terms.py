@@ -129,7 +129,8 @@ class Loader(NamedTuple):
     tallied: np.ndarray  # (terms,) of `_add_tallied`
     rate: np.ndarray | None  # (terms,) of `_add_rate`; None where no term drives
     content: np.ndarray  # (terms,)
-    tally: np.ndarray  # (10,) where energies and virials add up
+    tallies: np.ndarray  # (terms, 10) energy and virial of each
+    known: np.ndarray  # (1,) whether `tallies` are those of the last forces
     status: np.ndarray  # (1,) the worst status code
     power: np.ndarray  # (1,) sum of the rates
 
@@ -137,13 +138,14 @@ class Loader(NamedTuple):
 def loader_for(terms: int, drives: bool) -> Loader:
     """An empty loader for so many terms."""
     plain, tallied, rate, content = np.zeros((4, terms), np.intp)
-    single = np.zeros(1, np.int64), np.zeros(1)
-    return Loader(plain, tallied, rate if drives else None, content, np.zeros(TALLY_SIZE), *single)
+    known, status = np.zeros((2, 1), np.int64)
+    tallies = np.zeros((terms, TALLY_SIZE))
+    return Loader(plain, tallied, rate if drives else None, content, tallies, known, status, np.zeros(1))
 
 
 def term_code(term: NamedTuple, loader: Loader, called: bool) -> Code:
     """The machine code of a term for a loader. called : whether the loop over steps calls it by address."""
-    content = (term, *EXAMPLE, EXAMPLE[1], loader.tally, loader.status, loader.power)
+    content = (term, *EXAMPLE, EXAMPLE[1], loader.tallies[0], loader.status, loader.power)
     tasks = {"tallied": (_add_tallied, content)}
     if called:
         tasks["plain"] = (_add_plain, content)
@@ -172,7 +174,7 @@ def _add_rate(parcel, block):
 
 @kernel(outer=True)
 def _lay_down(loader, k, code, term, state, load, other, room):
-    content = (term, state, load, other, loader.tally, loader.status, loader.power)
+    content = (term, state, load, other, loader.tallies[k], loader.status, loader.power)
     loader.tallied[k] = address_of(code, "tallied", packed(content))  # checks the type
     return laid_down(content, room)
 
@@ -210,12 +212,12 @@ class Loading:
 
 
 @kernel(outer=True)
-def tally_one(loader, k):
-    """Forces of term k, with its energy and virial in `loader.tally`; a status code."""
-    loader.status[0] = OK
-    loader.tally[:] = 0.0
-    jump_to(loader.tallied[k], loader.content[k], TALLIED)
-    return loader.status[0]
+def tally_now(loader, force, torque_body):
+    """Write the forces and torques of all terms, and energies and virials in the loader; a status code.
+
+    force, torque_body : the arrays of the load to which the loader is bound
+    """
+    return load_now(loader, None, Load(force, torque_body), TALLIED)
 
 
 def is_driven(loader: types.Type) -> bool:
@@ -227,7 +229,7 @@ def load_now(terms, state, load, which):
     """Write the forces and torques of all terms at the present positions; the worst status code.
 
     terms : a tuple of terms, or a `Loader`. which : PLAIN, TALLIED or OTHER. A loader knows its loads, and `load` must
-    be the one asked for; energies and virial go into its tally. Of a tuple there are only forces.
+    be the one asked for; energies and virials go into its tallies. Of a tuple there are only forces.
     """
     raise TypeError("compiled code only")
 
@@ -241,13 +243,15 @@ def _load_now(terms, state, load, which):
         clear(load.force)
         clear(load.torque_body)
         terms.status[0] = OK
+        terms.known[0] = 0
         if which == TALLIED:
-            terms.tally[:] = 0.0
+            terms.tallies[:] = 0.0
         for k in range(len(terms.content)):
             address = terms.tallied[k] if which == TALLIED else terms.plain[k]
             jump_to(address, terms.content[k], which)
             if terms.status[0] != OK:  # asked again, all terms begin again: no need to go on
                 return terms.status[0]
+        terms.known[0] = which == TALLIED
         return OK
 
     return load_by_address

@@ -101,11 +101,18 @@ class Observation(NamedTuple):
 
 
 def observe(
-    system: System, engine: Engine, state: State, verlet_step: float = nan, freedom: Freedom | None = None
+    system: System,
+    engine: Engine,
+    state: State,
+    verlet_step: float = nan,
+    freedom: Freedom | None = None,
+    moved: bool = False,
 ) -> Observation:
     """All observables, from one evaluation of forces and energies.
 
     freedom : degrees of freedom that temperatures count; those of a conserved total momentum when not given
+
+    moved : whether the engine has just moved this state, so that it may know its forces and energies
 
     verlet_step : time step (ps) if the state comes from velocity Verlet. Between its kicks the kinetic energy is higher
     than at its steps by dt²/8 [sum F²/m + sum n . I^-1 n] on average: for a mode of frequency w the first is too high
@@ -115,7 +122,7 @@ def observe(
     Pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
     tensor is the symmetric part: the rest is the rate at which orientations take angular momentum up, 0 on average.
     """
-    load, tallies = engine.evaluate(state)
+    load, tallies = engine.look(state) if moved else engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
     volume, beyond = state.volume, 0.0
     if system.tail is not None:

@@ -35,7 +35,7 @@ class OtherEngine(ABC):
         """A copy of a state; what thermostats and barostats evolve is the program's own."""
         return state.copy()._replace(bath=np.zeros(0))
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int) -> None:
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
         """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""
         keep_time(state, dt)
         self._give(state)
@@ -62,6 +62,10 @@ class OtherEngine(ABC):
     @abstractmethod
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
+
+    def look(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """As `evaluate`, which asks the program anew only about other positions than those that it has."""
+        return self.evaluate(state)
 
     @abstractmethod
     def memory(self) -> dict[str, np.ndarray]:

@@ -408,8 +408,11 @@ class Simulation(Base):
                     shown = [
                         self._is_due(observer, n, stretch, to) for observer, n in zip(observers, every, strict=True)
                     ]
+                    looked = any(
+                        due and observer.reads_energies for observer, due in zip(observers, shown, strict=True)
+                    )
                     began = clock.perf_counter()
-                    self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to)
+                    self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
                     place = place._replace(seconds=place.seconds + seconds)

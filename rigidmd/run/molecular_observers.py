@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class LogFile(Observer):
     """log.csv: a line for each sample, written to disk at once."""
 
-    ends = True
+    ends = reads_energies = True
 
     def __init__(self, interval: float, tensor: bool):
         self.interval, self._tensor = interval, tensor
@@ -66,6 +66,8 @@ class LogFile(Observer):
 
 class PressureTensor(Observer):
     """pressure_tensor.csv: the pressure tensor at an interval of its own; without a folder in memory."""
+
+    reads_energies = True
 
     def __init__(self, interval: float):
         self.interval = interval
@@ -122,7 +124,7 @@ class Good(NamedTuple):
 class Sampler(Observer):
     """Keeps samples, checks each against the limits of the scene, and keeps the last state that was good."""
 
-    ends = True
+    ends = reads_energies = True
 
     def __init__(self, run: "MolecularSimulation", interval: float, check: watch.StepCheck):
         self.interval = interval

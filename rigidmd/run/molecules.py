@@ -345,7 +345,7 @@ class MolecularSimulation(Simulation):
         stage = self.scene.stages[moment.stage]
         is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
         step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
-        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage))
+        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage), moved=True)
 
     def sample_of(self, moment: Moment) -> Sample:
         """A line of the log. Its drift is counted from the last sample before its stage."""

@@ -30,6 +30,7 @@ class Observer:
     interval: float | None = None  # ps, or s for a single body
     steps: int | None = None
     ends = False
+    reads_energies = False  # whether it always reads forces or energies: the last step then computes them too
 
     def files(self) -> list[str]:
         """Names of all files that it may write."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import inverse_cube, inverse_root, load, zeros
 from rigidmd.forces.laws.endings import SWITCHES, Name, Plain, Polynomial, Shape, ended, ending, shape_of
 from rigidmd.forces.pairs import loop as pairs
@@ -48,27 +48,28 @@ def reaction_field(
 
 
 def _cube(shape, inverse, r2):
-    """1/r³; without an ending from r² alone, so that forces need no 1/r."""
+    """Two factors of 1/r³; without an ending from r² alone, so that forces need no 1/r."""
     raise TypeError("compiled code only")
 
 
-@implements(_cube, PAIR_FLAGS, inline=True)
+@implements(_cube, inline=True)
 def _cube_of(shape, inverse, r2):
     if is_a(shape, Plain):
         return lambda shape, inverse, r2: inverse_cube(r2)
-    return lambda shape, inverse, r2: inverse * inverse * inverse
+    return lambda shape, inverse, r2: (inverse, inverse * inverse)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+@kernel(inline=True, outer=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
     inverse = inverse_root(r2)
     u = inverse + law.field * r2 + law.end[0]
-    w = _cube(law.shape, inverse, r2) - 2 * law.field
+    one, two = _cube(law.shape, inverse, r2)
+    w = one * two - 2 * law.field
     return ended(law.shape, law.end, r2 * inverse, inverse, u, w)
 
 
-@implements(pairs.pair, PAIR_FLAGS, inline=True)
+@implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if not is_a(law, ReactionField):
         return None

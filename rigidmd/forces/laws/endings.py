@@ -23,7 +23,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Literal, NamedTuple, get_args
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import larger
 
 Name = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
@@ -94,7 +94,7 @@ def ended(shape, end, r, inverse, u, w):
     raise TypeError("compiled code only")
 
 
-@implements(ended, PAIR_FLAGS, inline=True)
+@implements(ended, inline=True)
 def _ended(shape, end, r, inverse, u, w):
     if is_a(shape, Plain):
         return lambda shape, end, r, inverse, u, w: (u, w)
@@ -121,7 +121,7 @@ def _ended(shape, end, r, inverse, u, w):
     return smoothly_switched
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+@kernel(inline=True, outer=True)
 def added(end, x):
     """(energy, force) that an ending adds at x = r - start >= 0, without its constant."""
     linear = end[1]
@@ -131,7 +131,7 @@ def added(end, x):
     return -1.0 * x * (linear + x2 * (quadratic / 3 + x * (cubic / 4))), linear + x2 * (quadratic + x * cubic)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+@kernel(inline=True, outer=True)
 def quintic(shape, r):
     """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start); S = 1 below the start."""
     per_width = 1 / (shape.cutoff - shape.start)
@@ -140,7 +140,7 @@ def quintic(shape, r):
     return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), t * t * left * left * (-30.0 * per_width)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, outer=True)
+@kernel(inline=True, outer=True)
 def nonic(shape, r):
     """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t as in `quintic`."""
     per_width = 1 / (shape.cutoff - shape.start)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a
+from rigidmd.compile import implements, is_a
 from rigidmd.compile.own import foreign
 from rigidmd.core.own_code import module_of
 from rigidmd.errors import told
@@ -154,7 +154,7 @@ def _source(energy: str, total, force, fields: list, r) -> str:
 from math import cos, exp, log, pow, sin, sqrt
 from typing import NamedTuple
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a
+from rigidmd.compile import implements, is_a
 from rigidmd.forces.laws.own import of_distance
 
 
@@ -163,7 +163,7 @@ class Formula(NamedTuple):
     uses_root = {uses_root}
 
 
-@implements(of_distance, PAIR_FLAGS, inline=True)
+@implements(of_distance, inline=True)
 def _of_distance(formula, shared, r2, inverse1, inverse2):
     if not is_a(formula, Formula):
         return None
@@ -363,7 +363,7 @@ def _class_for(kind: type, function: Callable) -> type:
     module, name = function.__module__, f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}"
     own = type(name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True})
     own.__name__ = f"{name}_{next(_COUNT)}"  # Numba's dispatchers take classes of one name for one type
-    compiled = foreign(function, PAIR_FLAGS, inline=True)
+    compiled = foreign(function, inline=True)
     asked = tuple(name for name in list(inspect.signature(function).parameters)[1:])
     values = {"r": "r2 * inverse1", "r2": "r2", "inverse": "inverse1"}
     source = (
@@ -374,7 +374,7 @@ def _class_for(kind: type, function: Callable) -> type:
     names = {"function": compiled}
     exec(source, names)
 
-    @implements(of_distance, PAIR_FLAGS, inline=True)
+    @implements(of_distance, inline=True)
     def _of_function(formula, shared, r2, inverse1, inverse2):
         return names["of_distance"] if is_a(formula, own) else None
 

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.integrate import quad
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import inverse, inverse_root, load, zeros
 from rigidmd.forces.laws.endings import (
     POLYNOMIALS,
@@ -104,7 +104,7 @@ def _inverse_power(p: int):
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
 
 
-@implements(pairs.pair, PAIR_FLAGS, inline=True)
+@implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if is_a(law, OneKind):
         return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, r2)
@@ -118,7 +118,7 @@ def _pair(law, i, j, r2):
     return pair
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def energy_and_force(law, c12, c6, r2):
     """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
     inverse2, inverse1 = inverses(law.shape, r2)
@@ -134,7 +134,7 @@ def inverses(shape, r2):
     raise TypeError("compiled code only")
 
 
-@implements(inverses, PAIR_FLAGS, inline=True)
+@implements(inverses, inline=True)
 def _inverses(shape, r2):
     if is_a(shape, Plain):
         return lambda shape, r2: (inverse(r2), 0.0)
@@ -146,7 +146,7 @@ def _inverses(shape, r2):
     return with_root
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def mixed(end12, end6, c12, c6):
     """The ending of the whole potential from those of its two powers."""
     return (

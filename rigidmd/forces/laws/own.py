@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import quad
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a
+from rigidmd.compile import implements, is_a
 from rigidmd.compile.lanes import cubic_at, inverse, inverse_root, load, select, zeros
 from rigidmd.forces.laws.endings import POLYNOMIALS, Bent, Plain, Polynomial, Shape, added, ended
 from rigidmd.forces.pairs import loop as pairs
@@ -74,7 +74,7 @@ def uses_root(formula: Any, shape: Any) -> bool:
     return not is_a(shape, Plain) or getattr(formula.instance_class, "uses_root", True)
 
 
-@implements(pairs.pair, PAIR_FLAGS, inline=True)
+@implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if is_a(law, OwnOfOneKind):
         return lambda law, i, j, r2: energy_and_force(law, law.formula, law.end, r2)
@@ -106,7 +106,7 @@ def energy_and_force(law, formula, end, r2):
     raise TypeError("compiled code only")
 
 
-@implements(energy_and_force, PAIR_FLAGS, inline=True)
+@implements(energy_and_force, inline=True)
 def _energy_and_force(law, formula, end, r2):
     shape = law.types[law.fields.index("shape")]
     if uses_root(formula, shape):
@@ -187,7 +187,7 @@ class Tabulated(NamedTuple):
     uses_root = False
 
 
-@implements(of_distance, PAIR_FLAGS, inline=True)
+@implements(of_distance, inline=True)
 def _of_table(formula, shared, r2, inverse1, inverse2):
     if not is_a(formula, Tabulated):
         return None

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erfc, ive
 
-from rigidmd.compile import PAIR_FLAGS, implements, is_a, kernel
+from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import HAS_AVX512, inverse_cube, inverse_root, load, parted, picked, polynomial, zeros
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.units import COULOMB_CHARGE
@@ -195,21 +195,21 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
 
 
 def screened(screening, inverse, cube, r2):
-    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r, 1/r³ and r²; scalars only without a table.
+    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r, two factors of 1/r³, and r².
 
-    Valid up to the cut-off.
+    Scalars only without a table. Valid up to the cut-off.
     """
     raise TypeError("compiled code only")
 
 
-@implements(screened, PAIR_FLAGS, inline=True)
+@implements(screened, inline=True)
 def _screened(screening, inverse, cube, r2):
     if is_a(screening, Screening):
 
         def by_polynomials(screening, inverse, cube, r2):
             t = screening.scale * r2 - 1.0
             u = inverse - polynomial(screening.energy, t)
-            w = cube - polynomial(screening.force, t)
+            w = cube[0] * cube[1] - polynomial(screening.force, t)
             return u, w
 
         return by_polynomials
@@ -222,18 +222,18 @@ def _screened(screening, inverse, cube, r2):
         force = _coefficient(screening.table, 3, k)
         for term in (2, 1, 0):
             force = force * x + _coefficient(screening.table, term, k)
-        return u, cube - force
+        return u, cube[0] * cube[1] - force
 
     return by_table
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _coefficient(table, term, k):
     """Coefficients of x^term in intervals k."""
     return picked(load(table, INTERVALS * term), load(table, INTERVALS * term + 16), k)
 
 
-@implements(pairs.pair, PAIR_FLAGS, inline=True)
+@implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if is_a(law, ScreenedCoulomb):
 
@@ -249,7 +249,7 @@ def _pair(law, i, j, r2):
     def shifted_pair(law, i, j, r2):
         qq = law.charge[i] * load(law.charge, j)
         inverse = inverse_root(r2)
-        u, w = screened(law.screening, inverse, inverse * inverse * inverse, r2)
+        u, w = screened(law.screening, inverse, (inverse, inverse * inverse), r2)
         return qq * (u + law.slope * (r2 * inverse) + law.shift), qq * (w - law.slope * inverse)
 
     return shifted_pair

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, MOST_BLOCKS, PAIR_FLAGS, kernel
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
 from rigidmd.compile.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
 from rigidmd.forces.pairs.sites import place
 
@@ -276,7 +276,7 @@ def place_block(clusters, cell, sites, state, block):
             local[at + 2 * width] = z - origin[4 * c + 2]
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def follow_block(clusters, limit, block):
     """Displacements of the sites of a block: `moved`, and `farthest`, infinite if one exceeds the limit."""
     width = width_of(clusters.local)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import PAIR_FLAGS, Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.compile.lanes import (
     align_stack,
     double,
@@ -236,25 +236,25 @@ def _refill(term):
     return status
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _forces(parcel, block):
     law, pairs, sums = opened(parcel)
     block_forces(law, pairs, sums.own, sums.others, None, block)
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _forces_and_energies(parcel, block):
     law, pairs, sums = opened(parcel)
     block_forces(law, pairs, sums.own, sums.others, sums.tallies, block)
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _gather(parcel, block):
     _, pairs, sums = opened(parcel)
     gather_block(pairs, sums.own, sums.others, block)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def block_forces(law, pairs, own, others, tallies, block):
     """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`."""
     align_stack()
@@ -306,7 +306,7 @@ def block_forces(law, pairs, own, others, tallies, block):
         first_met = pairs.near[c]
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _displacements(pairs, c, here, met, apart, entry):
     """The cluster met, and displacements from its sites, as vectors, to each of two sites of c; see `_separation`."""
     local = pairs.clusters.local
@@ -328,7 +328,7 @@ def origins_apart(pairs, c, met, apart, entry):
     raise TypeError("compiled code only")
 
 
-@implements(origins_apart, PAIR_FLAGS, inline=True)
+@implements(origins_apart, inline=True)
 def _origins_apart(pairs, c, met, apart, entry):
     if apart.dtype.bitwidth == 32:
 
@@ -346,14 +346,14 @@ def _origins_apart(pairs, c, met, apart, entry):
     return computed
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _separation(here, x, y, z):
     """Displacements of a site from a vector of others, and the squared distances."""
     dx, dy, dz = here[0] - x, here[1] - y, here[2] - z
     return dx, dy, dz, dx * dx + dy * dy + dz * dz
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
     """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too.
 
@@ -375,7 +375,7 @@ def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
     )
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _act(law, i, j, between, mask, totals, tallies):
     """Force on a site from each of a vector of others; energy and virial, if wanted, are added to `totals`."""
     dx, dy, dz, r2 = between
@@ -399,7 +399,7 @@ def _act(law, i, j, between, mask, totals, tallies):
     return gx, gy, gz, (energy, xx, xy, xz, yy, yz, zz)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def gather_block(pairs, own, others, block):
     """Forces on the sites of a block from their own rows and from all blocks, added in a fixed order."""
     clusters = pairs.clusters

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import PAIR_FLAGS, kernel
+from rigidmd.compile import kernel
 from rigidmd.compile.lanes import (
     bits,
     fill,
@@ -92,7 +92,7 @@ def fill_block(pairs, block, room):
     return 0
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def _find_candidates(pairs, c, scratch):
     """Candidates for a cluster's rows: clusters and images whose box is within reach of its box. Returns their number.
 
@@ -127,7 +127,7 @@ def _find_candidates(pairs, c, scratch):
     return candidates
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def _fill_rows(pairs, block, c, scratch, candidates):
     """Fill the rows of a cluster from its candidates."""
     width = width_of(pairs.clusters.local)
@@ -225,7 +225,7 @@ def _write_row(entries, found, count, filled):
             entries[first + n] = found[n]
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _find_kinds(pairs, c, scratch, candidates):
     """Reduce the candidates to those that a row of the cluster has, and find their kinds; returns their number.
 
@@ -249,7 +249,7 @@ def _find_kinds(pairs, c, scratch, candidates):
     return met
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _measure(pairs, c, kind, candidate, at):
     """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry needed a mask.
 
@@ -302,7 +302,7 @@ def _set_aside(pairs, c, kind, candidate, at):
             kind[at + own] = SPECIAL
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _mask_of_lanes(pairs, i, candidate, radius2):
     """The sites of a candidate that interact with site i, as bits; 0 if none is inside the radius."""
     if i >= len(pairs.group):
@@ -326,7 +326,7 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     return meets if bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _apart(pairs, c, other, image, k):
     """Component k of the vector from the image of another cluster's origin to the origin of cluster c, Å."""
     clusters = pairs.clusters

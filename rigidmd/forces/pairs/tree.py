@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import PAIR_FLAGS, kernel
+from rigidmd.compile import kernel
 from rigidmd.compile.lanes import bits, lane_count, larger, load, lowest_bit, width_of
 
 
@@ -52,7 +52,7 @@ def grow(tree, clusters):
                 tree.high[k, node] = max(tree.high[k, node], tree.high[k, child])
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
     """Write to found[count:], ascending, the clusters whose boxes are closer than a radius to a box (3,), (3,).
 
@@ -89,7 +89,7 @@ def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
     return count
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _near(tree, node, low, high, radius2):
     """The boxes within reach in the family that begins at a node, as bits."""
     dx = larger(larger(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)

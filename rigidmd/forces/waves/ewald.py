@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import PAIR_FLAGS, Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.compile.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
@@ -181,7 +181,7 @@ def _turn(parcel, block):
                 own.sine[d, n, i] = b * cosine + a * sine
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def _phase(own, d, n, at):
     """exp(2 pi i n x_d) of a vector of sites, as (cosine, sine)."""
     cosine = load(own.cosine[d, abs(n)], at)
@@ -189,12 +189,12 @@ def _phase(own, d, n, at):
     return (cosine, sine) if n >= 0 else (cosine, -1.0 * sine)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True)
+@kernel(inline=True)
 def _times(a, b):
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _sum(parcel, block):
     """S(k) of the columns of a block, with energy and virial; S(k) is then multiplied for the forces."""
     alpha, over, own = opened(parcel)
@@ -252,7 +252,7 @@ def add_wave_virial(tally, energy, k, slope):
             tally[1 + 3 * row + column] += energy * (unit - slope * k[row] * k[column])
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _push(parcel, block):
     """Forces on a share of the sites."""
     _alpha, over, own = opened(parcel)

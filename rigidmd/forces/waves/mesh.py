@@ -25,7 +25,6 @@ from rocket_fft import c2c, c2r, r2c
 from rigidmd.compile import (
     BLOCKS,
     MOST_BLOCKS,
-    PAIR_FLAGS,
     Code,
     call,
     call_blocks,
@@ -291,19 +290,19 @@ def _few(spline, array, index):
     return lambda spline, array, index: load_eight(array, index)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def weights_at(spline, part):
     """Weights of the grid points from the corner on, as a vector."""
     return _polynomials(spline, spline.value, spline.nodes, part)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def slopes_at(spline, part):
     """Derivatives of these weights, per grid cell."""
     return _polynomials(spline, spline.slope, spline.nodes[1:], part)
 
 
-@kernel(fastmath=PAIR_FLAGS, inline=True, counted=False)
+@kernel(inline=True, counted=False)
 def _polynomials(spline, coefficients, powers, part):
     """Polynomials in `part`, one in each lane, from coefficients (powers width,).
 
@@ -317,7 +316,7 @@ def _polynomials(spline, coefficients, powers, part):
     return found
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _spread(parcel, block):
     """Spread charges over the planes of a block, and transform them within the planes."""
     _alpha, _charge, spline, mesh = opened(parcel)
@@ -414,7 +413,7 @@ def _back(parcel, block):
                 grid[plane, nb + k, c] = grid[plane, k, c]
 
 
-@task(fastmath=PAIR_FLAGS, counted=False)
+@task(counted=False)
 def _pull(parcel, block):
     """Forces on a share of the sites: minus the gradient of the potential at each site, times its charge."""
     _alpha, charge, spline, mesh = opened(parcel)
