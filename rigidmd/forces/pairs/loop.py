@@ -47,7 +47,16 @@ from rigidmd.forces.pairs.lists import (
     most_needed,
     number_of,
 )  # fmt: skip
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, InSlots, blocks_of, load_some, virial_of_offsets
+from rigidmd.forces.pairs.sites import (
+    BodySites,
+    CentralSites,
+    InSlots,
+    blocks_of,
+    count_some,
+    load_some,
+    room_for_virial,
+    virial_of_molecules,
+)  # fmt: skip
 from rigidmd.forces.pairs.update import list_code, refill, update_list
 from rigidmd.forces.terms import Setup
 
@@ -58,6 +67,7 @@ class Sums(NamedTuple):
     own: np.ndarray  # (3 slots,) force on each site from its own row, then from all rows; stored as Clusters.local
     others: np.ndarray  # (blocks, room) forces of a block's rows on the clusters from its first one on
     tallies: np.ndarray  # (blocks, 10)
+    virial: np.ndarray  # see `room_for_virial`
 
 
 class PairForces(NamedTuple):
@@ -77,6 +87,7 @@ class PairForces(NamedTuple):
             own=pairs.clusters.half_square,  # no list is built while forces are summed
             others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
             tallies=np.zeros((blocks, TALLY_SIZE)),
+            virial=room_for_virial(),
         )
         return PairWorkspace(law, law.room(slots, setup.dtype), sites, pairs, sums)
 
@@ -112,7 +123,9 @@ class PairWorkspace(NamedTuple):
             forces=(_forces, content),
             forces_and_energies=(_forces_and_energies, content),
             gather=(_gather, content),
+            gather_and_count=(_gather_and_count, content),
             load=(load_some, (self.sites, state, load, self.forces_in_slots)),
+            count=(count_some, (self.sites, state, self.forces_in_slots, self.sums.virial)),
         )
         return self._replace(code=code, list_code=lists)
 
@@ -189,16 +202,17 @@ def _add_pair_forces(term, state, load, tally):
         blocks = len(sums.tallies)
         if tally is None:
             call_blocks(code, "forces", parcel, blocks)
+            call_blocks(code, "gather", parcel, blocks)
         else:
             call_blocks(code, "forces_and_energies", parcel, blocks)
-        call_blocks(code, "gather", parcel, blocks)
+            call_blocks(code, "gather_and_count", parcel, blocks)
         force = InSlots(sums.own, pairs.clusters.slot)
         call_blocks(code, "load", packed((term.sites, state, load, force)), blocks_of(len(state.position)))
         if tally is not None:
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += sums.tallies[block, k]
-            virial_of_offsets(term.sites, state, force, tally)
+            virial_of_molecules(term.sites, code, state, force, sums.virial, tally)
         return OK
 
     return add_pair_forces
@@ -251,12 +265,23 @@ def _forces_and_energies(parcel, block):
 @task(counted=False)
 def _gather(parcel, block):
     _, pairs, sums = opened(parcel)
-    gather_block(pairs, sums.own, sums.others, block)
+    gather_block(pairs, sums.own, sums.others, None, block)
+
+
+@task(counted=False)
+def _gather_and_count(parcel, block):
+    _, pairs, sums = opened(parcel)
+    gather_block(pairs, sums.own, sums.others, sums.tallies, block)
 
 
 @kernel(inline=True, counted=False)
 def block_forces(law, pairs, own, others, tallies, block):
-    """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`."""
+    """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`.
+
+    With tallies, energies and a part of the virial are summed. The distance of two sites is the vector between the
+    origins of their clusters and the difference of their places there. So the virial is the sum over entries of the
+    force on the row (x) that vector, which is summed here, and that over sites of f (x) place, see `gather_block`.
+    """
     align_stack()
     clusters = pairs.clusters
     width = width_of(clusters.local)
@@ -279,11 +304,13 @@ def block_forces(law, pairs, own, others, tallies, block):
                 (clusters.local[at + 1], clusters.local[at + width + 1], clusters.local[at + 2 * width + 1]),
             )
             still = (zero, zero, zero)
-            sums = (still, still, (zero, zero, zero, zero, zero, zero, zero))
+            sums, virial = (still, still, zero), (zero, zero, zero, zero, zero, zero)
             for n in range(first_special, pairs.special[i // 2]):
                 other, between = _displacements(pairs, c, here, met, apart, masked[n, 0])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
-                sums = _meet(law, pairs, first, i, other, between, masks, others, sums, tallies)
+                sums, force = _meet(law, pairs, first, i, other, between, masks, others, sums, tallies)
+                if tallies is not None:
+                    virial = _with_product(virial, force, origins_apart(pairs, c, met, apart, masked[n, 0]))
             # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
             # processor's queues before those of the next entry could enter.
             last = end_of_row(pairs, i // 2, moved) - 1
@@ -293,34 +320,46 @@ def block_forces(law, pairs, own, others, tallies, block):
                 other, between = _displacements(pairs, c, here, met, apart, item(entries, first_entry))
             for n in range(first_entry, last + 1):
                 ahead, after = _displacements(pairs, c, here, met, apart, item(entries, min(n + 1, last)))
-                sums = _meet(law, pairs, first, i, other, between, (None, None), others, sums, tallies)
+                sums, force = _meet(law, pairs, first, i, other, between, (None, None), others, sums, tallies)
+                if tallies is not None:
+                    virial = _with_product(virial, force, origins_apart(pairs, c, met, apart, item(entries, n)))
                 other, between = ahead, after
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
-            on_one, on_two, totals = sums
+            on_one, on_two, energy = sums
             for k in range(3):
                 own[at + k * width] = total(on_one[k])
                 own[at + k * width + 1] = total(on_two[k])
             if tallies is not None:
-                for k, of in enumerate((0, 1, 2, 3, 2, 4, 5, 3, 5, 6)):
-                    tallies[block, k] += total(totals[of])
+                tallies[block, 0] += total(energy)
+                _count(tallies[block], virial)
         first_met = pairs.near[c]
 
 
 @kernel(inline=True)
-def _displacements(pairs, c, here, met, apart, entry):
-    """The cluster met, and displacements from its sites, as vectors, to each of two sites of c; see `_separation`."""
+def _count(tally, virial):
+    """Add the six numbers of a symmetric virial, sums over lanes, to the nine of a tally."""
+    for k, of in enumerate((0, 1, 2, 1, 3, 4, 2, 4, 5)):
+        tally[1 + k] += total(virial[of])
+
+
+@kernel(inline=True)
+def _displacements(pairs, c, here, met, apart, number):
+    """The cluster met by an entry, and displacements from its sites, as vectors, to each of two sites of c.
+
+    These are as of `_separation`.
+    """
     local = pairs.clusters.local
     width = width_of(local)
-    other = cluster_of(item(met, entry))
+    other = cluster_of(item(met, number))
     at = 3 * width * other
-    dx, dy, dz = origins_apart(pairs, c, met, apart, entry)
+    dx, dy, dz = origins_apart(pairs, c, met, apart, number)
     x = load(local, at) - dx
     y = load(local, at + width) - dy
     z = load(local, at + 2 * width) - dz
     return other, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
 
 
-def origins_apart(pairs, c, met, apart, entry):
+def origins_apart(pairs, c, met, apart, number):
     """Vector from the origin of what is met to that of cluster c, Å.
 
     In single precision it is looked up: to compute it would take a sixth of the time of all pairs.
@@ -329,19 +368,20 @@ def origins_apart(pairs, c, met, apart, entry):
 
 
 @implements(origins_apart, inline=True)
-def _origins_apart(pairs, c, met, apart, entry):
+def _origins_apart(pairs, c, met, apart, number):
     if apart.dtype.bitwidth == 32:
 
-        def looked_up(pairs, c, met, apart, entry):
-            return spread(apart, 3 * entry), spread(apart, 3 * entry + 1), spread(apart, 3 * entry + 2)
+        def looked_up(pairs, c, met, apart, number):
+            return spread(apart, 3 * number), spread(apart, 3 * number + 1), spread(apart, 3 * number + 2)
 
         return looked_up
 
-    def computed(pairs, c, met, apart, entry):
-        origin, image = pairs.clusters.origin, item(met, entry)
+    def computed(pairs, c, met, apart, number):
+        origin, image = pairs.clusters.origin, item(met, number)
         there = load_four(pairs.shift, 4 * number_of(image)) + load_four(origin, 4 * cluster_of(image))
         vector = load_four(origin, 4 * c) - there
-        return lane(vector, 0), lane(vector, 1), lane(vector, 2)
+        local = pairs.clusters.local
+        return fill(lane(vector, 0), local), fill(lane(vector, 1), local), fill(lane(vector, 2), local)
 
     return computed
 
@@ -357,61 +397,87 @@ def _separation(here, x, y, z):
 def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
     """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too.
 
-    first : the first cluster of the block
+    first : the first cluster of the block. Also returns the sum of the forces on both sites.
     """
     width = width_of(pairs.clusters.local)
-    on_one, on_two, totals = sums
-    gx, gy, gz, totals = _act(law, i, width * other, between[0], masks[0], totals, tallies)
-    hx, hy, hz, totals = _act(law, i + 1, width * other, between[1], masks[1], totals, tallies)
+    on_one, on_two, energy = sums
+    gx, gy, gz, one = _act(law, i, width * other, between[0], masks[0])
+    hx, hy, hz, two = _act(law, i + 1, width * other, between[1], masks[1])
+    fx, fy, fz = gx + hx, gy + hy, gz + hz
     turn = len(pairs.clusters.origin) // 4 if other < first else 0
     at = 3 * width * (other - first + turn)
-    store(others, at, load(others, at) - (gx + hx))
-    store(others, at + width, load(others, at + width) - (gy + hy))
-    store(others, at + 2 * width, load(others, at + 2 * width) - (gz + hz))
+    store(others, at, load(others, at) - fx)
+    store(others, at + width, load(others, at + width) - fy)
+    store(others, at + 2 * width, load(others, at + 2 * width) - fz)
+    if tallies is not None:
+        energy = energy + (one + two)
+    on_one = (on_one[0] + gx, on_one[1] + gy, on_one[2] + gz)
+    on_two = (on_two[0] + hx, on_two[1] + hy, on_two[2] + hz)
+    return (on_one, on_two, energy), (fx, fy, fz)
+
+
+@kernel(inline=True)
+def _with_product(virial, force, at):
+    """A symmetric virial, six vectors, with force (x) place added."""
+    x, y, z = force
     return (
-        (on_one[0] + gx, on_one[1] + gy, on_one[2] + gz),
-        (on_two[0] + hx, on_two[1] + hy, on_two[2] + hz),
-        totals,
+        virial[0] + x * at[0],
+        virial[1] + x * at[1],
+        virial[2] + x * at[2],
+        virial[3] + y * at[1],
+        virial[4] + y * at[2],
+        virial[5] + z * at[2],
     )
 
 
 @kernel(inline=True)
-def _act(law, i, j, between, mask, totals, tallies):
-    """Force on a site from each of a vector of others; energy and virial, if wanted, are added to `totals`."""
+def _act(law, i, j, between, mask):
+    """Force on a site from each of a vector of others, and the energies."""
     dx, dy, dz, r2 = between
     counts = r2 < law.cutoff * law.cutoff
     if mask is not None:
         counts = counts & mask_of(mask, r2)
     u, w = pair(law, i, j, r2)
     w = select(counts, w, 0.0)
-    gx = w * dx
-    gy = w * dy
-    gz = w * dz
-    energy, xx, xy, xz, yy, yz, zz = totals
-    if tallies is not None:
-        energy = energy + select(counts, u, 0.0)
-        xx = xx + gx * dx
-        xy = xy + gx * dy
-        xz = xz + gx * dz
-        yy = yy + gy * dy
-        yz = yz + gy * dz
-        zz = zz + gz * dz
-    return gx, gy, gz, (energy, xx, xy, xz, yy, yz, zz)
+    return w * dx, w * dy, w * dz, select(counts, u, 0.0)
 
 
 @kernel(inline=True, counted=False)
-def gather_block(pairs, own, others, block):
-    """Forces on the sites of a block from their own rows and from all blocks, added in a fixed order."""
+def gather_block(pairs, own, others, tallies, block):
+    """Forces on the sites of a block from their own rows and from all blocks, added in a fixed order.
+
+    With tallies, the rest of the virial is added: the sum over sites of f (x) place from the origin of their cluster.
+    """
     clusters = pairs.clusters
     width = width_of(clusters.local)
+    zero = double(fill(0.0, own))
+    virial = (zero, zero, zero, zero, zero, zero)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        at = 3 * width * c
+        force = (
+            _gathered(pairs, own, others, c, 0),
+            _gathered(pairs, own, others, c, 1),
+            _gathered(pairs, own, others, c, 2),
+        )
         for k in range(3):
-            at = 3 * width * c + k * width
-            on_cluster = double(load(own, at))
-            for b in range(len(others)):
-                ahead = c - clusters.bounds[b]
-                if ahead < 0:
-                    ahead += len(clusters.origin) // 4
-                if ahead < pairs.needed[b, WINDOW]:
-                    on_cluster = on_cluster + double(load(others[b], 3 * width * ahead + k * width))
-            store(own, at, narrowed(on_cluster, own))
+            store(own, at + k * width, narrowed(force[k], own))
+        if tallies is not None:
+            local = clusters.local
+            there = double(load(local, at)), double(load(local, at + width)), double(load(local, at + 2 * width))
+            virial = _with_product(virial, force, there)
+    if tallies is not None:
+        _count(tallies[block], virial)
+
+
+@kernel(inline=True)
+def _gathered(pairs, own, others, c, k):
+    """Component k of the forces on the sites of a cluster, in double precision."""
+    width = width_of(pairs.clusters.local)
+    found = double(load(own, 3 * width * c + k * width))
+    for b in range(len(others)):
+        ahead = c - pairs.clusters.bounds[b]
+        if ahead < 0:
+            ahead += len(pairs.clusters.origin) // 4
+        if ahead < pairs.needed[b, WINDOW]:
+            found = found + double(load(others[b], 3 * width * ahead + k * width))
+    return found

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from rigidmd.compile import BLOCKS, MOST_BLOCKS, implements, is_a, kernel, opened, task
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.compile.lanes import lane_count, width_of
 from rigidmd.core.state import EXAMPLE
 
@@ -214,28 +214,70 @@ def load_some(parcel, block):
         load_molecule(sites, state, load, m, site_force)
 
 
-def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray) -> dict:
-    """The tasks "place" and "load" for arrays (s, 3), see `Code`."""
+@task()
+def count_some(parcel, block):
+    """Sums of f (x) (x_site - X_molecule) over the molecules of a block (`blocks_of`), into a row (9,) of `virial`."""
+    sites, state, site_force, virial = opened(parcel)
+    own = virial[block]
+    own[:] = 0.0
+    for m in _molecules_of(state, block):
+        _count_offsets(sites, state, m, site_force, own)
+
+
+def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray, virial: np.ndarray) -> dict:
+    """The tasks "place", "load" and "count" for positions and forces (s, 3), see `Code`."""
     state, load = EXAMPLE
-    return {"place": (place_some, (sites, state, position)), "load": (load_some, (sites, state, load, force))}
+    return {
+        "place": (place_some, (sites, state, position)),
+        "load": (load_some, (sites, state, load, force)),
+        "count": (count_some, (sites, state, force, virial)),
+    }
 
 
-def virial_of_offsets(sites, state, site_force, tally):
-    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule)."""
+def room_for_virial() -> np.ndarray:
+    """Room for the sums of `count_some`: 9 of each block, which has two lines of cache to itself."""
+    return np.zeros((MOST_BLOCKS, 16))
+
+
+def virial_of_molecules(sites, code, state, site_force, virial, tally):
+    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule).
+
+    code : has `count_some` as "count"; virial : of `room_for_virial`
+    """
     raise TypeError("compiled code only")
 
 
-@implements(virial_of_offsets)
-def _virial_of_offsets(sites, state, site_force, tally):
+@implements(virial_of_molecules)
+def _virial_of_molecules(sites, code, state, site_force, virial, tally):
     if is_a(sites, CentralSites):
-        return lambda sites, state, site_force, tally: None
+        return lambda sites, code, state, site_force, virial, tally: None
 
-    def virial_of_offsets(sites, state, site_force, tally):
-        for i in range(len(sites.molecule)):
-            offset = turned(sites, state, sites.molecule[i], i)
+    def virial_of_molecules(sites, code, state, site_force, virial, tally):
+        blocks = blocks_of(len(state.position))
+        call_blocks(code, "count", packed((sites, state, site_force, virial)), blocks)
+        for block in range(blocks):
+            for k in range(9):
+                tally[1 + k] -= virial[block, k]
+
+    return virial_of_molecules
+
+
+def _count_offsets(sites, state, m, site_force, virial):
+    """Add f (x) (x_site - X_molecule) of a molecule's sites to nine numbers."""
+    raise TypeError("compiled code only")
+
+
+@implements(_count_offsets, inline=True)
+def _count_offsets_of(sites, state, m, site_force, virial):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, m, site_force, virial: None
+
+    def count_offsets(sites, state, m, site_force, virial):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            offset = turned(sites, state, m, i)
             force = of_site(site_force, i)
             for row in range(3):
                 for k in range(3):
-                    tally[1 + 3 * row + k] -= force[row] * offset[k]
+                    virial[3 * row + k] += force[row] * offset[k]
 
-    return virial_of_offsets
+    return count_offsets

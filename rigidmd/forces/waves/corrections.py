@@ -9,7 +9,7 @@ from scipy.special import erf
 from rigidmd.compile import implements, is_a
 from rigidmd.core.state import OK
 from rigidmd.forces import terms
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites, virial_of_offsets
+from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites
 from rigidmd.forces.pairs.space import volume_of
 from rigidmd.forces.terms import Setup
 
@@ -90,8 +90,8 @@ def _add_surface_dipole(term, state, load, tally):
             for i in range(len(term.charge)):
                 for row in range(3):
                     for k in range(3):
-                        tally[1 + 3 * row + k] += term.site_force[i, row] * term.position[i, k]
-            virial_of_offsets(term.sites, state, term.site_force, tally)
+                        m = term.sites.molecule[i]
+                        tally[1 + 3 * row + k] += term.site_force[i, row] * state.position[m, k]
         load_from_sites(term.sites, state, load, term.site_force)
         return OK
 

@@ -25,7 +25,14 @@ from rigidmd.compile import Code, call_blocks, implements, is_a, kernel, opened,
 from rigidmd.compile.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, blocks_of, site_tasks, virial_of_offsets
+from rigidmd.forces.pairs.sites import (
+    BodySites,
+    CentralSites,
+    blocks_of,
+    room_for_virial,
+    site_tasks,
+    virial_of_molecules,
+)
 from rigidmd.forces.pairs.space import follow_cell
 from rigidmd.forces.terms import Setup
 from rigidmd.forces.waves.vectors import Waves
@@ -48,6 +55,7 @@ class WaveSums(NamedTuple):
     imaginary: np.ndarray
     push: np.ndarray  # (3, slots) forces on the sites, by component
     tallies: np.ndarray  # (blocks, 10)
+    virial: np.ndarray  # see `room_for_virial`
 
 
 class EwaldSum(NamedTuple):
@@ -76,6 +84,7 @@ class EwaldSum(NamedTuple):
             imaginary=np.zeros(over.total // 2),
             push=np.zeros((3, slots)),
             tallies=np.zeros((len(over.bounds) - 1, TALLY_SIZE)),
+            virial=room_for_virial(),
         )
         return EwaldWorkspace(self.alpha, self.sites, over, sums)
 
@@ -97,7 +106,7 @@ class EwaldWorkspace(NamedTuple):
     def with_code(self) -> "EwaldWorkspace":
         """With its machine code."""
         content = (self.alpha, self.waves, self.sums)
-        moved = site_tasks(self.sites, self.sums.position, self.sums.force)
+        moved = site_tasks(self.sites, self.sums.position, self.sums.force, self.sums.virial)
         return self._replace(code=Code(turn=(_turn, content), sum=(_sum, content), push=(_push, content), **moved))
 
 
@@ -138,7 +147,7 @@ def _add_ewald_sum(term, state, load, tally):
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += own.tallies[block, k]
-            virial_of_offsets(term.sites, state, own.force, tally)
+            virial_of_molecules(term.sites, term.code, state, own.force, own.virial, tally)
         call_blocks(term.code, "load", packed((term.sites, state, load, own.force)), molecules)
         return OK
 

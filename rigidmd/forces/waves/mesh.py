@@ -38,7 +38,14 @@ from rigidmd.compile import (
 from rigidmd.compile.lanes import load_eight, load_four, store, total
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.pairs.sites import BodySites, CentralSites, blocks_of, site_tasks, virial_of_offsets
+from rigidmd.forces.pairs.sites import (
+    BodySites,
+    CentralSites,
+    blocks_of,
+    room_for_virial,
+    site_tasks,
+    virial_of_molecules,
+)
 from rigidmd.forces.pairs.space import follow_cell
 from rigidmd.forces.terms import Setup
 from rigidmd.forces.waves.ewald import add_wave_virial, invert_cell
@@ -83,6 +90,7 @@ class Mesh(NamedTuple):
     alias: np.ndarray  # (3, 6, most points) splines.Aliases of the axes
     axes: np.ndarray  # (3, 1) numbers of the axes, for the transforms
     tallies: np.ndarray  # (blocks, 10)
+    virial: np.ndarray  # see `room_for_virial`
     lost: np.ndarray  # (blocks,) whether a position is not finite
     weight: np.ndarray  # (blocks, 64) the weights of one site, which are read one by one
 
@@ -131,6 +139,7 @@ class Pme(NamedTuple):
             alias=table,
             axes=np.arange(3)[:, None],
             tallies=np.zeros((blocks, TALLY_SIZE)),
+            virial=room_for_virial(),
             lost=np.zeros(blocks, np.bool_),
             weight=np.zeros((blocks, 64), kind),
         )
@@ -158,7 +167,7 @@ class PmeWorkspace(NamedTuple):
         tasks = (_weigh, _scale, _sort, _spread, _convolve, _convolve_and_count, _back, _pull)
         names = ("weigh", "scale", "sort", "spread", "convolve", "convolve_and_count", "back", "pull")
         found = {name: (one, content) for name, one in zip(names, tasks, strict=True)}
-        moved = site_tasks(self.sites, self.mesh.position, self.mesh.force)
+        moved = site_tasks(self.sites, self.mesh.position, self.mesh.force, self.mesh.virial)
         return self._replace(code=Code(**found, **moved))
 
 
@@ -192,7 +201,7 @@ def _add_pme(term, state, load, tally):
             for block in range(blocks):
                 for k in range(len(tally)):
                     tally[k] += mesh.tallies[block, k]
-            virial_of_offsets(term.sites, state, mesh.force, tally)
+            virial_of_molecules(term.sites, code, state, mesh.force, mesh.virial, tally)
         call_blocks(code, "load", packed((term.sites, state, load, mesh.force)), molecules)
         return OK
 
