@@ -273,6 +273,35 @@ def test_everything_follows_a_cell_that_changes(electrostatics, change):
     assert state.position == pytest.approx(other.position, abs=1e-9)
 
 
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+@pytest.mark.parametrize("angles", [[90, 90, 90], [70, 100, 115]])
+def test_a_list_serves_while_the_box_changes_little(angles, precision):
+    """Pairs across the edges, which move with the images, are those of a new list; of a larger change too, anew."""
+    box = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": angles}
+    counts = {"spce": 150, "nitrogen": 20}
+    forces = {"cutoff_A": 7.0, "truncation": "force_shift"}  # a pair at the cut-off has no force
+    system, engine, state = built(counts, 20.0, 3, spread=0.1, box=box, forces=forces, precision=precision)
+    rng = np.random.default_rng(1)
+    engine.evaluate(state)
+    lists = [own.pairs for own in engine.workspaces.values()]
+    assert [own.counters[BUILDS] for own in lists] == [1, 1]
+    start, digits = state.copy(), {"double": 1e-10, "mixed": 3e-5}[precision]
+    for size in (1e-3, 2e-3, 3e-3, -3e-3, 1e-3, 0.04):
+        strain = np.eye(3) + size * np.tril(rng.choice([-1, 1], (3, 3)))
+        state.cell[:] = start.cell @ strain
+        state.position[:] = start.position @ strain
+        load, tallies = engine.evaluate(state)
+        expected, theirs = system.engine().evaluate(state)
+        scale = np.sqrt(np.mean(expected.force**2))
+        assert np.abs(load.force - expected.force).max() < digits * scale * 10
+        for name, tally in theirs.items():
+            assert tallies[name].virial == pytest.approx(tally.virial, abs=digits * np.abs(tally.virial).max())
+        assert ([own.counters[BUILDS] for own in lists] == [1, 1]) == (abs(size) < 0.01)
+        assert max(own.slack[0] for own in lists) > 0 or abs(size) > 0.01
+    for own in lists:
+        assert np.array_equal(own.built, state.cell)
+
+
 def test_a_cell_that_becomes_too_small_for_the_cut_off_stops_in_words():
     _, engine, state = built({"argon": 100}, 14.0, 3, spread=0.1, forces={"cutoff_A": 6.9, "skin_A": 6.0})
     engine.evaluate(state)

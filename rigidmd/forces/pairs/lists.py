@@ -4,9 +4,10 @@ A row is two sites near one another, so whatever is loaded of a cluster serves b
 same clusters: these are listed once, with the vectors between, and an entry of a row is a place in that list.
 
 A list is valid until some site has moved more than half the skin since it was built, by translation or rotation of its
-body. The engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. The clusters
-of each row are sorted into shells by distance. The displacements since the build tell how many shells can matter, so
-the loop works through a new list as if it had no skin.
+body. The engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. A box that
+has changed since then has moved the images: that is taken from the skin. The clusters of each row are sorted into
+shells by distance. The displacements since the build tell how many shells can matter, so the loop works through a new
+list as if it had no skin.
 
 Each pair of clusters is stored once, in a row of the cluster behind, with the clusters taken as a ring. The list is
 divided into blocks of rows, and any thread may fill any block: the list, and every sum over it, has the same bits for
@@ -56,9 +57,12 @@ class PairList(NamedTuple):
     reach2: float  # square of the largest distance between sites of one group, Å²; may be infinite
     group: np.ndarray  # (s,) group of each site; pairs inside one group are excluded
     cell: np.ndarray  # (3, 3) the cell at the last use, Å
+    built: np.ndarray  # (3, 3) the cell when the list was built, Å
     clusters: Clusters
     tree: BoxTree
+    multiple: np.ndarray  # (IMAGES, 3) int32 edges a, b, c by which each image is displaced
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
+    slack: np.ndarray  # (1,) the farthest that an image has moved since the list was built, Å
     row: np.ndarray  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
     beyond: np.ndarray  # (rows, SHELLS) uint8 how many entries at the end of a row are beyond shell k
     entries: np.ndarray  # (blocks, capacity) uint16
@@ -106,9 +110,12 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
         group=group,
         cell=cell.copy(),
+        built=cell.copy(),
         clusters=clusters,
         tree=box_tree(count),
+        multiple=np.zeros((IMAGES, 3), np.int32),
         shift=zeros(4 * IMAGES, np.float64),
+        slack=np.zeros(1),
         row=np.zeros(rows, np.int32),
         beyond=np.zeros((rows, SHELLS), np.uint8),
         entries=np.empty((blocks, room), np.uint16),
@@ -166,7 +173,7 @@ def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
     """What `recalled` needs to have this list again, bit for bit, where sites have moved since it was built."""
     found = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
-        found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED}
+        found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED} | {"built": pairs.built}
     return found
 
 
@@ -190,6 +197,8 @@ def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
             raise ValueError("order of a list is none of its sites")
         clusters.slot[clusters.order[:sites]] = np.arange(sites)
         clusters.group[: len(clusters.order)] = pairs.group[clusters.order]
+    if "built" in memory:  # the update of the list then follows the cell of the state
+        pairs.cell[:] = memory["built"]
     return pairs
 
 
@@ -235,11 +244,11 @@ def most_needed(pairs, k):
 
 @kernel(inline=True)
 def farthest(pairs):
-    """The largest displacement of any site since the list was built, Å; infinite if the list is no longer valid."""
+    """The largest displacement of any site's image since the list was built, Å; infinite if it is no longer valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
         found = max(found, pairs.clusters.farthest[block])
-    return found
+    return found + pairs.slack[0]
 
 
 @kernel(inline=True)

@@ -326,6 +326,22 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     return meets if bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
 
+@kernel(counted=False)
+def part_block(pairs, block):
+    """Write the vectors between the origins of a block anew, where images have moved."""
+    apart = pairs.apart[block]
+    if len(apart) == 0:
+        return
+    first = 0
+    for c in range(pairs.clusters.bounds[block], pairs.clusters.bounds[block + 1]):
+        for n in range(first, pairs.near[c]):
+            other, image = cluster_of(pairs.met[block, n]), number_of(pairs.met[block, n])
+            if image != 0:
+                for k in range(3):
+                    apart[3 * n + k] = _apart(pairs, c, other, image, k)
+        first = pairs.near[c]
+
+
 @kernel(inline=True)
 def _apart(pairs, c, other, image, k):
     """Component k of the vector from the image of another cluster's origin to the origin of cluster c, Å."""

@@ -1,6 +1,6 @@
 """Keeping a neighbour list: its sites are moved with the bodies, and the list is rebuilt when it is no longer valid."""
 
-from math import ceil, floor, inf
+from math import ceil, floor, inf, sqrt
 
 from rigidmd.compile import Code, call, call_blocks, kernel, opened, packed, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, OK
@@ -28,7 +28,7 @@ from rigidmd.forces.pairs.lists import (
     farthest,
     most_needed,
 )  # fmt: skip
-from rigidmd.forces.pairs.rows import fill_block
+from rigidmd.forces.pairs.rows import fill_block, part_block
 from rigidmd.forces.pairs.sites import BodySites, CentralSites
 from rigidmd.forces.pairs.space import follow_cell
 from rigidmd.forces.pairs.tree import grow
@@ -40,6 +40,7 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
     """The machine code of the tasks that keep a list."""
     placed = (pairs, sites, EXAMPLE[0])
     return Code(
+        part=(_part, pairs),
         place=(_place, placed),
         follow=(_follow, pairs),
         wrap=(_wrap, placed),
@@ -57,16 +58,18 @@ def update_list(pairs, code, sites, state):
     blocks = len(pairs.needed)
     parcel = packed(pairs)
     placed = packed((pairs, sites, state))
-    if follow_cell(state.cell, pairs.cell):
-        pairs.counters[USABLE] = 0
+    if follow_cell(state.cell, pairs.cell) and pairs.counters[USABLE] == 1:
+        if _move_images(pairs):
+            call_blocks(code, "part", parcel, blocks)
+        else:
+            pairs.counters[USABLE] = 0
     if pairs.counters[USABLE] == 1:
         call_blocks(code, "place", placed, blocks)
         call_blocks(code, "follow", parcel, blocks)
         if farthest(pairs) < inf:
             return OK
     pairs.counters[USABLE] = 0
-    shortest = min(pairs.cell[0, 0], pairs.cell[1, 1], pairs.cell[2, 2])
-    if pairs.cutoff < inf and (2 * pairs.cutoff > shortest or pairs.skin > LONGEST_SKIN * shortest):
+    if not _fits(pairs):
         return CELL_CHANGED
     call_blocks(code, "wrap", placed, blocks)
     call_blocks(code, "bin", placed, blocks)
@@ -83,7 +86,7 @@ def update_list(pairs, code, sites, state):
 def refill(pairs, code):
     """Build the list again from the clusters that `lists.recalled` has put in; a status code."""
     settle_again(pairs.clusters)
-    pairs.counters[IMAGES_FOUND] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+    _find_images(pairs)
     parcel = packed(pairs)
     call(code, "grow", parcel)
     call_blocks(code, "fill", parcel, len(pairs.needed))
@@ -105,6 +108,60 @@ def _judged(pairs):
     return OK
 
 
+@kernel(inline=True)
+def _shortest(cell):
+    return min(cell[0, 0], cell[1, 1], cell[2, 2])
+
+
+@kernel
+def _fits(pairs):
+    """Whether the cell has room for the cut-off and the skin."""
+    shortest = _shortest(pairs.cell)
+    return pairs.cutoff == inf or (2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest)
+
+
+@kernel
+def _most_slack(pairs):
+    """How far images may move until the list is built again, Å.
+
+    Images are sought so much farther than sites: one that was left out, and may move by twice as much as those that
+    were found, is out of reach meanwhile. No slack if such a search could find more images than there is room for.
+    """
+    is_short = pairs.cutoff < inf and 2.5 * pairs.skin <= _shortest(pairs.built)
+    return 0.25 * pairs.skin if is_short else 0.0
+
+
+@kernel
+def _move_images(pairs):
+    """Move the images with the cell. Whether the list still serves; `part_block` must then follow."""
+    farthest2 = 0.0
+    for n in range(pairs.counters[IMAGES_FOUND]):
+        moved2 = 0.0
+        for k in range(3):
+            before = _displacement(pairs.built, pairs.multiple[n], k)
+            pairs.shift[4 * n + k] = _displacement(pairs.cell, pairs.multiple[n], k)
+            moved2 += (pairs.shift[4 * n + k] - before) ** 2
+        farthest2 = max(farthest2, moved2)
+    pairs.slack[0] = sqrt(farthest2)
+    return _fits(pairs) and pairs.slack[0] <= _most_slack(pairs)
+
+
+@kernel(inline=True)
+def _displacement(cell, multiple, k):
+    """Component k of a sum of edges; an edge may be infinite where there is none of it."""
+    total = 0.0
+    for vector in range(3):
+        if multiple[vector] != 0:
+            total += multiple[vector] * cell[vector, k]
+    return total
+
+
+@task(counted=False)
+def _part(parcel, block):
+    pairs = opened(parcel)
+    part_block(pairs, block)
+
+
 @task(counted=False)
 def _place(parcel, block):
     pairs, sites, state = opened(parcel)
@@ -114,7 +171,7 @@ def _place(parcel, block):
 @task(counted=False)
 def _follow(parcel, block):
     pairs = opened(parcel)
-    follow_block(pairs.clusters, 0.5 * pairs.skin, block)
+    follow_block(pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0]), block)
 
 
 @task(counted=False)
@@ -134,19 +191,22 @@ def _prepare(parcel, block):
     """Sort the sites for a new list; a status code into counters[STATUS]."""
     pairs = opened(parcel)
     pairs.counters[STATUS] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
-    pairs.counters[IMAGES_FOUND] = _find_images(pairs.cell, pairs.cutoff + pairs.skin, pairs.shift)
+    _find_images(pairs)
 
 
 @kernel
-def _find_images(cell, radius, shift):
-    """Shifts of the images of the brick (see `clusters`) within a radius of it, and their number. Shift 0 is the first.
+def _find_images(pairs):
+    """Find the images of the brick (see `clusters`) near it in the present cell. Shift 0 is the first.
 
     Bricks are stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27
     images in an orthorhombic box and up to 48 in a triclinic one.
     """
+    cell, multiple = pairs.cell, pairs.multiple
+    pairs.built[:] = cell
+    pairs.slack[0] = 0.0
+    radius = pairs.cutoff + pairs.skin + _most_slack(pairs)
+    multiple[0] = 0
     found = 1
-    for n in range(3):
-        shift[n] = 0.0
     for z in range(-1, 2):
         if z != 0 and cell[2, 2] == inf:
             continue
@@ -157,14 +217,12 @@ def _find_images(cell, radius, shift):
             for x in range(left, right + 1):
                 if x == y == z == 0:
                     continue
-                for k in range(3):
-                    total = 0.0
-                    for n, vector in ((x, 0), (y, 1), (z, 2)):
-                        if n != 0:
-                            total += n * cell[vector, k]
-                    shift[4 * found + k] = total
+                multiple[found, 0], multiple[found, 1], multiple[found, 2] = x, y, z
                 found += 1
-    return found
+    for n in range(found):
+        for k in range(3):
+            pairs.shift[4 * n + k] = _displacement(cell, multiple[n], k)
+    pairs.counters[IMAGES_FOUND] = found
 
 
 @kernel
