@@ -251,9 +251,9 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluate, advance = Engine.evaluate, Engine.advance
     monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state))
 
-    def counted(self, state, scheme, dt, until):
+    def counted(self, state, scheme, dt, until, looked=False):
         loads.append(until - state.step[NOW])
-        return advance(self, state, scheme, dt, until)
+        return advance(self, state, scheme, dt, until, looked)
 
     monkeypatch.setattr(Engine, "advance", counted)
     ends, costs = [], []

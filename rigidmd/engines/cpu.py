@@ -187,7 +187,7 @@ class Engine:
     def look(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """`evaluate` at the state that was just moved; what its last step has computed is not computed again."""
         moving = self._loadings.get("steps")
-        if state is not self._moved or self._stale or moving is None or not moving.loader.known[0]:
+        if self.load is None or moving is None or state is not self._moved or self._stale or not moving.loader.known[0]:
             return self.evaluate(state)
         return self._told(self.load, moving)
 
