@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rigidmd.own.force import Force
     from rigidmd.own.pair_law import PairLaw, pair_law
     from rigidmd.own.trust import trust
-    from rigidmd.run import Every, Moment, Observer, Results, Simulation
+    from rigidmd.run import Every, Moment, Observer, Results, Simulation, run_together
     from rigidmd.scene import BodyScene, MolecularScene, Scene
     from rigidmd.study.sweep.sweeping import sweep
 
@@ -39,6 +39,7 @@ __all__ = [
     "compiled_force",
     "compiled_thermostat",
     "pair_law",
+    "run_together",
     "sweep",
     "trust",
 ]
@@ -46,7 +47,7 @@ __all__ = [
 #: The module in which each of them is.
 _HOMES = (
     dict.fromkeys(("BodyScene", "MolecularScene", "Scene"), "scene")
-    | dict.fromkeys(("Every", "Moment", "Observer", "Results", "Simulation"), "run")
+    | dict.fromkeys(("Every", "Moment", "Observer", "Results", "Simulation", "run_together"), "run")
     | dict.fromkeys(("compiled_force", "compiled_thermostat"), "dynamics.own")
     | dict.fromkeys(("PairLaw", "pair_law"), "own.pair_law")
     | {

@@ -48,17 +48,18 @@ def run(engine, state, dt, steps, scheme=VERLET):
 
 
 def test_the_energy_error_is_of_order_two(liquid):
+    """Of its fluctuation: the error at the start is no measure, it is small or large by chance (orders of 1.88 to 2.08
+    from 30 starts, those of the fluctuation 1.98 to 2.03)."""
     system, engine, state = liquid
-    start = observe(system, engine, state).energy
-    errors = []
+    fluctuations = []
     for dt in (0.002, 0.001, 0.0005):
-        moved, worst = state.copy(), []
+        moved, energies = state.copy(), []
         engine.forget()
         for _ in range(40):
             move(engine, moved, VERLET, dt, round(0.004 / dt))
-            worst.append(observe(system, engine, moved).energy - start)
-        errors.append(np.sqrt(np.mean(np.square(worst))))
-    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.1)
+            energies.append(observe(system, engine, moved).energy)
+        fluctuations.append(np.std(energies))
+    assert np.log2(np.array(fluctuations[:-1]) / fluctuations[1:]) == pytest.approx([2, 2], abs=0.06)
 
 
 @pytest.mark.parametrize(

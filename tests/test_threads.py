@@ -1,6 +1,7 @@
 """Threads: that each block is done once, whoever asks, and that those who wait leave their cores to others."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 from conftest import ROOT, small_scene
 
-from rigidmd import Simulation
+from rigidmd import Simulation, run_together
 from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
 from rigidmd.compile.crew import _crew
 from rigidmd.compile.machine import MOST_THREADS
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.errors import SimulationError
 
 
 @task()
@@ -89,23 +92,87 @@ def test_two_leaders_at_once_each_have_their_blocks_done_once():
     assert all((seen[:, 0] == 20_000).all() for seen in found)
 
 
-def test_two_simulations_at_once_have_the_bits_of_each_alone():
-    stage = {"ensemble": "nve", "duration_ps": 1.0}
-    own = {"stages": [stage], "start": {"temperature_K": 90.0}, "output": {"trajectory": False}}
-    scenes = [small_scene({"argon": 500}, 30.0, seed=seed, **own) for seed in (1, 2)]
-    alone = [Simulation(scene).run().state for scene in scenes]
+def short_runs(count=2, seed=1, **own):
+    """Runs of 500 argon for 1 ps, with a seed each."""
+    own = {"stages": [{"ensemble": "nve", "duration_ps": 1.0}], "start": {"temperature_K": 90.0}} | own
+    own = {"output": {"trajectory": False}} | own
+    return [Simulation(small_scene({"argon": 500}, 30.0, seed=seed + k, **own)) for k in range(count)]
+
+
+def test_simulations_at_once_have_the_bits_of_each_alone():
+    alone = [simulation.run().state for simulation in short_runs(3)]
+    together = run_together(short_runs(3))
+    for a, b in zip(alone, together, strict=True):
+        assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b.state, strict=True))
+        assert b.summary["threads"] == 1
+    assert [r.state.step[0] for r in run_together(short_runs(3), jobs=1)] == [s.step[0] for s in alone]
+
+
+def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
+    alone = [simulation.run().state for simulation in short_runs()]
     together = [None, None]
 
-    def run(k):
-        together[k] = Simulation(scenes[k]).run().state
+    def run(k, simulation):
+        together[k] = simulation.run().state
 
-    both = [threading.Thread(target=run, args=(k,)) for k in (0, 1)]
+    both = [threading.Thread(target=run, args=one) for one in enumerate(short_runs())]
     for one in both:
         one.start()
     for one in both:
         one.join()
     for a, b in zip(alone, together, strict=True):
         assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
+
+
+def test_other_threads_of_python_go_on_while_steps_are_taken():
+    [simulation] = short_runs(1)
+    engine, state = simulation.engine, simulation.state
+    row = SCHEMES["velocity_verlet"]
+    engine.advance(state, row, 1e-3, 1)
+    ends = []
+
+    def move():
+        ends.append(time.perf_counter())
+        engine.advance(state, row, 1e-3, 1000)
+        ends.append(time.perf_counter())
+
+    mover, ticks = threading.Thread(target=move), []
+    mover.start()
+    while mover.is_alive():
+        ticks.append(time.perf_counter())
+        time.sleep(1e-3)
+    began, ended = ends
+    inside = [began, *(tick for tick in ticks if began < tick < ended), ended]
+    assert max(np.diff(inside)) < 0.5 * (ended - began)  # with Python's lock all of it would be one gap
+
+
+def test_what_runs_together_is_stopped_together():
+    runs = short_runs(3, stages=[{"ensemble": "nve", "duration_ps": 1e5}])
+    timer = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    try:
+        first, second, third = run_together(runs, jobs=2)
+    finally:
+        timer.cancel()
+    assert first.interrupted and second.interrupted and third is None
+    assert first.signal == signal.SIGTERM
+    assert 0 < first.state.step[0] < 1e8
+
+
+def test_one_that_fails_takes_no_other_with_it(tmp_path):
+    hot = {"start": {"temperature_K": 90.0}, "stages": [{"ensemble": "nve", "duration_ps": 1.0, "timestep_fs": 900.0}]}
+    runs = [*short_runs(1, **hot), *short_runs(1, seed=2)]
+    with pytest.raises(SimulationError) as error:
+        run_together(runs)
+    assert any("of 2 runs at once these failed: 1" in note for note in error.value.__notes__)
+    assert runs[1].state.time[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("twice", "jobs", "word"), [(True, None, "twice"), (False, 0, "at least one")])
+def test_what_cannot_run_together_is_refused(twice, jobs, word):
+    runs = short_runs(1)
+    with pytest.raises(ValueError, match=word):
+        run_together(runs * 2 if twice else runs, jobs)
 
 
 @pytest.mark.skipif(MOST_THREADS < 2 or not hasattr(time, "pthread_getcpuclockid"), reason="one core")

@@ -1,6 +1,7 @@
 """Machine code that is called by address. Each address carries the type that the code was compiled for."""
 
 import hashlib
+import threading
 from collections.abc import Callable
 from contextvars import ContextVar
 
@@ -78,7 +79,7 @@ class Task:
             ahead.wait_for(*self.name, parcel)
             crew.begin()
             code = callback(self.function, (parcel, types.intp), self.options)
-            self.compiled[parcel] = code
+            self.compiled.setdefault(parcel, code)  # another thread may use what it has made meanwhile
         return self.compiled[parcel].address
 
     @property
@@ -93,7 +94,7 @@ class Task:
             code = kept_callback(self.function, (parcel, types.intp), self.options)
             if code is None:
                 return False
-            self.compiled[parcel] = code
+            self.compiled.setdefault(parcel, code)
         return True
 
 
@@ -102,6 +103,8 @@ def task(*, counted=True):
     return lambda function: Task(function, **options_of(False), **uncounted(counted))
 
 
+#: Held while codes are compiled together: of several runs at once, one compiles what the others then read.
+_compiling = threading.RLock()
 #: Tasks of each `Code` that this thread makes, while it compiles nothing; None otherwise.
 _plan: ContextVar[list[tuple[Task, Parcel]] | None] = ContextVar("plan", default=None)
 
@@ -114,16 +117,17 @@ def compile_together(make: Callable[[], object]) -> None:
     """
     if ahead.compilers() == 1:
         return
-    wanted: list[tuple[Task, Parcel]] = []
-    before = _plan.set(wanted)
-    try:
-        make()
-    finally:
-        _plan.reset(before)
-    missing = [(*one.name, parcel) for one, parcel in dict.fromkeys(wanted) if not one.is_ready(parcel)]
-    if len(missing) >= ahead.FEWEST:
-        with ahead.helped(missing):
+    with _compiling:
+        wanted: list[tuple[Task, Parcel]] = []
+        before = _plan.set(wanted)
+        try:
             make()
+        finally:
+            _plan.reset(before)
+        missing = [(*one.name, parcel) for one, parcel in dict.fromkeys(wanted) if not one.is_ready(parcel)]
+        if len(missing) >= ahead.FEWEST:
+            with ahead.helped(missing):
+                make()
 
 
 class Code:

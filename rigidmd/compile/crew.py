@@ -242,20 +242,21 @@ class _Crew:
         self.wanted = MOST_THREADS
         self.hired = 0
         self.code: list = []
-        self._hiring = threading.Lock()
+        self._hiring = threading.RLock()
 
     def begin(self) -> None:
         """Compile what the crew does, or read it from the cache, and hire the helpers that are wanted."""
-        if not self.code:
-            options = options_of(False) | uncounted(False)
-            self.code = [
-                callback(function, (types.int64,) * count, options)
-                for function, count in ((_lead, 4), (_help, 2), (_look, 2))
-            ]
-            self.cells[LEAD] = self.code[0].address
-            self.cells[LEADERS_BELL] = _bell()
-            self.cells[POLLS] = self._polls()
-        self.hire()
+        with self._hiring:
+            if not self.code:
+                options = options_of(False) | uncounted(False)
+                self.code = [
+                    callback(function, (types.int64,) * count, options)
+                    for function, count in ((_lead, 4), (_help, 2), (_look, 2))
+                ]
+                self.cells[LEAD] = self.code[0].address
+                self.cells[LEADERS_BELL] = _bell()
+                self.cells[POLLS] = self._polls()
+            self.hire()
 
     def hire(self) -> None:
         """Hire the helpers that are missing, and let as many help as are wanted. Does nothing before `begin`."""
@@ -288,7 +289,7 @@ class _Crew:
 
     def forget(self) -> None:
         """After a fork: no helper has come along."""
-        self.hired, self._hiring = 0, threading.Lock()
+        self.hired, self._hiring = 0, threading.RLock()
         self.cells[[HELPERS, AT_WORK, LEADER_SLEEPS]] = 0
         self.cells[FIRST_HELPER:] = 0
         if self.code:

@@ -22,7 +22,7 @@ def kernel(function: Callable | None = None, *, inline=False, counted=True, oute
     calls: references are then not counted. Atomic reference counting raised a vector of pairs from 7 ns to 47 ns. Such
     a loop must read elements by index: iteration over a view crashed. Its caller must not rebind, in a loop, arrays
     that it passes: the new arrays were freed while in use.
-    outer: True if Python calls the function.
+    outer: True if Python calls the function, which then runs without Python's lock.
     """
     if function is None:
         return lambda f: kernel(f, inline=inline, counted=counted, outer=outer)

@@ -186,9 +186,9 @@ def _own_folder() -> Iterator[None]:
 def dispatcher(function: Callable, options: dict, outer: bool) -> CPUDispatcher:
     """A function that is compiled with these options of Numba, or read from our cache, when it is first called.
 
-    outer : whether Python calls it, for which it needs a wrapper
+    outer : whether Python calls it, for which it needs a wrapper. Meanwhile other threads of Python go on
     """
-    options = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer}
+    options = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer, "nogil": outer}
     compiled = numba.njit(**options)(function)
     compiled.__class__ = Kernel if outer else Inner
     return compiled

@@ -6,5 +6,15 @@ from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Every, Observer
 from rigidmd.run.results import Results
+from rigidmd.run.together import run_together
 
-__all__ = ["BodySimulation", "Every", "MolecularSimulation", "Moment", "Observer", "Results", "Simulation"]
+__all__ = [
+    "BodySimulation",
+    "Every",
+    "MolecularSimulation",
+    "Moment",
+    "Observer",
+    "Results",
+    "Simulation",
+    "run_together",
+]

@@ -470,5 +470,15 @@ class Simulation(Base):
         """End the run at the next look with everything saved; a second Ctrl-C ends it at once."""
         if self._interrupted and number == signal.SIGINT:
             raise KeyboardInterrupt
+        self.stop(number)
+
+    def stop(self, number: int | None = None) -> None:
+        """End the run at its next look, with everything saved. number : of the signal that asks for it
+
+        An observer may call it, and any thread.
+        """
         self._signal = self._signal or number
         self._interrupted = True
+
+    def take_threads(self, count: int) -> None:
+        """Let runs compute with so many threads. Results do not depend on it; a single body always takes one."""

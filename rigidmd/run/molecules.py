@@ -101,6 +101,13 @@ class MolecularSimulation(Simulation):
         self._built = replace(self._built, state=begun, from_lattice=False)
         self._reset()
 
+    def take_threads(self, count: int) -> None:
+        """Let runs compute with so many threads. Results do not depend on it."""
+        scene = self._built.scene.model_copy(update={"threads": count})
+        self._built = replace(self._built, scene=scene)
+        self.threads = threads_for(count)
+        self._reset()
+
     def atoms(self) -> "ase.Atoms":
         """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. An observer may call it."""
         return atoms_of(self.system, self.state, self.scene.output.positions == "wrapped")

@@ -1,0 +1,133 @@
+"""Many small systems: steps of all replicas a second, one after another and at once.
+
+    python tests/benchmarks/replicas.py --systems 216,27,6 --replicas 8 --rounds 3
+
+Replicas differ in their seeds. They run one after another on all cores; at once in this process by `run_together`, a
+thread each; and by `rigidmd sweep --replicas` in processes, a thread each. Beside them stands what the engine alone
+takes on one core, times the cores. 216 and 27: liquid SPC/E in a box; 6: a cluster in vacuum. Steps of 2 fs at constant
+temperature in mixed precision, a line of the log every 0.1 ps, all files but the trajectory and figures. A time is that
+of all replicas from the scene to the last file, the start of processes included; compiled code is in the cache.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import tomli_w
+from peers import choice
+from scaling import STEP
+
+from rigidmd import Scene, Simulation, run_together
+from rigidmd.assemble.rows import row
+from rigidmd.core.state import NOW
+
+CORES = len(os.sched_getaffinity(0))
+CLUSTER = {"box": {"lengths_A": 7.0, "periodic": False}}
+#: Molecules -> what their scene has of its own.
+SYSTEMS = {
+    "216": {"box": {"density_g_cm3": 0.997}, "forces": {"cutoff_A": 9.0, "electrostatics": "reaction_field"}},
+    "27": {"box": {"density_g_cm3": 0.997}, "forces": {"cutoff_A": 4.6, "electrostatics": "reaction_field"}},
+    "6": CLUSTER,
+}
+TEMPERATURES = {"216": 298.0, "27": 298.0, "6": 150.0}
+LONG, WARM_UP = 1.0, 500  # ps, steps
+
+
+def data(name: str, duration: float, seed: int = 1) -> dict:
+    """A replica for so many ps."""
+    stage = {"ensemble": "nvt", "temperature_K": TEMPERATURES[name], "timestep_fs": 1e3 * STEP, "duration_ps": duration}
+    return SYSTEMS[name] | {
+        "precision": "mixed",
+        "seed": seed,
+        "molecules": [{"model": "spce", "count": int(name)}],
+        "stages": [stage],
+        "output": {"trajectory": False, "figure": False},
+    }
+
+
+def bare_speed(name: str, seconds: float) -> float:
+    """Steps a second of the engine alone on one core, from a state that has come to rest."""
+    simulation = Simulation(Scene.from_dict(data(name, LONG)))
+    simulation.take_threads(1)
+    state = simulation.run().state
+    engine, scheme = simulation.engine, row(simulation.system, 0)
+
+    def speed(steps: int) -> float:
+        began = time.perf_counter()
+        engine.advance(state, scheme, STEP, int(state.step[NOW]) + steps)
+        return steps / (time.perf_counter() - began)
+
+    return speed(max(WARM_UP, round(seconds * speed(WARM_UP))))
+
+
+def one_after_another(name: str, duration: float, replicas: int, folder: Path) -> None:
+    for k in range(replicas):
+        Simulation(Scene.from_dict(data(name, duration, 1 + k)), folder / str(k)).run()
+
+
+def together(name: str, duration: float, replicas: int, folder: Path) -> None:
+    scenes = [Scene.from_dict(data(name, duration, 1 + k)) for k in range(replicas)]
+    run_together([Simulation(scene, folder / str(k)) for k, scene in enumerate(scenes)])
+
+
+def swept(name: str, duration: float, replicas: int, folder: Path) -> None:
+    folder.mkdir()
+    scene = folder / "scene.toml"
+    scene.write_text(tomli_w.dumps(data(name, duration)))
+    command = [
+        sys.executable,
+        "-m",
+        "rigidmd",
+        "sweep",
+        str(scene),
+        "--replicas",
+        str(replicas),
+        "-o",
+        str(folder / "out"),
+    ]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+WAYS = {"one after another": one_after_another, "run_together": together, "rigidmd sweep": swept}
+
+
+def measure(name: str, replicas: int, rounds: int, seconds: float) -> tuple[float, dict[str, float]]:
+    """The engine alone on all cores, and the median of each way: steps of all replicas a second."""
+    bare = [bare_speed(name, 1.0)]
+    duration = STEP * round(seconds * bare[0])
+    found: dict[str, list[float]] = {way: [] for way in WAYS}
+    for k in range(rounds + 1):
+        for way, run in WAYS.items():
+            with tempfile.TemporaryDirectory() as folder:
+                began = time.perf_counter()
+                run(name, duration if k else LONG, replicas, Path(folder) / "runs")
+                spent = time.perf_counter() - began
+            if k:  # the first round fills the cache
+                found[way].append(replicas * round(duration / STEP) / spent)
+        bare.append(bare_speed(name, 1.0))
+    return CORES * statistics.median(bare), {way: statistics.median(speeds) for way, speeds in found.items()}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    names = list(SYSTEMS)
+    parser.add_argument("--systems", type=choice(names), default=names, help=f"of {','.join(names)}; all")
+    parser.add_argument("--replicas", type=int, default=8, help="8")
+    parser.add_argument("--rounds", type=int, default=3, help="3")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of computing for each replica on one core; 4")
+    asked = parser.parse_args()
+    print(f"| SPC/E | engine alone, {CORES} times one core | {' | '.join(WAYS)} |\n|---|---|{'---|' * len(WAYS)}")
+    for name in asked.systems:
+        bare, speeds = measure(name, asked.replicas, asked.rounds, asked.seconds)
+        cells = " | ".join(f"{speed:.4g}, {speed / bare:.2f}" for speed in speeds.values())
+        print(f"| {name} | {bare:.4g} | {cells} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
