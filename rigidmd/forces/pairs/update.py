@@ -202,10 +202,12 @@ def _find_images(pairs):
     images in an orthorhombic box and up to 48 in a triclinic one.
     """
     cell, multiple = pairs.cell, pairs.multiple
-    pairs.built[:] = cell
+    for vector in range(3):
+        for k in range(3):
+            pairs.built[vector, k] = cell[vector, k]
     pairs.slack[0] = 0.0
     radius = pairs.cutoff + pairs.skin + _most_slack(pairs)
-    multiple[0] = 0
+    multiple[0, 0] = multiple[0, 1] = multiple[0, 2] = 0
     found = 1
     for z in range(-1, 2):
         if z != 0 and cell[2, 2] == inf:
