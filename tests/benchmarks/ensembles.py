@@ -1,0 +1,79 @@
+"""What ensembles cost: steps a second with each thermostat and barostat, against constant energy.
+
+    python tests/benchmarks/ensembles.py --workloads W1,W2 --rounds 5
+
+All move the same start in steps of 2 fs in mixed precision, in turns in one process, and nobody looks. The thermostats and
+barostats have their default strengths. The workloads are those of peers.py.
+"""
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+
+from peers import WORKLOADS, choice, start_of
+from scaling import STEP
+
+from rigidmd import Scene, Simulation
+from rigidmd.assemble.rows import row as row_of_stage
+from rigidmd.core.state import NOW
+
+WARM, PRESSED = {"temperature_K": 300.0}, {"pressure_bar": 1.0}
+STAGES = {
+    "nve": {"ensemble": "nve"},
+    "nvt, langevin": {"ensemble": "nvt", "thermostat": "langevin"} | WARM,
+    "nvt, velocity_rescaling": {"ensemble": "nvt", "thermostat": "velocity_rescaling"} | WARM,
+    "nvt, nose_hoover": {"ensemble": "nvt", "thermostat": "nose_hoover"} | WARM,
+    "npt, cell_rescaling": {"ensemble": "npt", "barostat": "cell_rescaling"} | WARM | PRESSED,
+    "npt, monte_carlo": {"ensemble": "npt", "barostat": "monte_carlo"} | WARM | PRESSED,
+    "nph, piston": {"ensemble": "nph"} | PRESSED,
+}
+WARM_UP = 200
+
+
+def measure(workload: str, folder: Path, rounds: int, seconds: float) -> dict[str, tuple[float, float]]:
+    """Of each ensemble its median steps a second, and the median of the ratios to constant energy."""
+    stages = [{"duration_ps": 1.0, "timestep_fs": 1e3 * STEP} | stage for stage in STAGES.values()]
+    data = WORKLOADS[workload].scene(precision="mixed", stages=stages, output={"trajectory": False})
+    run = Simulation(Scene.from_dict(data, folder))
+    movers = []
+    for k in range(len(stages)):
+        row, engine = row_of_stage(run.system, k), run.system.engine()
+        movers.append((engine, engine.begin(run.state, row), row))
+
+    def speed(mover, steps: int) -> float:
+        engine, state, row = mover
+        began = time.perf_counter()
+        engine.advance(state, row, STEP, int(state.step[NOW]) + steps)
+        return steps / (time.perf_counter() - began)
+
+    for mover in movers:
+        speed(mover, WARM_UP)
+    steps = max(50, round(seconds * speed(movers[0], WARM_UP)))
+    found = [[speed(mover, steps) for mover in movers] for _ in range(rounds)]
+    return {
+        name: (statistics.median(one[k] for one in found), statistics.median(one[k] / one[0] for one in found))
+        for k, name in enumerate(STAGES)
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    names = list(WORKLOADS)
+    parser.add_argument("--workloads", type=choice(names), default=["W1", "W2"], help=f"of {','.join(names)}; W1,W2")
+    parser.add_argument("--rounds", type=int, default=5, help="5")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement; 2")
+    asked = parser.parse_args()
+    found = {
+        name: measure(name, start_of(name, "own").sites_file.parent, asked.rounds, asked.seconds)
+        for name in asked.workloads
+    }
+    print(f"| steps/s, and over nve | {' | '.join(found)} |\n|---|{'---|' * len(found)}")
+    for name in STAGES:
+        cells = (f"{speed:.4g}, {ratio:.2f}" for speed, ratio in (own[name] for own in found.values()))
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
