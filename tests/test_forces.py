@@ -10,7 +10,7 @@ from rigidmd.assemble.system import build
 from rigidmd.compile.lanes import lane_count
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import no_load
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import BUILDS, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
@@ -271,6 +271,14 @@ def test_everything_follows_a_cell_that_changes(electrostatics, change):
     move(engine, state, SCHEMES["velocity_verlet"], 0.0005, 5)
     move(system.engine(), other, SCHEMES["velocity_verlet"], 0.0005, 5)
     assert state.position == pytest.approx(other.position, abs=1e-9)
+
+
+def test_a_box_that_is_no_number_is_told():
+    _, engine, state = built({"argon": 60}, 20.0, 3)
+    engine.evaluate(state)
+    state.cell[:] = np.nan
+    with pytest.raises(NotFiniteError):
+        engine.evaluate(state)
 
 
 @pytest.mark.parametrize("precision", ["double", "mixed"])

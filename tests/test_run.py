@@ -686,6 +686,17 @@ def test_a_look_asks_a_force_in_python_once():
     assert spring.asked == asked + 1
 
 
+def test_a_look_at_another_state_is_an_evaluation():
+    system, engine, start = built({"argon": 20}, 20.0, 3)
+    row = SCHEMES["velocity_verlet"]
+    moved, other = engine.begin(start, row), engine.begin(start, row)
+    engine.advance(moved, row, 1e-3, 5, looked=True)
+    other.position[:] += 0.1 * np.arange(20)[:, None]
+    engine.advance(other, row, 1e-3, 0, looked=True)  # no step
+    expected = system.engine().evaluate(other)[1]
+    assert engine.look(other)[1]["lennard_jones"].energy == pytest.approx(expected["lennard_jones"].energy, rel=1e-12)
+
+
 def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
     ends = []
     for interval in (0.01, 0.025):

@@ -6,13 +6,14 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 
 import numba
 import numpy as np
 import pytest
 from conftest import ROOT, small_scene
 
-from rigidmd import Simulation, run_together
+from rigidmd import Every, Simulation, run_together
 from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
 from rigidmd.compile.crew import _crew
 from rigidmd.compile.machine import MOST_THREADS
@@ -157,6 +158,35 @@ def test_what_runs_together_is_stopped_together():
     assert first.interrupted and second.interrupted and third is None
     assert first.signal == signal.SIGTERM
     assert 0 < first.state.step[0] < 1e8
+
+
+def test_a_second_ctrl_c_is_an_interrupt_and_all_runs_still_end():
+    def press_twice(moment):
+        if moment.step == 100:  # this run cannot end before both have come
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.1)
+
+    stages = [{"ensemble": "nve", "duration_ps": 1e5}]
+    scene = short_runs(1, stages=stages)[0].scene
+    runs = [Simulation(scene, observers=Every(0.1, press_twice)), *short_runs(1, stages=stages)]
+    with pytest.raises(KeyboardInterrupt):
+        run_together(runs)
+    assert all(0 < one.state.step[0] < 1e8 for one in runs)
+
+
+def test_each_run_writes_its_files_as_if_alone(tmp_path):
+    runs = [
+        Simulation(
+            small_scene({"argon": 100}, 20.0, seed=seed, output={"trajectory_interval_ps": 0.002}), tmp_path / str(seed)
+        )
+        for seed in range(4)
+    ]
+    for results in run_together(runs, jobs=4):
+        assert all(path.is_file() for path in results.files)
+        assert len(results.universe().trajectory) == 3
+    everything = ("ignore", None, Warning, None, 0)
+    assert everything not in warnings.filters
 
 
 def test_one_that_fails_takes_no_other_with_it(tmp_path):

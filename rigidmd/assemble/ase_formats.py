@@ -2,7 +2,6 @@
 
 import io
 import re
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
 from rigidmd.assemble.own_formats import promised_atoms
+from rigidmd.core.process import quiet
 from rigidmd.core.toml_text import whole_number
 from rigidmd.errors import StructureError
 
@@ -31,8 +31,7 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
     import ase.io.formats
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
         raise StructureError(

@@ -27,6 +27,7 @@ from numba.core.registry import CPUDispatcher
 
 from rigidmd.compile.cache import cache_folder, shared_folder
 from rigidmd.core.own_code import BY_CONTENT
+from rigidmd.core.process import ONE_AT_A_TIME
 from rigidmd.errors import RigidMDWarning
 
 
@@ -166,7 +167,7 @@ class Inner(Kernel):
 
 
 def _opened_cache(function: Callable) -> FunctionCache:
-    with _own_folder():
+    with ONE_AT_A_TIME, _own_folder():
         found = FunctionCache(function)
     found._cache_file.__class__ = Index
     return found

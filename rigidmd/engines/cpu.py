@@ -132,6 +132,8 @@ class Engine:
         row = _scheme_of(row)
         workspaces = self._prepare(state)
         keep_time(state, dt)
+        if state is not self._moved and "steps" in self._loadings:  # the energies of its last step are of another state
+            self._loadings["steps"].loader.known[0] = 0
         self._moved = state
         if self.load is None:
             self.load = no_load(state)

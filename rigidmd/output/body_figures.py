@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle, save_figure, thin_series
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle, save_figure, settings, thin_series
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,11 +23,9 @@ MOST_POINTS, FLOOR = 10_000, 1e-17
 
 def draw_motion(folder: Path, figures: dict[str, "Figure"]) -> list[Path]:
     """Write figures as PNG and SVG, with the same bytes for the same run. Returns the paths. Raises OutputError."""
-    from matplotlib import rc_context
-
     written = []
     for stem, figure in figures.items():
-        with rc_context({"svg.hashsalt": stem}):
+        with settings({"svg.hashsalt": stem}):
             for ending, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
                 written.append(folder / f"{stem}.{ending}")
                 with whole_file(written[-1]) as temporary:

@@ -1,8 +1,12 @@
 """Shared by all figures: writing, and styles for many curves."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 
 import numpy as np
+
+from rigidmd.core.process import ONE_AT_A_TIME
 
 #: Points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
 AT_ONCE = 5000
@@ -36,15 +40,23 @@ class InPieces:
             renderer.draw_path(gc, piece, affine, rgbFace)
 
 
+@contextmanager
+def settings(changed: dict) -> Iterator[None]:
+    """Within it Matplotlib has other settings. It has one set of them for all threads."""
+    from matplotlib import rc_context
+
+    with ONE_AT_A_TIME, rc_context(changed):
+        yield
+
+
 def save_figure(figure, target, **options) -> None:
     """`figure.savefig`, with curves of any number of points."""
-    from matplotlib import rc_context
     from matplotlib.lines import Line2D
 
     for line in figure.findobj(Line2D):
         if len(line.get_xdata()) > AT_ONCE:
             line.set_path_effects([InPieces()])
-    with rc_context({"agg.path.chunksize": 0}):
+    with settings({"agg.path.chunksize": 0}):
         figure.savefig(target, **options)
 
 

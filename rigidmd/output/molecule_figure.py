@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.molecules import Molecule
-from rigidmd.output.figure import COOL, FAINT, INK, save_figure
+from rigidmd.output.figure import COOL, FAINT, INK, save_figure, settings
 from rigidmd.output.molecule_report import COVALENT, bonds, short_source
 from rigidmd.output.target import check_target
 
@@ -34,7 +34,6 @@ class _Sphere(NamedTuple):
 
 def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     """Draw a molecule into a file; the ending sets the format. Raises OutputError."""
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     check_target(path, ENDINGS, force, "figure")
@@ -69,7 +68,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     ]
     told.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(told), fontsize=FONT, linespacing=1.35, **plain)
-    with rc_context({"svg.hashsalt": m.name}), whole_file(path) as temporary:
+    with settings({"svg.hashsalt": m.name}), whole_file(path) as temporary:
         metadata = {"Date": None} if path.suffix == ".svg" else None
         save_figure(figure, temporary, dpi=150, metadata=metadata)
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, settings
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
@@ -78,13 +78,11 @@ def code(text: str) -> str:
 
 def figure(drawn, salt: str, about: str) -> str:
     """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each figure of a page."""
-    from matplotlib import rc_context
-
     stream = io.StringIO()
     drawn.patch.set_visible(False)
     for axis in drawn.axes:
         axis.patch.set_visible(False)
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+    with settings({"svg.fonttype": "none", "svg.hashsalt": salt}):
         save_figure(drawn, stream, format="svg", metadata={"Date": None, "Creator": None})
     found = stream.getvalue()
     found = found[found.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1)

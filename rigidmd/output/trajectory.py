@@ -17,6 +17,7 @@ from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.gsd_format import GsdReader
 from rigidmd.assemble.system import System
 from rigidmd.assemble.trajectory_formats import read_apart
+from rigidmd.core.process import quiet
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError, StructureError
 from rigidmd.output.connections import charges, connections
@@ -210,8 +211,7 @@ def _quiet() -> Iterator[None]:
     """Silence the warnings of readers, and what one that could not open its file says when it is removed."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             yield
     finally:
         sys.unraisablehook = hook

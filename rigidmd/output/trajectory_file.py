@@ -4,7 +4,6 @@ import contextlib
 import os
 import struct
 import tempfile
-import warnings
 from collections.abc import Iterator, Sequence
 from math import inf
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.system import System
 from rigidmd.core.files import AppendedFile, whole_file
+from rigidmd.core.process import quiet
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.output.gsd_file import GsdFile
@@ -48,8 +48,7 @@ def write_topology(path: Path, system: System | BodySystem, state: State, wrappe
     Raises SimulationError if the format cannot hold a position.
     """
     _check_fits(path, system.site_positions(state, wrapped))
-    with whole_file(path) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of missing attributes (occupancies, ...)
+    with whole_file(path) as temporary, quiet():  # of missing attributes (occupancies, ...)
         sites = universe(system, state, wrapped=wrapped).select_atoms("all")
         sites.write(str(temporary), **({"bonds": "all"} if path.suffix == ".pdb" else {}))
 
@@ -122,8 +121,7 @@ class TrajectoryFile:
     def _whole(self, state: State, time: float) -> bytes:
         """The file that has the present frame alone."""
         options = self._options | ({"start": self._frames} if self._format == ".pdb" else {})
-        with _scratch(self._path) as path, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with _scratch(self._path) as path, quiet():
             form = "NCDF" if self._format == ".nc" else self._format[1:].upper()
             writer: Any = mda.Writer(path, n_atoms=len(self._system.sites.name), format=form, **options)
             with writer:

@@ -1,7 +1,6 @@
 """Frames of a run of molecules as `ase.Atoms`."""
 
 import contextlib
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,6 +9,7 @@ import numpy as np
 from rigidmd.assemble.system import System
 from rigidmd.assemble.to_atoms import EV, atoms_of, atoms_of_sites
 from rigidmd.assemble.traj_format import TrajReader
+from rigidmd.core.process import quiet
 from rigidmd.core.state import NOW
 from rigidmd.measure.atom_forces import in_ase_units
 from rigidmd.units import KJ_PER_MOL
@@ -96,8 +96,7 @@ def _from_files(results: "Results") -> Callable[[int], tuple]:
         with contextlib.closing(TrajReader(path)) as file:
             stored = [file.read(k) for k in range(file.count)]
             return lambda k: (*file.of_sites(stored[k]), stored[k].cell)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # frames that are not evenly spaced: each has its time
+    with quiet():  # frames that are not evenly spaced: each has its time
         trajectory = cast(Any, results.universe().trajectory)
 
     def sites(k: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Unpack, cast, overload
 
 import numpy as np
 
+from rigidmd.core.process import ONE_AT_A_TIME
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines import Engine
@@ -38,7 +39,7 @@ from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
 from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import changed_since, fitting
-from rigidmd.run.signals import handled, interruptible
+from rigidmd.run.signals import ending_signals, handled, interruptible
 from rigidmd.run.stretches import Costs, Place, Stretch
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
@@ -141,6 +142,7 @@ class Simulation(Base):
         self._signal: int | None = None
         self._resume = resume
         self._deadline = None if walltime is None else clock.monotonic() + walltime
+        self._keeper = Keeper(None, False, None)  # before a run
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
 
@@ -186,13 +188,13 @@ class Simulation(Base):
             scene = cast(MolecularScene | BodyScene, self.scene)
             self._keeper = Keeper(self.folder, scene.output.checkpoint_minutes, self._deadline)
             if hasattr(signal, "SIGUSR1"):
-                stack.enter_context(handled(self._ask_for_checkpoint, signal.SIGUSR1))
+                stack.enter_context(handled(self.ask_for_checkpoint, signal.SIGUSR1))
             self._warnings.clear()
             self._inputs = input_digests(self.scene)
             self._reset()
             began = clock.perf_counter()
             if kept is None:
-                with interruptible():
+                with interruptible(), ONE_AT_A_TIME:  # of several runs one compiles, and the others read what it made
                     self._prepare()
             else:
                 with fitting(self.folder):
@@ -210,10 +212,7 @@ class Simulation(Base):
                     make_folder(self.folder, self._force, names, inputs, lock)
                 else:
                     continue_folder(self.folder, names)
-            ending = [signal.SIGINT]
-            if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:  # else the program has its own way to end
-                ending.append(signal.SIGTERM)
-            stack.enter_context(handled(self._stop_at_next_look, *ending))
+            stack.enter_context(handled(self._stop_at_next_look, *ending_signals()))
             for k, observer in enumerate(observers):
                 stack.callback(observer.close)
                 if kept is None:
@@ -463,7 +462,8 @@ class Simulation(Base):
             if now:
                 observer.see(moment)
 
-    def _ask_for_checkpoint(self, number: int) -> None:
+    def ask_for_checkpoint(self, number: int | None = None) -> None:
+        """Write a checkpoint at the next look. number : of the signal that asks for it"""
         self._keeper.asked = True
 
     def _stop_at_next_look(self, number: int) -> None:

@@ -22,6 +22,11 @@ def handled(handler: Callable[[int], None], *numbers: int) -> Iterator[None]:
             signal.signal(number, earlier)
 
 
+def ending_signals() -> list[int]:
+    """The signals that end runs: Ctrl-C, and SIGTERM unless the program has its own way to end."""
+    return [signal.SIGINT, *([signal.SIGTERM] if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else [])]
+
+
 #: Seconds until Ctrl-C is tried again that came where Python ignores exceptions.
 AGAIN = 0.05
 
@@ -32,7 +37,8 @@ def interruptible() -> Iterator[None]:
 
     Raises KeyboardInterrupt, at the end if it did not before.
     """
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # a program has its own way
+    has_own_way = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    if has_own_way or threading.current_thread() is not threading.main_thread():
         yield
         return
     pressed, again, ignored = False, [], sys.unraisablehook

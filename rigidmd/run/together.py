@@ -1,14 +1,15 @@
 """Several runs at once in one process, a thread each."""
 
+import contextlib
+import signal
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from signal import SIGINT, SIGTERM
 from typing import cast
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.run.loop import Simulation
 from rigidmd.run.results import Results
-from rigidmd.run.signals import handled
+from rigidmd.run.signals import ending_signals, handled
 
 #: Seconds between two looks at who has asked to stop.
 TICK = 0.2
@@ -22,8 +23,9 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
 
     jobs : runs at a time; default: as many as there are cores
 
-    Ctrl-C and SIGTERM stop all at their next looks; what had not begun is None in the list. If a run fails, the others
-    go on, and the first error is raised at the end, with a note on the runs that failed.
+    Ctrl-C and SIGTERM stop all at their next looks; what had not begun is None in the list. A second Ctrl-C raises
+    KeyboardInterrupt then. If a run fails, the others go on, and the first error is raised at the end, with a note on
+    the runs that failed. The simulations keep to one thread, in their summaries and scenes too.
     """
     simulations = list(simulations)
     if len({id(one) for one in simulations}) < len(simulations):
@@ -33,7 +35,7 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
     for one in simulations:
         one.take_threads(1)
     begun: list[Simulation] = []
-    asked: list[int] = []  # the signals so far
+    asked: list[int] = []  # the signals that end runs, so far
 
     def run(one: Simulation) -> Results | None:
         if asked:
@@ -41,19 +43,32 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
         begun.append(one)
         return one.run(progress=False)
 
-    def stop(number: int) -> None:
-        if asked and number == SIGINT:
-            raise KeyboardInterrupt
-        asked.append(number)
+    def stop_all() -> None:
+        for one in begun:
+            one.stop(asked[0])
 
-    with handled(stop, SIGINT, SIGTERM), ThreadPoolExecutor(jobs or MOST_THREADS, "run") as pool:
+    def stop(number: int) -> None:
+        again = bool(asked) and number == signal.SIGINT
+        asked.append(number)
+        stop_all()
+        if again:
+            raise KeyboardInterrupt
+
+    def ask_for_checkpoints(number: int) -> None:
+        for one in begun:
+            one.ask_for_checkpoint(number)
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(handled(stop, *ending_signals()))
+        if hasattr(signal, "SIGUSR1"):
+            stack.enter_context(handled(ask_for_checkpoints, signal.SIGUSR1))
+        pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
         futures = [pool.submit(run, one) for one in simulations]
         running = set(futures)
         while running:
             _, running = wait(running, TICK)
             if asked:
-                for one in begun:  # again and again: one that was just beginning did not hear it
-                    one.stop(asked[0])
+                stop_all()  # again and again: one that was just beginning did not hear it
     _raise_first([future.exception() for future in futures])
     return [future.result() for future in futures]
 

@@ -116,8 +116,8 @@ def _shortest(cell):
 @kernel
 def _fits(pairs):
     """Whether the cell has room for the cut-off and the skin."""
-    shortest = _shortest(pairs.cell)
-    return pairs.cutoff == inf or (2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest)
+    shortest = _shortest(pairs.cell)  # NaN fits: what is not a number is found, and told, where sites are sorted
+    return pairs.cutoff == inf or not (2 * pairs.cutoff > shortest or pairs.skin > LONGEST_SKIN * shortest)
 
 
 @kernel
@@ -206,7 +206,7 @@ def _find_images(pairs):
         for k in range(3):
             pairs.built[vector, k] = cell[vector, k]
     pairs.slack[0] = 0.0
-    radius = pairs.cutoff + pairs.skin + _most_slack(pairs)
+    radius = min(pairs.cutoff + pairs.skin + _most_slack(pairs), _shortest(cell))  # rounding may exceed it
     multiple[0, 0] = multiple[0, 1] = multiple[0, 2] = 0
     found = 1
     for z in range(-1, 2):
