@@ -228,8 +228,8 @@ def _inverse_root(x):
     if _has_estimate(x) and x.dtype == types.float32:
 
         def from_quick_estimate(x):
-            # As below: the square of e does not count. LLVM would divide by a root where a processor is said to do
-            # that fast, as those of Intel: it takes 40 cycles a vector.
+            # As below: the square of e does not count. For processors of Intel LLVM would compute a root and divide:
+            # water with a switch then takes 7 % longer (forces of W1's charges, mixed).
             y = _estimate(x)
             e = 1.0 - x * y * y
             return y + 0.5 * y * e

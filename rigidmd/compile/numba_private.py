@@ -15,6 +15,7 @@ import functools
 import hashlib
 import pickle
 import secrets
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +28,6 @@ from numba.core.registry import CPUDispatcher
 
 from rigidmd.compile.cache import cache_folder, shared_folder
 from rigidmd.core.own_code import BY_CONTENT
-from rigidmd.core.process import ONE_AT_A_TIME
 from rigidmd.errors import RigidMDWarning
 
 
@@ -166,8 +166,12 @@ class Inner(Kernel):
         raise TypeError(f"{self.py_func.__name__} is for compiled code only; for Python, use kernel(outer=True)")
 
 
+#: Held while Numba's setting is another one. Whoever has it waits for no other lock: Numba may hold its own here.
+_setting = threading.Lock()
+
+
 def _opened_cache(function: Callable) -> FunctionCache:
-    with ONE_AT_A_TIME, _own_folder():
+    with _setting, _own_folder():
         found = FunctionCache(function)
     found._cache_file.__class__ = Index
     return found

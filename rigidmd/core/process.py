@@ -5,7 +5,8 @@ import threading
 import warnings
 from collections.abc import Iterator
 
-#: Held while settings of the process are changed for a moment, and while a run compiles, which changes some too.
+#: Held while settings of the process are changed for a moment, and while a run compiles, which changes some too. Who
+#: holds it may wait for the locks of Numba and of `compile`; who holds one of those must not wait for it.
 ONE_AT_A_TIME = threading.RLock()
 
 
