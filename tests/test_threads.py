@@ -160,6 +160,14 @@ def test_what_runs_together_is_stopped_together():
     assert 0 < first.state.step[0] < 1e8
 
 
+def test_an_observer_may_end_a_run():
+    scene = short_runs(1)[0].scene
+    simulation = Simulation(scene, observers=Every(0.2, lambda moment: moment.step and simulation.stop()))
+    results = simulation.run()
+    assert results.interrupted and results.signal is None
+    assert results.state.time[0] == pytest.approx(0.2)
+
+
 def test_a_second_ctrl_c_is_an_interrupt_and_all_runs_still_end():
     def press_twice(moment):
         if moment.step == 100:  # this run cannot end before both have come
