@@ -273,12 +273,15 @@ def test_everything_follows_a_cell_that_changes(electrostatics, change):
     assert state.position == pytest.approx(other.position, abs=1e-9)
 
 
-def test_a_box_that_is_no_number_is_told():
-    _, engine, state = built({"argon": 60}, 20.0, 3)
+@pytest.mark.parametrize("at", [(0, 0), (2, 2), (1, 0), (2, 1)])
+@pytest.mark.parametrize("counts", [{"argon": 60}, {"spce": 60}])
+def test_a_box_that_is_no_number_is_told(counts, at):
+    _, engine, state = built(counts, 20.0, 3, spread=0.05)
     engine.evaluate(state)
-    state.cell[:] = np.nan
-    with pytest.raises(NotFiniteError):
-        engine.evaluate(state)
+    state.cell[at] = np.nan
+    for _ in range(2):
+        with pytest.raises(NotFiniteError):
+            engine.evaluate(state)
 
 
 @pytest.mark.parametrize("precision", ["double", "mixed"])

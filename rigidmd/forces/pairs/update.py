@@ -58,11 +58,15 @@ def update_list(pairs, code, sites, state):
     blocks = len(pairs.needed)
     parcel = packed(pairs)
     placed = packed((pairs, sites, state))
-    if follow_cell(state.cell, pairs.cell) and pairs.counters[USABLE] == 1:
-        if _move_images(pairs):
-            call_blocks(code, "part", parcel, blocks)
-        else:
+    if follow_cell(state.cell, pairs.cell):
+        if not _is_known(pairs.cell):
             pairs.counters[USABLE] = 0
+            return NOT_FINITE
+        if pairs.counters[USABLE] == 1:
+            if _move_images(pairs):
+                call_blocks(code, "part", parcel, blocks)
+            else:
+                pairs.counters[USABLE] = 0
     if pairs.counters[USABLE] == 1:
         call_blocks(code, "place", placed, blocks)
         call_blocks(code, "follow", parcel, blocks)
@@ -108,6 +112,16 @@ def _judged(pairs):
     return OK
 
 
+@kernel
+def _is_known(cell):
+    """Whether no component of a cell is NaN: comparisons and extremes would pass over it."""
+    for vector in range(3):
+        for k in range(3):
+            if cell[vector, k] != cell[vector, k]:
+                return False
+    return True
+
+
 @kernel(inline=True)
 def _shortest(cell):
     return min(cell[0, 0], cell[1, 1], cell[2, 2])
@@ -116,8 +130,8 @@ def _shortest(cell):
 @kernel
 def _fits(pairs):
     """Whether the cell has room for the cut-off and the skin."""
-    shortest = _shortest(pairs.cell)  # NaN fits: what is not a number is found, and told, where sites are sorted
-    return pairs.cutoff == inf or not (2 * pairs.cutoff > shortest or pairs.skin > LONGEST_SKIN * shortest)
+    shortest = _shortest(pairs.cell)
+    return pairs.cutoff == inf or (2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest)
 
 
 @kernel
