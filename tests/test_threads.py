@@ -148,16 +148,17 @@ def test_other_threads_of_python_go_on_while_steps_are_taken():
 
 
 def test_what_runs_together_is_stopped_together():
-    runs = short_runs(3, stages=[{"ensemble": "nve", "duration_ps": 1e5}])
-    timer = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
-    try:
-        first, second, third = run_together(runs, jobs=2)
-    finally:
-        timer.cancel()
+    def end(moment):
+        if moment.step == 100:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stages = [{"ensemble": "nve", "duration_ps": 1e5}]
+    scene = short_runs(1, stages=stages)[0].scene
+    runs = [Simulation(scene, observers=Every(0.1, end)), *short_runs(2, stages=stages)]
+    first, second, third = run_together(runs, jobs=2)
     assert first.interrupted and second.interrupted and third is None
     assert first.signal == signal.SIGTERM
-    assert 0 < first.state.step[0] < 1e8
+    assert 100 <= first.state.step[0] < 1e8
 
 
 def test_an_observer_may_end_a_run():
