@@ -199,7 +199,7 @@ def test_each_run_writes_its_files_as_if_alone(tmp_path):
     assert everything not in warnings.filters
 
 
-def test_one_that_fails_takes_no_other_with_it(tmp_path):
+def test_one_that_fails_takes_no_other_with_it():
     hot = {"start": {"temperature_K": 90.0}, "stages": [{"ensemble": "nve", "duration_ps": 1.0, "timestep_fs": 900.0}]}
     runs = [*short_runs(1, **hot), *short_runs(1, seed=2)]
     with pytest.raises(SimulationError) as error:

@@ -8,15 +8,13 @@ barostats have their default strengths. The workloads are those of peers.py.
 
 import argparse
 import statistics
-import time
 from pathlib import Path
 
 from peers import WORKLOADS, choice, start_of
-from scaling import STEP
+from scaling import STEP, speed
 
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.rows import row as row_of_stage
-from rigidmd.core.state import NOW
 
 WARM, PRESSED = {"temperature_K": 300.0}, {"pressure_bar": 1.0}
 STAGES = {
@@ -41,16 +39,9 @@ def measure(workload: str, folder: Path, rounds: int, seconds: float) -> dict[st
         row, engine = row_of_stage(run.system, k), run.system.engine()
         movers.append((engine, engine.begin(run.state, row), row))
 
-    def speed(mover, steps: int) -> float:
-        engine, state, row = mover
-        began = time.perf_counter()
-        engine.advance(state, row, STEP, int(state.step[NOW]) + steps)
-        return steps / (time.perf_counter() - began)
-
-    for mover in movers:
-        speed(mover, WARM_UP)
-    steps = max(50, round(seconds * speed(movers[0], WARM_UP)))
-    found = [[speed(mover, steps) for mover in movers] for _ in range(rounds)]
+    warm = [speed(*mover, WARM_UP) for mover in movers]
+    steps = max(50, round(seconds * warm[0]))
+    found = [[speed(*mover, steps) for mover in movers] for _ in range(rounds)]
     return {
         name: (statistics.median(one[k] for one in found), statistics.median(one[k] / one[0] for one in found))
         for k, name in enumerate(STAGES)

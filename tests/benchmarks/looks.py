@@ -11,16 +11,14 @@ peers.py.
 import argparse
 import statistics
 import tempfile
-import time
 from pathlib import Path
 
 from peers import WORKLOADS, choice, start_of
-from scaling import STEP, relax
+from scaling import STEP, relax, speed
 from scaling import scene as small
 
 from rigidmd import Scene, Simulation
 from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import NOW
 
 SMALL = "216"
 VERLET = SCHEMES["velocity_verlet"]
@@ -41,9 +39,7 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
     engine, state = alone.engine, alone.state
 
     def of_engine(steps: int) -> float:
-        began = time.perf_counter()
-        engine.advance(state, VERLET, STEP, int(state.step[NOW]) + steps)
-        return steps / (time.perf_counter() - began)
+        return speed(engine, state, VERLET, steps)
 
     def of_run(steps: int) -> float:
         with tempfile.TemporaryDirectory() as out:

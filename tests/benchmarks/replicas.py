@@ -20,22 +20,20 @@ from pathlib import Path
 
 import tomli_w
 from peers import choice
-from scaling import STEP
+from scaling import STEP, speed
 
 from rigidmd import Scene, Simulation, run_together
 from rigidmd.assemble.rows import row
-from rigidmd.core.state import NOW
 
 CORES = len(os.sched_getaffinity(0))
-CLUSTER = {"box": {"lengths_A": 7.0, "periodic": False}}
 #: Molecules -> what their scene has of its own.
 SYSTEMS = {
     "216": {"box": {"density_g_cm3": 0.997}, "forces": {"cutoff_A": 9.0, "electrostatics": "reaction_field"}},
     "27": {"box": {"density_g_cm3": 0.997}, "forces": {"cutoff_A": 4.6, "electrostatics": "reaction_field"}},
-    "6": CLUSTER,
+    "6": {"box": {"lengths_A": 7.0, "periodic": False}},
 }
 TEMPERATURES = {"216": 298.0, "27": 298.0, "6": 150.0}
-LONG, WARM_UP = 1.0, 500  # ps, steps
+TO_REST, WARM_UP = 1.0, 500  # ps, steps
 
 
 def data(name: str, duration: float, seed: int = 1) -> dict:
@@ -52,44 +50,33 @@ def data(name: str, duration: float, seed: int = 1) -> dict:
 
 def bare_speed(name: str, seconds: float) -> float:
     """Steps a second of the engine alone on one core, from a state that has come to rest."""
-    simulation = Simulation(Scene.from_dict(data(name, LONG)))
+    simulation = Simulation(Scene.from_dict(data(name, TO_REST)))
     simulation.take_threads(1)
     state = simulation.run().state
     engine, scheme = simulation.engine, row(simulation.system, 0)
 
-    def speed(steps: int) -> float:
-        began = time.perf_counter()
-        engine.advance(state, scheme, STEP, int(state.step[NOW]) + steps)
-        return steps / (time.perf_counter() - began)
-
-    return speed(max(WARM_UP, round(seconds * speed(WARM_UP))))
+    warm = speed(engine, state, scheme, WARM_UP)
+    return speed(engine, state, scheme, max(WARM_UP, round(seconds * warm)))
 
 
 def one_after_another(name: str, duration: float, replicas: int, folder: Path) -> None:
+    """Each on all cores."""
     for k in range(replicas):
         Simulation(Scene.from_dict(data(name, duration, 1 + k)), folder / str(k)).run()
 
 
 def together(name: str, duration: float, replicas: int, folder: Path) -> None:
+    """At once in this process."""
     scenes = [Scene.from_dict(data(name, duration, 1 + k)) for k in range(replicas)]
     run_together([Simulation(scene, folder / str(k)) for k, scene in enumerate(scenes)])
 
 
 def swept(name: str, duration: float, replicas: int, folder: Path) -> None:
+    """By the command."""
     folder.mkdir()
     scene = folder / "scene.toml"
     scene.write_text(tomli_w.dumps(data(name, duration)))
-    command = [
-        sys.executable,
-        "-m",
-        "rigidmd",
-        "sweep",
-        str(scene),
-        "--replicas",
-        str(replicas),
-        "-o",
-        str(folder / "out"),
-    ]
+    command = [sys.executable, "-m", "rigidmd", "sweep", scene, "--replicas", str(replicas), "-o", folder / "out"]
     subprocess.run(command, check=True, capture_output=True)
 
 
@@ -105,7 +92,7 @@ def measure(name: str, replicas: int, rounds: int, seconds: float) -> tuple[floa
         for way, run in WAYS.items():
             with tempfile.TemporaryDirectory() as folder:
                 began = time.perf_counter()
-                run(name, duration if k else LONG, replicas, Path(folder) / "runs")
+                run(name, duration if k else TO_REST, replicas, Path(folder) / "runs")
                 spent = time.perf_counter() - began
             if k:  # the first round fills the cache
                 found[way].append(replicas * round(duration / STEP) / spent)

@@ -26,6 +26,7 @@ from peers import WORKLOADS, numbers, write_start
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.room import array_bytes
 from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.state import NOW
 
 WORK = WORKLOADS["W1"]
 UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cut-off
@@ -47,6 +48,13 @@ def relax(folder: Path) -> None:
              "thermostat_time_ps": 0.1}  # fmt: skip
     state = Simulation(Scene.from_dict(scene(1, "mixed", structure=None, stages=[stage]))).run().state
     keep(folder, 1, state)
+
+
+def speed(engine, state, row, steps: int) -> float:
+    """Steps a second of an engine that moves a state, in one piece."""
+    began = time.perf_counter()
+    engine.advance(state, row, STEP, int(state.step[NOW]) + steps)
+    return steps / (time.perf_counter() - began)
 
 
 def keep(folder: Path, copies: int, state) -> None:
