@@ -25,8 +25,9 @@ from rigidmd.compile import (
 from rigidmd.compile.lane_types import COUNT, Lanes, Mask, filled, multiply_add
 from rigidmd.compile.machine import PROCESSOR_FEATURES
 
-#: Whether this machine has the instructions that `picked` and the estimates of 1/x and 1/sqrt(x) use.
+#: Whether this machine has the instruction that `picked` uses, and the estimates of 1/x and 1/sqrt(x).
 HAS_AVX512 = SIMD_BITS == 512 and "avx512f" in PROCESSOR_FEATURES
+IS_X86 = "sse2" in PROCESSOR_FEATURES
 
 
 def lane_count(dtype) -> int:
@@ -216,38 +217,91 @@ single = intrinsic(_converted(types.float32))
 double = intrinsic(_converted(types.float64))
 
 
+#: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³ (p = 3/2).
+QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2, 15 / 8, 35 / 16, 315 / 128)
+
+
+def _terms(x) -> int:
+    """How many terms of a series correct `_root_estimate` and `_quotient_estimate` of a type; 0 if it has none.
+
+    The next term is below half the last digit: e is at most 1.2e-4 with AVX-512, 7.4e-4 with older instructions.
+    """
+    if not IS_X86 or x.count not in (2, 4, 8, 16):
+        return 0
+    return (1 if x.dtype == types.float32 else 3) + (not _is_whole(x))
+
+
+def _is_whole(x) -> bool:
+    """Whether a type of vectors fills the registers of AVX-512."""
+    return HAS_AVX512 and x.count == COUNT.get(x.dtype)
+
+
+def _estimated(name):
+    def estimated(typing, x):
+        def emit(context, builder, signature, arguments):
+            value = arguments[0]
+            if _is_whole(x):
+                everywhere = ir.Constant(ir.IntType(max(8, x.count)), -1)
+                kind = {types.float32: "ps", types.float64: "pd"}[x.dtype]
+                return _call(builder, f"llvm.x86.avx512.{name}14.{kind}.512", value.type, value, value, everywhere)
+            if x.dtype == types.float64:
+                value = builder.fptrunc(value, ir.VectorType(ir.FloatType(), x.count))
+            if x.count == 2:
+                value = _shuffled(builder, value, value, (0, 1, 0, 1))
+            kind = "avx.{}.ps.256" if x.count == 8 else "sse.{}.ps"
+            value = _call(builder, f"llvm.x86.{kind.format(name)}", value.type, value)
+            if x.count == 2:
+                value = _shuffled(builder, value, value, (0, 1))
+            return value if x.dtype == types.float32 else builder.fpext(value, context.get_value_type(x))
+
+        return x(x), emit
+
+    return estimated
+
+
+#: 1/sqrt(x) and 1/x of a vector by the machine's estimates: relative errors up to 2^-14 with AVX-512, else 1.5 2^-12.
+_root_estimate = intrinsic(_estimated("rsqrt"))
+_quotient_estimate = intrinsic(_estimated("rcp"))
+
+
+@intrinsic
+def _nested(typing, coefficients, x):
+    """Sum of coefficients[k] x^k, by as few operations as there are."""
+
+    def emit(context, builder, signature, arguments):
+        kinds = signature.args[0].types
+        found = None
+        for k in reversed(range(len(kinds))):
+            own = filled(context, builder, builder.extract_value(arguments[0], k), kinds[k], x)
+            found = own if found is None else multiply_add(builder, found, arguments[1], own)
+        return found
+
+    return x(coefficients, x), emit
+
+
 def inverse_root(x):
     """1/sqrt(x), accurate to about the last digit."""
     raise TypeError("compiled code only")
 
 
+# The series are written out, since LLVM's own choice depends on the processor: for some it computes a root and divides,
+# for others it corrects an estimate to 4e-7 only.
 @implements(inverse_root, inline=True)
 def _inverse_root(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / sqrt(x)
-    if _has_estimate(x) and x.dtype == types.float32:
+    if terms := _terms(x):
+        series = ROOT[:terms]
 
-        def from_quick_estimate(x):
-            # As below: the square of e does not count. For processors of Intel LLVM would compute a root and divide:
-            # water with a switch then takes 7 % longer (forces of W1's charges, mixed).
-            y = _estimate(x)
+        def from_estimate(x):
+            y = _root_estimate(x)
             e = 1.0 - x * y * y
-            return y + 0.5 * y * e
+            return y + y * (e * _nested(series, e))
 
-        return from_quick_estimate
+        return from_estimate
 
     if x.dtype == types.float32:
         return lambda x: _quick_inverse(x)
-    if _has_estimate(x):
-
-        def from_estimate(x):
-            # 1/sqrt(x) = y (1 + e/2 + 3/8 e² + 5/16 e³ + ...) with e = 1 - x y², at most 1.2e-4: the fourth power does
-            # not count
-            y = _estimate(x)
-            e = 1.0 - x * y * y
-            return y + y * e * (0.5 + e * (0.375 + 0.3125 * e))
-
-        return from_estimate
 
     def refined(x):
         # One step of third order takes the float32 result from 24 bits to 53; a float64 root and division are slower.
@@ -268,15 +322,16 @@ def inverse_cube(x):
 
 @implements(inverse_cube, inline=True)
 def _inverse_cube(x):
-    if _has_estimate(x) and x.dtype == types.float32:
+    if isinstance(x, Lanes) and _terms(x):
+        series = (1.0, *CUBE[: _terms(x)])
 
         def from_estimate(x):
-            # 1/sqrt(x)³ = y³ (1 + 3/2 e + 15/8 e² + ...) with e = 1 - x y², at most 1.2e-4: the square does not count.
             # A corrected root and its cube would take one multiplication more; pairs with a reaction field then take
-            # 5 % longer.
-            y = _estimate(x)
+            # 5 % longer (AVX-512).
+            y = _root_estimate(x)
             y2 = y * y
-            return y * y2, 2.5 - 1.5 * x * y2
+            e = 1.0 - x * y2
+            return y * y2, _nested(series, e)
 
         return from_estimate
 
@@ -285,32 +340,6 @@ def _inverse_cube(x):
         return y, y * y
 
     return cubed
-
-
-def _has_estimate(x) -> bool:
-    """Whether `_estimate` serves a type."""
-    return HAS_AVX512 and isinstance(x, Lanes) and x.count == COUNT.get(x.dtype)
-
-
-def _estimated(name):
-    def estimated(typing, x):
-        suffix = {types.float32: "ps", types.float64: "pd"}[x.dtype]
-
-        def emit(context, builder, signature, arguments):
-            value = arguments[0]
-            everywhere = ir.IntType(x.count)(-1)
-            kind = ir.FunctionType(value.type, [value.type, value.type, everywhere.type])
-            function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.x86.avx512.{name}14.{suffix}.512")
-            return builder.call(function, [value, value, everywhere])
-
-        return x(x), emit
-
-    return estimated
-
-
-#: 1/sqrt(x) and 1/x of a vector, with a relative error up to 2^-14; see `_has_estimate`.
-_estimate = intrinsic(_estimated("rsqrt"))
-_estimated_quotient = intrinsic(_estimated("rcp"))
 
 
 @intrinsic
@@ -362,26 +391,18 @@ def inverse(x):
 def _inverse(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / x
-    if _has_estimate(x) and x.dtype == types.float32:
+    if terms := _terms(x):
+        series = QUOTIENT[:terms]
 
-        def from_quick_estimate(x):
-            y = _estimated_quotient(x)
-            e = 1.0 - x * y  # its square does not count
-            return y + y * e
+        def from_estimate(x):
+            y = _quotient_estimate(x)
+            e = 1.0 - x * y
+            return y + y * (e * _nested(series, e))
 
-        return from_quick_estimate
+        return from_estimate
 
     if x.dtype == types.float32:
         return lambda x: _quick_quotient(x)
-    if _has_estimate(x):
-
-        def from_estimate(x):
-            # 1/x = y (1 + e + e² + e³ + ...) with e = 1 - x y, at most 6.1e-5: the fourth power does not count
-            y = _estimated_quotient(x)
-            e = 1.0 - x * y
-            return y + y * e * (1.0 + e * (1.0 + e))
-
-        return from_estimate
 
     def refined(x):
         y = double(_quick_quotient(single(x)))
@@ -477,19 +498,64 @@ def total(typing, x):
     """The sum of all lanes as a float64, added pairwise in a fixed order."""
 
     def emit(context, builder, signature, arguments):
-        value, count = arguments[0], x.count
+        value = arguments[0]
         if x.dtype == types.float32:
-            value = builder.fpext(value, ir.VectorType(ir.DoubleType(), count))
-        while count > 1:
-            count //= 2
-            halves = []
-            for start in (0, count):
-                order = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(start, start + count)))
-                halves.append(builder.shuffle_vector(value, value, order))
-            value = builder.fadd(*halves)
-        return builder.extract_element(value, ir.IntType(32)(0))
+            value = builder.fpext(value, ir.VectorType(ir.DoubleType(), x.count))
+        return builder.extract_element(_in_halves(builder, value, 1), ir.IntType(32)(0))
 
     return types.float64(x), emit
+
+
+def _shuffled(builder, a, b, lanes):
+    """A vector of these lanes of two others; those of b have the numbers after those of a."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
+
+
+def _in_halves(builder, value, count):
+    """The halves of a vector added, again and again until so many lanes are left."""
+    while value.type.count > count:
+        half = value.type.count // 2
+        value = builder.fadd(*(_shuffled(builder, value, value, range(k, k + half)) for k in (0, half)))
+    return value
+
+
+@intrinsic
+def store_totals(typing, array, index, step, x, y):
+    """Write the sums of all lanes of vectors x[k] and y[k] to array[index + k step] and array[index + k step + 1].
+
+    x, y : tuples of three vectors. All six are summed together, in the precision of the array, which takes fewer
+    instructions than six times `total`.
+    """
+    if not _is_row(array):
+        return None
+    lanes = Lanes(array.dtype, COUNT[array.dtype])
+    three = types.UniTuple(lanes, 3)
+    width, part = lanes.count, 128 // array.dtype.bitwidth  # part: lanes within which a processor shuffles fastest
+
+    def merged(builder, a, b, first, second):
+        """The sum of two choices of lanes of a and b, the same in each part."""
+        both = [[start + k for start in range(0, width, part) for k in lanes] for lanes in (first, second)]
+        return builder.fadd(*(_shuffled(builder, a, b, lanes) for lanes in both))
+
+    def emit(context, builder, signature, arguments):
+        into, index, step, *both = arguments
+        found = [[builder.extract_value(of, k) for of in both] for k in range(3)]
+        if part == 2:
+            sums = [_in_halves(builder, merged(builder, *of, (0, width), (1, width + 1)), 2) for of in found]
+        else:
+            halves = (0, width, 1, width + 1), (2, width + 2, 3, width + 3)
+            on_x, on_y, on_z = (merged(builder, *of, *halves) for of in found)
+            halves = (0, 1, width, width + 1), (2, 3, width + 2, width + 3)
+            fours = [_in_halves(builder, merged(builder, *of, *halves), 4) for of in ((on_x, on_y), (on_z, on_z))]
+            sums = [_shuffled(builder, four, four, lanes) for four in fours for lanes in ((0, 1), (2, 3))][:3]
+        data = context.make_array(array)(context, builder, into).data
+        for own in sums:
+            there = builder.bitcast(builder.gep(data, [index]), own.type.as_pointer())
+            builder.store(own, there, align=array.dtype.bitwidth // 8)
+            index = builder.add(index, step)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, three, three), emit
 
 
 @intrinsic

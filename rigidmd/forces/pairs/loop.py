@@ -25,6 +25,7 @@ from rigidmd.compile.lanes import (
     select,
     spread,
     store,
+    store_totals,
     total,
     width_of,
     zeros,
@@ -326,9 +327,7 @@ def block_forces(law, pairs, own, others, tallies, block):
                 other, between = ahead, after
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
             on_one, on_two, energy = sums
-            for k in range(3):
-                own[at + k * width] = total(on_one[k])
-                own[at + k * width + 1] = total(on_two[k])
+            store_totals(own, at, width, on_one, on_two)
             if tallies is not None:
                 tallies[block, 0] += total(energy)
                 _count(tallies[block], virial)
@@ -405,18 +404,18 @@ def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
     bx, by, bz, _ = between[1]
     one, of_one = _act(law, i, width * other, between[0][3], masks[0])
     two, of_two = _act(law, i + 1, width * other, between[1][3], masks[1])
-    # Each sum has its product in its own expression, so that it is one multiply-add: three operations less.
-    fx, fy, fz = one * ax + two * bx, one * ay + two * by, one * az + two * bz
     turn = len(pairs.clusters.origin) // 4 if other < first else 0
     at = 3 * width * (other - first + turn)
-    store(others, at, load(others, at) - fx)
-    store(others, at + width, load(others, at + width) - fy)
-    store(others, at + 2 * width, load(others, at + 2 * width) - fz)
-    if tallies is not None:
-        energy = energy + (of_one + of_two)
+    # Each product is in one expression with the sum to which it is added, so that the two are one multiply-add.
+    store(others, at, load(others, at) - one * ax - two * bx)
+    store(others, at + width, load(others, at + width) - one * ay - two * by)
+    store(others, at + 2 * width, load(others, at + 2 * width) - one * az - two * bz)
     on_one = (on_one[0] + one * ax, on_one[1] + one * ay, on_one[2] + one * az)
     on_two = (on_two[0] + two * bx, on_two[1] + two * by, on_two[2] + two * bz)
-    return (on_one, on_two, energy), (fx, fy, fz)
+    if tallies is None:
+        return (on_one, on_two, energy), None
+    force = (one * ax + two * bx, one * ay + two * by, one * az + two * bz)
+    return (on_one, on_two, energy + (of_one + of_two)), force
 
 
 @kernel(inline=True)
