@@ -37,7 +37,7 @@ from rigidmd.forces.pairs.lists import (
     cluster_of,
     number_of,
 )  # fmt: skip
-from rigidmd.forces.pairs.tree import within_reach
+from rigidmd.forces.pairs.tree import ahead, families_within_reach, near
 
 SPECIAL = SHELLS  # where a candidate that needs a mask counts, after the shells
 BEYOND = SHELLS + 1  # where one counts that a row does not meet
@@ -47,10 +47,11 @@ KINDS = SHELLS + 2
 class Scratch(NamedTuple):
     """Scratch arrays for the rows of one cluster."""
 
-    stack: np.ndarray  # (levels, 2) for within_reach
-    low: np.ndarray  # (3,) box of the cluster, moved by an image
+    stack: np.ndarray  # (levels, 2) for families_within_reach
+    low: np.ndarray  # (3,) a box, moved by an image
     high: np.ndarray  # (3,)
-    candidate: np.ndarray  # (room,) images of clusters that may be met, at last those that are
+    family: np.ndarray  # (room,) families of clusters near some clusters, as IMAGES * family + number of the image
+    candidate: np.ndarray  # (room + arity,) images of clusters that may be met, at last those that are
     close: np.ndarray  # (room,) those of them that may need a mask
     kind: np.ndarray  # (room * rows,) uint8 shell of entry n in row k of the cluster, at n * rows + k
     place: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind; then where the next of them goes
@@ -66,6 +67,7 @@ def _scratch(pairs, room):
         np.empty(3),
         np.empty(3),
         np.empty(room, np.int64),
+        np.empty(room + width_of(pairs.tree.low), np.int64),
         np.empty(room, np.int64),
         np.empty(rows * (room + 1), np.uint8),  # one more, since what no row has is written too
         np.empty((rows, KINDS), np.uint32),  # unsigned: no index is checked for being negative
@@ -82,48 +84,83 @@ def fill_block(pairs, block, room):
     """
     clusters = pairs.clusters
     scratch = _scratch(pairs, room)
-    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        candidates = _find_candidates(pairs, c, scratch)
-        if candidates > room:
-            return 2 * candidates
-        _fill_rows(pairs, block, c, scratch, candidates)
+    arity = width_of(pairs.tree.low)
+    end = clusters.bounds[block + 1]
+    for first in range(clusters.bounds[block], end, arity):
+        last = min(first + arity, end)
+        families = _find_families(pairs, first, last, scratch)
+        if families > room:
+            return 2 * families
+        for c in range(first, last):
+            candidates = _find_candidates(pairs, c, scratch, families)
+            if candidates > room:
+                return 2 * candidates
+            _fill_rows(pairs, block, c, scratch, candidates)
     for k in range(len(scratch.filled)):
         pairs.needed[block, k] = scratch.filled[k]
     return 0
 
 
 @kernel(inline=True, counted=False)
-def _find_candidates(pairs, c, scratch):
-    """Candidates for a cluster's rows: clusters and images whose box is within reach of its box. Returns their number.
+def _find_families(pairs, first, end, scratch):
+    """Families of clusters that may be within reach of clusters first ... end - 1. Returns their number.
 
     The number may exceed the room.
     """
-    tree = pairs.tree
-    count = len(pairs.clusters.origin) // 4
-    radius = (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
-    into = scratch.candidate
-    candidates = 0
+    tree, into, low, high = pairs.tree, scratch.family, scratch.low, scratch.high
+    radius = _reach(pairs)
+    families = 0
     for image in range(pairs.counters[IMAGES_FOUND]):
         reaches = True
         for k in range(3):
             shift = pairs.shift[4 * image + k]
-            scratch.low[k] = tree.low[k, c] - shift
-            scratch.high[k] = tree.high[k, c] - shift
+            low[k], high[k] = inf, -inf
+            for c in range(first, end):
+                low[k] = min(low[k], tree.low[k, c] - shift)
+                high[k] = max(high[k], tree.high[k, c] - shift)
             if shift != 0.0:
-                reaches &= scratch.high[k] > -radius and scratch.low[k] < pairs.cell[k, k] + radius
+                reaches &= high[k] > -radius and low[k] < pairs.cell[k, k] + radius
         if not reaches:
             continue
-        first = candidates
-        found = within_reach(tree, scratch.low, scratch.high, radius * radius, c, count, scratch.stack, into, first)
-        if found > len(into):
-            return found
-        for n in range(first, found):
-            ahead = into[n] - c
-            if ahead < 0:
-                ahead += count
-            if 2 * ahead < count or (2 * ahead == count and c < into[n]):
-                into[candidates] = IMAGES * into[n] + image
-                candidates += 1
+        count = len(pairs.clusters.origin) // 4
+        found = families_within_reach(
+            tree, low, high, radius * radius, first, end, count, scratch.stack, into, families
+        )
+        for n in range(families, min(found, len(into))):
+            into[n] = IMAGES * into[n] + image
+        families = found
+    return families
+
+
+@kernel(inline=True)
+def _reach(pairs):
+    """The distance within which a list has sites, Å, and what rounding may add."""
+    return (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
+
+
+@kernel(inline=True, counted=False)
+def _find_candidates(pairs, c, scratch, families):
+    """Candidates for a cluster's rows: clusters and images whose box is within reach of its box. Returns their number.
+
+    The number may exceed the room. There is no branch for each candidate: the next one takes the place of one that is
+    none.
+    """
+    tree, into, shift = pairs.tree, scratch.candidate, pairs.shift
+    arity = width_of(tree.low)
+    count = len(pairs.clusters.origin) // 4
+    radius = _reach(pairs)
+    candidates = 0
+    for n in range(families):
+        first, image = arity * cluster_of(scratch.family[n]), number_of(scratch.family[n])
+        at = 4 * image
+        low = tree.low[0, c] - shift[at], tree.low[1, c] - shift[at + 1], tree.low[2, c] - shift[at + 2]
+        high = tree.high[0, c] - shift[at], tree.high[1, c] - shift[at + 1], tree.high[2, c] - shift[at + 2]
+        found = near(tree, first, low, high, radius * radius) & ahead(c, count, first, arity)
+        for k in range(arity):
+            into[candidates] = IMAGES * (first + k) + image
+            candidates += found >> k & 1
+        if candidates > len(into) - arity:
+            break
     return candidates
 
 
@@ -133,7 +170,7 @@ def _fill_rows(pairs, block, c, scratch, candidates):
     width = width_of(pairs.clusters.local)
     rows = width // 2
     masked, filled = pairs.masked[block], scratch.filled
-    radius2 = ((pairs.cutoff + pairs.skin) * (1 + ROUNDING)) ** 2
+    radius2 = _reach(pairs) ** 2
     met = _find_kinds(pairs, c, scratch, candidates)
     _meet(pairs, block, c, scratch, met)
     _sort_by_kind(pairs, c, scratch, met)

@@ -1,6 +1,7 @@
 """A tree of bounding boxes of clusters. It finds clusters within reach of one another in O(N log N) for any shape.
 
-A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of them.
+A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of them. The tree is
+searched once for some clusters near one another, down to families; each of the clusters then tests the boxes in these.
 """
 
 from math import ceil, inf
@@ -53,29 +54,29 @@ def grow(tree, clusters):
 
 
 @kernel(inline=True, counted=False)
-def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
-    """Write to found[count:], ascending, the clusters whose boxes are closer than a radius to a box (3,), (3,).
+def families_within_reach(tree, low, high, radius2, first, end, clusters, stack, found, count):
+    """Write to found[count:], ascending, families that may have clusters closer than a radius to a box (3,), (3,).
 
-    Only clusters at most half a turn ahead of cluster c on the ring are taken. Returns the new count, which may exceed
-    the room; stack (levels, 2) is scratch.
+    Family f has clusters arity * f ... arity * (f + 1) - 1. Only those are taken that have a cluster at most half a
+    turn ahead, on the ring, of one of clusters first ... end - 1. Returns the new count, which may exceed the room;
+    stack (levels, 2) is scratch.
     """
     arity = width_of(tree.low)
     top = len(tree.level) - 2
     half = clusters // 2
     depth = 0
-    size = arity**top  # clusters under a child of the family
-    stack[0, 0] = 0  # family
-    stack[0, 1] = _near(tree, tree.level[top], low, high, radius2)
+    size = arity ** (top + 1)  # clusters under the node
+    stack[0, 0] = 0  # node
+    stack[0, 1] = 1  # its siblings that are left, and itself, as bits; the root has none
     while depth >= 0:
         if stack[depth, 1] == 0:
             depth -= 1
             size *= arity
             continue
-        child = lowest_bit(stack[depth, 1])
+        node = stack[depth, 0] + lowest_bit(stack[depth, 1])
         stack[depth, 1] &= stack[depth, 1] - 1
-        node = stack[depth, 0] * arity + child
-        first = node * size
-        if not ((first <= c + half and first + size > c) or first <= c + half - clusters):
+        begin = node * size
+        if not ((begin < end + half and begin + size > first) or begin < end + half - clusters):
             continue
         if depth == top:
             if count < len(found):
@@ -84,15 +85,33 @@ def within_reach(tree, low, high, radius2, c, clusters, stack, found, count):
         else:
             depth += 1
             size //= arity
-            stack[depth, 0] = node
-            stack[depth, 1] = _near(tree, tree.level[top - depth] + node * arity, low, high, radius2)
+            stack[depth, 0] = node * arity
+            stack[depth, 1] = near(tree, tree.level[top + 1 - depth] + node * arity, low, high, radius2)
     return count
 
 
 @kernel(inline=True)
-def _near(tree, node, low, high, radius2):
-    """The boxes within reach in the family that begins at a node, as bits."""
+def near(tree, node, low, high, radius2):
+    """Which of the boxes from a node on, as many as its siblings, are closer than a radius to a box, as bits."""
     dx = larger(larger(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
     dy = larger(larger(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
     dz = larger(larger(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
     return bits(dx * dx + dy * dy + dz * dz < radius2)
+
+
+@kernel(inline=True)
+def ahead(c, clusters, first, arity):
+    """Which of clusters first ... first + arity - 1 are at most half a turn ahead of cluster c on the ring, as bits.
+
+    Of two clusters opposite one another the second is ahead of the first.
+    """
+    passed = _bits_below(c - first, arity)
+    beyond = _bits_below(c + clusters // 2 + 1 - first, arity)
+    around = _bits_below(c + (clusters - 1) // 2 + 1 - clusters - first, arity)
+    return (beyond & ~passed) | around
+
+
+@kernel(inline=True)
+def _bits_below(k, count):
+    """Of so many bits those below bit k."""
+    return (1 << min(max(k, 0), count)) - 1
