@@ -356,25 +356,22 @@ def smaller_of_two(typing, x):
 
 
 @intrinsic
-def rounded_up(typing, x):
-    """The smallest whole number not below x, in each lane."""
-    return x(x), lambda c, b, s, arguments: _call(
-        b, f"llvm.ceil.{_suffix(arguments[0].type)}", arguments[0].type, *arguments
-    )
+def store_whole_alternate(typing, array, index, x):
+    """Write the whole parts of lanes 0, 2, 4, ... of a vector, from 0 to 127, to an array of bytes from an index on.
 
-
-@intrinsic
-def store_alternate(typing, array, index, x):
-    """Write lanes 0, 2, 4, ... of a vector, whole numbers from 0 to 127, to an array of bytes from an index on."""
+    Lane 1 must equal lane 0, lane 3 lane 2, and so on.
+    """
     if not _is_row(array) or array.dtype != types.uint8:
         return None
     count = x.count // 2
 
     def emit(context, builder, signature, arguments):
         target, index, value = arguments
-        order = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(0, x.count, 2)))
         whole = builder.fptosi(value, ir.VectorType(ir.IntType(32), x.count))
-        half = builder.trunc(builder.shuffle_vector(whole, whole, order), ir.VectorType(ir.IntType(8), count))
+        # two equal lanes are one number of 64 bits, of which the lowest byte is wanted: no lanes are moved
+        half = builder.trunc(
+            builder.bitcast(whole, ir.VectorType(ir.IntType(64), count)), ir.VectorType(ir.IntType(8), count)
+        )
         data = context.make_array(array)(context, builder, target).data
         builder.store(half, builder.bitcast(builder.gep(data, [index]), half.type.as_pointer()), align=1)
         return context.get_dummy_value()

@@ -14,12 +14,10 @@ from rigidmd.compile.lanes import (
     load,
     load_beside,
     root,
-    rounded_up,
-    select,
     smaller,
     smaller_of_two,
     spread,
-    store_alternate,
+    store_whole_alternate,
     width_of,
 )  # fmt: skip
 from rigidmd.forces.pairs.lists import (
@@ -39,8 +37,8 @@ from rigidmd.forces.pairs.lists import (
 )  # fmt: skip
 from rigidmd.forces.pairs.tree import ahead, families_within_reach, near
 
-SPECIAL = SHELLS  # where a candidate that needs a mask counts, after the shells
-BEYOND = SHELLS + 1  # where one counts that a row does not meet
+BEYOND = SHELLS  # where a candidate counts that a row does not meet, after the shells
+SPECIAL = SHELLS + 1  # where one counts that needs a mask
 KINDS = SHELLS + 2
 
 
@@ -179,7 +177,7 @@ def _fill_rows(pairs, block, c, scratch, candidates):
         here = scratch.sorted[own]
         _write_row(pairs.entries[block], here, scratch.place[own, SHELLS - 1], filled)
         pairs.row[r] = min(filled[ENTRIES], pairs.entries.shape[1])
-        for n in range(scratch.place[own, SHELLS - 1], scratch.place[own, SPECIAL]):
+        for n in range(scratch.place[own, BEYOND], scratch.place[own, SPECIAL]):
             entry = np.int64(here[n])
             first_of_row = _mask_of_lanes(pairs, 2 * r, scratch.candidate[entry], radius2)
             second = _mask_of_lanes(pairs, 2 * r + 1, scratch.candidate[entry], radius2)
@@ -304,20 +302,30 @@ def _measure(pairs, c, kind, candidate, at):
     y = load(local, begin + width) + _apart(pairs, c, other, image, 1)
     z = load(local, begin + 2 * width) + _apart(pairs, c, other, image, 2)
     # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|²,
-    # is subtracted.
-    nearest = fill(inf, local)
-    for lane in range(width):
-        there = 3 * width * other + lane
-        rest = spread(clusters.half_square, width * other + lane) - z * spread(local, there + 2 * width)
-        nearest = smaller(nearest, rest - y * spread(local, there + width) - x * spread(local, there))
-    nearest2 = 2.0 * nearest + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
-    distance = root(larger(smaller_of_two(nearest2), 0.0)) * (1 - ROUNDING)
-    shell = fill(0.0, local)
+    # is subtracted. Of two sums none waits for the other.
+    one, two = fill(inf, local), fill(inf, local)
+    for lane in range(0, width, 2):
+        one = smaller(one, _rest(clusters, other, lane, x, y, z))
+        two = smaller(two, _rest(clusters, other, lane + 1, x, y, z))
+    nearest2 = 2.0 * smaller(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
+    kinds = fill(0.0, local)
     if pairs.cutoff < inf:
-        shell = (distance - pairs.cutoff) * pairs.shells_per_A
-    within = shell <= SHELLS - 1
-    store_alternate(kind, at, select(within, rounded_up(larger(shell, 0.0)), float(BEYOND)))
-    return bits(within) != 0, bits(nearest2 <= pairs.reach2) != 0
+        distance = root(larger(smaller_of_two(nearest2), 0.0))
+        scale = pairs.shells_per_A
+        shell = distance * (scale * (1 - ROUNDING)) + (1 - pairs.cutoff * scale)  # 1 to 2 in the first beyond
+        kinds = smaller(larger(shell, 0.0), float(BEYOND))
+    store_whole_alternate(kind, at, kinds)
+    return bits(kinds < float(BEYOND)) != 0, bits(nearest2 <= pairs.reach2) != 0
+
+
+@kernel(inline=True)
+def _rest(clusters, other, lane, x, y, z):
+    """|y|²/2 - x y for one site y of another cluster."""
+    local = clusters.local
+    width = width_of(local)
+    at = 3 * width * other + lane
+    rest = spread(clusters.half_square, width * other + lane) - z * spread(local, at + 2 * width)
+    return rest - y * spread(local, at + width) - x * spread(local, at)
 
 
 @kernel(inline=True)
@@ -335,8 +343,7 @@ def _set_aside(pairs, c, kind, candidate, at):
             mates = mates | (group == clusters.group[width * other + lane])
         special = bits(mates)
     for own in range(width // 2):
-        if special >> 2 * own & 3:
-            kind[at + own] = SPECIAL
+        kind[at + own] = SPECIAL if special >> 2 * own & 3 else kind[at + own]  # written anyway: no branch
 
 
 @kernel(inline=True)

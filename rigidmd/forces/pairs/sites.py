@@ -158,11 +158,10 @@ def _load_molecule(sites, state, load, m, site_force):
     def load_body(sites, state, load, m, site_force):
         q = state.rotation[m]
         begin = sites.kind[m] - sites.first[m]
+        sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = 0.0  # kept in registers until the last site
         for i in range(sites.first[m], sites.first[m + 1]):
             fx, fy, fz = of_site(site_force, i)
-            load.force[m, 0] += fx
-            load.force[m, 1] += fy
-            load.force[m, 2] += fz
+            sum_x, sum_y, sum_z = sum_x + fx, sum_y + fy, sum_z + fz
             # n_body = d x (Q^T f), with the site's offset d in the body frame
             bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
             by = q[0, 1] * fx + q[1, 1] * fy + q[2, 1] * fz
@@ -170,9 +169,15 @@ def _load_molecule(sites, state, load, m, site_force):
             x = sites.offset_body[begin + i, 0]
             y = sites.offset_body[begin + i, 1]
             z = sites.offset_body[begin + i, 2]
-            load.torque_body[m, 0] += y * bz - z * by
-            load.torque_body[m, 1] += z * bx - x * bz
-            load.torque_body[m, 2] += x * by - y * bx
+            turn_x += y * bz - z * by
+            turn_y += z * bx - x * bz
+            turn_z += x * by - y * bx
+        load.force[m, 0] += sum_x
+        load.force[m, 1] += sum_y
+        load.force[m, 2] += sum_z
+        load.torque_body[m, 0] += turn_x
+        load.torque_body[m, 1] += turn_y
+        load.torque_body[m, 2] += turn_z
 
     return load_body
 
