@@ -1,10 +1,12 @@
 """Threads that share the blocks of a task, without OpenMP: they wait inside compiled code, a thread for each core.
 
 One thread, the leader, is in the loop over steps; the helpers are Python threads that never leave `_help` and hold no
-lock of Python's. A leader writes down a task, its parcel and the number of blocks, and takes blocks itself; helpers
-that are awake take blocks too, each the next one, until there are none. Nobody waits for a helper that has taken no
-block: one that sleeps, or whose core is busy with another program, is not missed. So a task costs a few exchanges of a
-line of memory between cores, not an entry into a parallel region and a barrier of all threads at its end.
+lock of Python's. A leader writes down a task, its parcel and the number of blocks, and claims blocks itself; helpers
+that are awake claim blocks too, until there are none. Each thread begins with a share of its own, the same in every
+task, so that what it has computed is still in its core's memory when it is needed; then it helps with what others have
+left. Nobody waits for a helper that has claimed no block: one that sleeps, or whose core is busy with another program,
+is not missed. So a task costs a few exchanges of a line of memory between cores, not an entry into a parallel region
+and a barrier of all threads at its end.
 
 A leader that finds the crew at work, for another leader or because a block has blocks of its own, does all its blocks
 alone. The blocks of a task, not the threads, decide the bits of a result.
@@ -22,21 +24,21 @@ from numba import types
 from numba.extending import intrinsic
 
 from rigidmd.compile.kernels import kernel, options_of
-from rigidmd.compile.machine import MOST_THREADS, PROCESSOR_FEATURES
+from rigidmd.compile.machine import MOST_BLOCKS, MOST_THREADS, PROCESSOR_FEATURES
 from rigidmd.compile.numba_private import callback, uncounted
 
 WORD = ir.IntType(64)
 #: Cells of the crew's memory, 8 to a line of cache: cells that different threads write are on lines of their own.
 LEAD, HELPERS, POLLS = 0, 1, 2  # address of `_lead`; helpers that may help; looks of a waiting thread before it sleeps
 AT_WORK = 8  # 1 while a leader has the crew
-TICKET = 16  # the number of the present job, times `JOB`; the next block that is free
+JOB = 16  # the number of the present job, even; odd while one is written down
 ADDRESS, PARCEL, BLOCKS = 24, 25, 26  # the job
-DONE = 32  # blocks that are done
+DONE = 32  # parts of it that are done
 LEADER_SLEEPS, LEADERS_BELL = 40, 41  # 1 while the leader sleeps; the lock on which it sleeps
-FIRST_HELPER, LINE = 48, 8  # a line for each helper: 1 while it sleeps, and its lock
+CLAIMED = 48  # for each part of a job the number of the last job in which it was claimed
+PARTS = MOST_BLOCKS  # at most; where there are more blocks, several are a part
+FIRST_HELPER, LINE = CLAIMED + PARTS, 8  # a line for each helper: 1 while it sleeps, and its lock
 SLEEPS, BELL = 0, 1
-JOB = 1 << 24
-CLOSED = JOB - 1  # in place of the next block while a job is written down
 SYMBOL = "rigidmd_crew"
 ALLOCATE, ACQUIRE, RELEASE = "PyThread_allocate_lock", "PyThread_acquire_lock", "PyThread_release_lock"
 #: A thread that waits looks again and again for so long, in seconds, before it sleeps: longer than from one task to the
@@ -138,31 +140,39 @@ def jump_to(typing, address, parcel, block):
 
 
 @kernel(counted=False)
-def _take(crew, ticket, address, parcel, blocks):
-    """Do blocks of the job of a ticket until there are none; whether the last one to be done was among them."""
+def _take(crew, job, address, parcel, blocks, own, threads):
+    """Do what is left of a job, as thread `own` of so many; whether the last part to be done was among it.
+
+    Even threads begin with the first part of their share and go up, odd ones with the last and go down: two threads
+    meet where they have done the same.
+    """
+    parts = min(blocks, PARTS)
     last = False
-    while ticket % JOB < blocks:
-        if _replace(crew, TICKET, ticket, ticket + 1):
-            jump_to(address, parcel, ticket % JOB)
-            last = _add(crew, DONE, 1) + 1 == blocks
-        now = _read(crew, TICKET)
-        if now // JOB != ticket // JOB:
-            break
-        ticket = now
+    up = own % 2 == 0
+    part = own * parts // threads if up else (own + 1) * parts // threads - 1
+    for _ in range(parts):
+        claimed = _read(crew, CLAIMED + part)
+        # A part of an earlier job has this number or a later one: all were claimed before the next job was written.
+        if claimed < job and _replace(crew, CLAIMED + part, claimed, job):
+            for block in range(part * blocks // parts, (part + 1) * blocks // parts):
+                jump_to(address, parcel, block)
+            last |= _add(crew, DONE, 1) + 1 == parts
+        part = (part + (1 if up else parts - 1)) % parts
     return last
 
 
 def _help(crew, own):
     """What helper `own` does, for ever."""
     line = FIRST_HELPER + LINE * own
-    looks = 0
+    looks = finished = 0
     while True:
-        ticket = _read(crew, TICKET)
+        job, helpers = _read(crew, JOB), _read(crew, HELPERS)
         address, parcel, blocks = _read(crew, ADDRESS), _read(crew, PARCEL), _read(crew, BLOCKS)
-        # what was read is of this job if the ticket is still the same when a block is taken
-        if ticket % JOB < blocks and own < _read(crew, HELPERS):
-            if _take(crew, ticket, address, parcel, blocks) and _replace(crew, LEADER_SLEEPS, 1, 0):
+        # what was read is of this job if its number is still the same
+        if job != finished and job % 2 == 0 and own < helpers and _read(crew, JOB) == job:
+            if _take(crew, job, address, parcel, blocks, own + 1, helpers + 1) and _replace(crew, LEADER_SLEEPS, 1, 0):
                 _ring(_read(crew, LEADERS_BELL))
+            finished = job
             looks = 0
         elif looks < _read(crew, POLLS):
             looks += 1
@@ -170,7 +180,7 @@ def _help(crew, own):
         else:
             looks = 0
             _write(crew, line + SLEEPS, 1)
-            if _read(crew, TICKET) == ticket or not _replace(crew, line + SLEEPS, 1, 0):
+            if _read(crew, JOB) == job or not _replace(crew, line + SLEEPS, 1, 0):
                 _sleep(_read(crew, line + BELL))
 
 
@@ -181,28 +191,28 @@ def _lead(crew, address, parcel, blocks):
         for block in range(blocks):
             jump_to(address, parcel, block)
         return
-    job = (_read(crew, TICKET) // JOB + 1) * JOB
-    _write(crew, TICKET, job + CLOSED)
+    parts = min(blocks, PARTS)
+    job = (_read(crew, JOB) // 2 + 1) * 2
+    _write(crew, JOB, job - 1)
     _write(crew, ADDRESS, address)
     _write(crew, PARCEL, parcel)
     _write(crew, BLOCKS, blocks)
     _write(crew, DONE, 0)
-    job += JOB
-    _write(crew, TICKET, job)
-    for own in range(min(helpers, blocks - 1)):
+    _write(crew, JOB, job)
+    for own in range(min(helpers, parts - 1)):
         line = FIRST_HELPER + LINE * own
         if _read(crew, line + SLEEPS) == 1 and _replace(crew, line + SLEEPS, 1, 0):
             _ring(_read(crew, line + BELL))
-    _take(crew, job, address, parcel, blocks)
+    _take(crew, job, address, parcel, blocks, 0, helpers + 1)
     looks = 0
-    while _read(crew, DONE) < blocks:
+    while _read(crew, DONE) < parts:
         looks += 1
         if looks < _read(crew, POLLS):
             _pause()
         else:
             looks = 0
             _write(crew, LEADER_SLEEPS, 1)
-            if _read(crew, DONE) < blocks or not _replace(crew, LEADER_SLEEPS, 1, 0):
+            if _read(crew, DONE) < parts or not _replace(crew, LEADER_SLEEPS, 1, 0):
                 _sleep(_read(crew, LEADERS_BELL))
     _write(crew, AT_WORK, 0)
 
@@ -210,7 +220,7 @@ def _lead(crew, address, parcel, blocks):
 def _look(crew, looks):
     """Look as a thread that waits does, so many times."""
     for _ in range(looks):
-        _read(crew, TICKET)
+        _read(crew, JOB)
         _pause()
 
 
@@ -292,6 +302,7 @@ class _Crew:
         self.hired, self._hiring = 0, threading.RLock()
         self.cells[[HELPERS, AT_WORK, LEADER_SLEEPS]] = 0
         self.cells[FIRST_HELPER:] = 0
+        self.cells[CLAIMED:FIRST_HELPER] = self.cells[JOB]  # nothing is left of a job that another thread had begun
         if self.code:
             self.cells[LEADERS_BELL] = _bell()
 
