@@ -92,7 +92,7 @@ def stiffest(system: System, state: State, engine: Engine | None = None) -> Stif
     here, moved = weighted(engine.evaluate(state)[0]), state.copy()
     vector = np.random.default_rng(0).standard_normal(here.size)
     vector *= np.concatenate([np.repeat(mass, 3), inertia.ravel()]) > 0
-    basis, matrix = [vector / np.linalg.norm(vector)], np.zeros((DIRECTIONS, DIRECTIONS))
+    basis, matrix = [vector / sqrt(_product(vector, vector))], np.zeros((DIRECTIONS, DIRECTIONS))
     for k in range(DIRECTIONS):
         shift, turn = parts(basis[k])
         reach = max(np.abs(shift).max(initial=0.0), np.abs(radius * turn).max(initial=0.0))
@@ -102,9 +102,9 @@ def stiffest(system: System, state: State, engine: Engine | None = None) -> Stif
             moved.rotation[turning] = state.rotation[turning] @ from_vector(h * turn)
         image = (here - weighted(engine.evaluate(moved)[0])) / h
         for j, other in enumerate(basis):
-            matrix[j, k] = other @ image
+            matrix[j, k] = _product(other, image)
             image = image - matrix[j, k] * other
-        size = np.linalg.norm(image)
+        size = sqrt(_product(image, image))
         if k + 1 == DIRECTIONS or not size > 1e-6 * np.abs(matrix).max():
             break
         matrix[k + 1, k] = size
@@ -115,10 +115,15 @@ def stiffest(system: System, state: State, engine: Engine | None = None) -> Stif
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     if values[-1] <= 0:
         return None
-    mode = (np.array(basis).T @ vectors[:, -1]) ** 2
+    mode = sum(share * vector for share, vector in zip(vectors[:, -1], basis, strict=True)) ** 2
     share = mode[: 3 * len(moving)].reshape(-1, 3).sum(axis=1)
     share[: len(turning)] += mode[3 * len(moving) :].reshape(-1, 3).sum(axis=1)
     return Stiffest(sqrt(values[-1]), int(moving[share.argmax()]))
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> float:
+    """Scalar product of long vectors. `a @ b` starts threads that then wait in a loop, on cores that a run needs."""
+    return float(np.einsum("i,i", a, b))
 
 
 def long_steps(scene: MolecularScene) -> list[str]:
