@@ -14,8 +14,8 @@ import pytest
 from conftest import ROOT, small_scene
 
 from rigidmd import Every, Simulation, run_together
-from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
-from rigidmd.compile.crew import _crew
+from rigidmd.compile import Code, call_blocks, kernel, laid_down, opened, packed, set_threads, task
+from rigidmd.compile.crew import CLAIMED, FIRST_HELPER, _crew, _take
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SimulationError
@@ -68,6 +68,45 @@ def test_every_block_is_done_once(threads, blocks, work):
     seen = counted(blocks, work, 200)
     assert (seen[:, 0] == 200).all()
     assert seen[:, 1] == pytest.approx([sum(np.sqrt(np.arange(work) + b)) for b in range(blocks)])
+
+
+@task()
+def _note(parcel, block):
+    order = opened(parcel)
+    order[0] += 1
+    order[order[0]] = block
+
+
+@kernel(outer=True)
+def _lay_down(content, room):
+    return laid_down(content, room)
+
+
+@kernel(outer=True)
+def _take_alone(cells, job, address, room, blocks, own, threads):
+    return _take(cells, job, address, room, blocks, own, threads)
+
+
+@pytest.mark.parametrize(
+    ("own", "threads", "claimed", "expected"),
+    [
+        (0, 2, [0] * 6, [0, 1, 2, 3, 4, 5]),
+        (1, 2, [0] * 6, [5, 4, 3, 2, 1, 0]),
+        (0, 2, [0, 4, 2, 0, 4, 4], [0, 2, 3]),  # the others are claimed
+        (2, 3, [0] * 6, [4, 5, 0, 1, 2, 3]),
+        (1, 3, [0] * 6, [3, 2, 1, 0, 5, 4]),
+        (1, 2, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
+        (3, 8, [0] * 6, [2, 1, 0, 5, 4, 3]),  # more threads than blocks
+    ],
+)
+def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(own, threads, claimed, expected):
+    cells, order, room = np.zeros(FIRST_HELPER, np.int64), np.zeros(7, np.int64), np.zeros(64)
+    cells[CLAIMED : CLAIMED + 6] = claimed
+    code = Code(note=(_note, order))
+    assert _lay_down(order, room) <= len(room)
+    last = _take_alone(cells.ctypes.data, 4, code.address("note"), room.ctypes.data, 6, own, threads)
+    assert order[1 : order[0] + 1].tolist() == expected
+    assert last == (len(expected) == 6)
 
 
 def test_a_block_may_have_blocks_of_its_own():
