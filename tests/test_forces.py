@@ -7,6 +7,7 @@ from numba.core.errors import TypingError
 from reference import Oracle
 
 from rigidmd.assemble.system import build
+from rigidmd.compile import kernel
 from rigidmd.compile.lanes import lane_count
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import no_load
@@ -15,6 +16,7 @@ from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import BUILDS, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
 from rigidmd.forces.pairs.space import cell_of
+from rigidmd.forces.pairs.tree import ahead
 from rigidmd.forces.terms import Loading
 from rigidmd.measure.observables import observe
 from rigidmd.mechanics.rotation import from_vector
@@ -240,6 +242,24 @@ def test_a_cutoff_within_which_are_too_many_sites_is_refused():
     own.pairs.needed[0, MET_BY_ONE] = MOST_MET + 1
     with pytest.raises(SimulationError, match="sites are within the cut-off of 8 Å: take a shorter one"):
         own.with_room(state.cell)
+
+
+@kernel(outer=True)
+def _ahead(c, clusters, first, arity):
+    return ahead(c, clusters, first, arity)
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 3, 7, 8, 9, 16, 21])
+def test_of_two_clusters_one_is_ahead_of_the_other(clusters):
+    """Each pair is then listed once."""
+    found = []
+    for c in range(clusters):
+        for first in range(0, clusters, 4):
+            bits = _ahead(c, clusters, first, 4)
+            found += [(c, first + k) for k in range(4) if bits >> k & 1 and first + k < clusters]
+    once = {tuple(sorted(pair)) for pair in found}
+    assert len(found) == len(once) == clusters * (clusters + 1) // 2
+    assert all((b - a) % clusters <= clusters // 2 for a, b in found)
 
 
 def test_blocks_of_lists_grow_in_number_with_the_edge_of_the_box():
