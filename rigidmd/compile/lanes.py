@@ -285,7 +285,7 @@ def inverse_root(x):
 
 
 # The series are written out, since LLVM's own choice depends on the processor: for some it computes a root and divides,
-# for others it corrects an estimate to 4e-7 only.
+# for others it corrects an estimate of float32 by one step, and the cube is off by up to 5.8e-7 instead of 1.9e-7.
 @implements(inverse_root, inline=True)
 def _inverse_root(x):
     if not isinstance(x, Lanes):
