@@ -115,7 +115,7 @@ def stiffest(system: System, state: State, engine: Engine | None = None) -> Stif
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     if values[-1] <= 0:
         return None
-    mode = sum(share * vector for share, vector in zip(vectors[:, -1], basis, strict=True)) ** 2
+    mode = np.einsum("k,kn", vectors[:, -1], np.array(basis)) ** 2
     share = mode[: 3 * len(moving)].reshape(-1, 3).sum(axis=1)
     share[: len(turning)] += mode[3 * len(moving) :].reshape(-1, 3).sum(axis=1)
     return Stiffest(sqrt(values[-1]), int(moving[share.argmax()]))
