@@ -25,7 +25,7 @@ from rigidmd.compile import (
 from rigidmd.compile.lane_types import COUNT, Lanes, Mask, filled, multiply_add
 from rigidmd.compile.machine import PROCESSOR_FEATURES
 
-#: Whether this machine has the instruction that `picked` uses, and the estimates of 1/x and 1/sqrt(x).
+#: Whether this machine has the instruction that `picked` uses and estimates to 14 bits; whether it has any estimates.
 HAS_AVX512 = SIMD_BITS == 512 and "avx512f" in PROCESSOR_FEATURES
 IS_X86 = "sse2" in PROCESSOR_FEATURES
 
@@ -218,7 +218,7 @@ double = intrinsic(_converted(types.float64))
 
 
 #: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³ (p = 3/2).
-QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2, 15 / 8, 35 / 16, 315 / 128)
+QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2, 15 / 8, 35 / 16, 315 / 128)
 
 
 def _terms(x) -> int:
@@ -260,6 +260,7 @@ def _estimated(name):
 
 
 #: 1/sqrt(x) and 1/x of a vector by the machine's estimates: relative errors up to 2^-14 with AVX-512, else 1.5 2^-12.
+#: That of 1/x is used with AVX-512 only.
 _root_estimate = intrinsic(_estimated("rsqrt"))
 _quotient_estimate = intrinsic(_estimated("rcp"))
 
