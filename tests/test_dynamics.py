@@ -190,16 +190,23 @@ def test_angular_momentum_is_kept_in_free_space():
 
 
 def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(liquid):
-    system, _, state = liquid
-    engine = system.engine()  # with new lists: the same bits after whatever tests came before
-    moved, times, energies = state.copy(), [], []
-    for k in range(400):
-        move(engine, moved, VERLET, 0.001, 50)
-        times.append(0.05 * (k + 1))
-        energies.append(observe(system, engine, moved).energy / 100 / 64)
-    line = slope(times, energies)
-    assert abs(line.value) < 3 * line.error
-    assert line.error * 1000 < 0.1  # kJ/mol/ns per molecule: small enough to mean something
+    """Of eight starts together: the error of a single slope is known to a third only, and one in fifty passes three of
+    it by chance. Over 48 starts the slopes had a mean of 0.0006 and a standard deviation of 0.017 kJ/mol/ns."""
+    system, engine, state = liquid
+    lines = []
+    for seed in range(8):
+        moved, times, energies = state.copy(), [], []
+        draw_momenta(system.model, moved, 300.0, np.random.default_rng(seed))
+        engine.forget()
+        for k in range(400):
+            move(engine, moved, VERLET, 0.001, 50)
+            times.append(0.05 * (k + 1))
+            energies.append(observe(system, engine, moved).energy / 100 / 64)
+        lines.append(slope(times, energies))
+    drift = np.mean([line.value for line in lines])
+    error = np.sqrt(np.mean([line.error**2 for line in lines]) / len(lines))
+    assert abs(drift) < 3 * error
+    assert error * 1000 < 0.04  # kJ/mol/ns per molecule: small enough to mean something
 
 
 def test_splitting_a_run_changes_no_bit(liquid):
