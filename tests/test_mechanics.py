@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from rigidmd.compile import kernel
-from rigidmd.mechanics.groups import GROUP, turn_group
+from rigidmd.mechanics.groups import TOGETHER, turn_group
 from rigidmd.mechanics.inertia import kind_of_body, principal_frame
 from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations
 from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
@@ -20,13 +20,12 @@ def spin(rotor, rotation, angular_momentum, h, steps):
 
 
 @kernel(outer=True)
-def turn_all(rotor, species, rotation, angular_momentum, h, size):
-    if size == 1:
+def turn_all(rotor, species, rotation, angular_momentum, h, together):
+    if together:
+        turn_group(rotor, species, rotation, angular_momentum, 0, len(rotation), h)
+    else:
         for m in range(len(rotation)):
             turn(rotor, species[m], rotation, angular_momentum, m, h)
-    else:
-        for first in range(0, len(rotation), size):
-            turn_group(rotor, species, rotation, angular_momentum, first, min(first + size, len(rotation)), h)
 
 
 @pytest.mark.parametrize("moments", ["of every kind", "of two axes", "round"])
@@ -41,16 +40,16 @@ def test_many_bodies_turn_together_as_one_by_one(moments, longest):
         "round": [[2, 2, 2], [0, 1, 1]],
     }[moments]  # fmt: skip
     rotor = split_rotor(np.array(inertia, float))
-    n = GROUP + 37
+    n = 20 * TOGETHER + 1
     species = rng.integers(0, len(inertia), n)
     rotation = random_rotations(rng, n)
     momentum = rng.standard_normal((n, 3)) * (rotor.inverse_inertia[species] > 0)
     momentum *= longest * rng.random((n, 1)) / np.linalg.norm(momentum, axis=1, keepdims=True)
     found = []
-    for size in (1, GROUP):
+    for together in (False, True):
         q, momenta = rotation.copy(), momentum.copy()
-        turn_all(rotor, species, q, momenta, 0.7, size)
-        turn_all(rotor, species, q, momenta, -0.3, size)
+        turn_all(rotor, species, q, momenta, 0.7, together)
+        turn_all(rotor, species, q, momenta, -0.3, together)
         found.append((q, momenta))
     assert found[1][0] == pytest.approx(found[0][0], abs=2e-15)
     assert found[1][1] == pytest.approx(found[0][1], abs=2e-15 * longest)
@@ -62,7 +61,7 @@ def test_one_body_that_is_no_number_leaves_its_group_alone():
     rotor, species = split_rotor(np.array([[1.0, 2.0, 2.5]])), np.zeros(20, int)
     rotation, momentum = random_rotations(rng, 20), rng.standard_normal((20, 3))
     momentum[7, 1] = np.nan
-    turn_all(rotor, species, rotation, momentum, 0.01, GROUP)
+    turn_all(rotor, species, rotation, momentum, 0.01, True)
     assert np.array_equal(np.isnan(rotation).any(axis=(1, 2)), np.arange(20) == 7)
 
 

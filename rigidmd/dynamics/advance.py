@@ -12,7 +12,7 @@ from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import blocks_of
 from rigidmd.forces.terms import PLAIN, TALLIED, is_driven, total_energy_rate
-from rigidmd.mechanics.groups import GROUP, turn_group
+from rigidmd.mechanics.groups import TOGETHER, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
 #: Random numbers that a flow may draw for one molecule in a step.
@@ -238,17 +238,17 @@ def _pay_for_molecules(model, terms, state, h):
 
 
 @kernel(inline=True)
-def _groups_of(state, block):
-    """The first molecule of a block, and the first that is no more in it; whole groups."""
+def _share(state, block):
+    """The first molecule of a block, and the first that is no more in it: as many as turn together, again and again."""
     n, blocks = len(state.position), blocks_of(len(state.position))
-    groups = (n + GROUP - 1) // GROUP
-    return GROUP * (groups * block // blocks), min(n, GROUP * (groups * (block + 1) // blocks))
+    groups = (n + TOGETHER - 1) // TOGETHER
+    return TOGETHER * (groups * block // blocks), min(n, TOGETHER * (groups * (block + 1) // blocks))
 
 
 @task()
 def _kick(parcel, block):
     species, inverse_mass, inverse_inertia, state, load, h = opened(parcel)
-    first, end = _groups_of(state, block)
+    first, end = _share(state, block)
     for m in range(first, end):
         kind = species[m]
         share = h * inverse_mass[kind]
@@ -263,10 +263,8 @@ def _kick(parcel, block):
 @task()
 def _drift(parcel, block):
     rotor, species, state, h = opened(parcel)
-    first, end = _groups_of(state, block)
-    for start in range(first, end, GROUP):
-        stop = min(start + GROUP, end)
-        for m in range(start, stop):
-            for k in range(3):
-                state.position[m, k] += h * state.velocity[m, k]
-        turn_group(rotor, species, state.rotation, state.angular_momentum_body, start, stop, h)
+    first, end = _share(state, block)
+    for m in range(first, end):
+        for k in range(3):
+            state.position[m, k] += h * state.velocity[m, k]
+    turn_group(rotor, species, state.rotation, state.angular_momentum_body, first, end, h)

@@ -1,19 +1,23 @@
-"""Rotations of many bodies at a time, part by part, in loops without branches or calls that the compiler vectorises.
+"""Rotations of many bodies at a time, one in each lane.
 
-With one body at a time, each part waits for the one before it, and a water takes two and a half times as long.
+With one body at a time, each part of a rotation waits for the one before it.
 """
 
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile.lanes import align_stack, bits, lane_count, load, select
+from rigidmd.compile.records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.mechanics.rotor import SHORT, SplitRotor, series_of_square, turn, turned
 
-GROUP = 128  # bodies; their data stay in the L1 cache
-SHARE, RATE, SIGN, L, Q, ROWS = 0, 1, 4, 5, 8, 17  # first row of each quantity in a group
+TOGETHER = lane_count(np.float64)  # bodies that turn together
+#: Rows of what the lanes have to know of their species: axes a and b (as numbers), h g, h (1/I - g) about a, b and c,
+#: the square of the largest of these, and 1 if the axes a, b, c are left-handed, -1 if right-handed.
+AXIS_A, AXIS_B, SHARE, RATE, FASTEST2, TURN, ROWS = 0, 1, 2, 3, 6, 7, 8
 
 
 def turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
-    """`turn` of molecules first ... end - 1, at most GROUP."""
+    """`turn` of molecules first ... end - 1."""
     raise TypeError("compiled code only")
 
 
@@ -25,34 +29,25 @@ def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
         )
 
     def turn_together(rotor, species, rotation, angular_momentum_body, first, end, h):
-        count = end - first
-        # few bodies, or bodies that rotate about their momenta only, take longer to collect than to rotate
-        if count < 8 or not rotor.excess.any():
-            _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
-            return
-        group = np.empty((ROWS, GROUP))
-        longest, about = _collect(group, rotor, species, rotation, angular_momentum_body, first, count, h)
-        if not longest * longest < SHORT:
-            _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
-            return
-        _about_momenta(group, count)
-        if about[0]:
-            _about_axes(group, count, 0, 0.5)
-        if about[1]:
-            _about_axes(group, count, 1, 0.5)
-        if about[2]:
-            _about_axes(group, count, 2, 1.0)
-        if about[1]:
-            _about_axes(group, count, 1, 0.5)
-        if about[0]:
-            _about_axes(group, count, 0, 0.5)
-        for n in range(count):
-            m = np.uint64(first + n)
-            for k in range(3):
-                axis = np.uint64(rotor.order[species[m], k])
-                angular_momentum_body[m, axis] = group[L + k, n]
-                for row in range(3):
-                    rotation[m, row, axis] = group[Q + 3 * row + k, n]
+        align_stack()
+        known, kinds = np.empty(ROWS * TOGETHER), np.full(TOGETHER, -1)
+        whole = (1 << TOGETHER) - 1
+        about = (False, False, False)
+        while first + TOGETHER <= end:
+            if not _are(kinds, species, first):
+                about = _learn(known, kinds, rotor, species, first, h)
+            momentum = load_vectors(angular_momentum_body, first)
+            x, y, z = momentum
+            if bits(load(known, FASTEST2 * TOGETHER) * (x * x + y * y + z * z) < SHORT) != whole:
+                _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, first + TOGETHER, h)
+            elif about[0] | about[1] | about[2]:
+                _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum)
+            else:
+                share = load(known, SHARE * TOGETHER)
+                turned_lanes = _about_momenta(load_matrices(rotation, first), (share * x, share * y, share * z), -1.0)
+                store_matrices(rotation, first, turned_lanes)
+            first += TOGETHER
+        _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
 
     return turn_together
 
@@ -64,63 +59,114 @@ def _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end
 
 
 @kernel(inline=True)
-def _collect(group, rotor, species, rotation, angular_momentum_body, first, count, h):
-    """Fill the rows of a group; returns a bound on all angles, and which axes have rotations.
+def _are(kinds, species, first):
+    """Whether the lanes' bodies are of these kinds."""
+    same = True
+    for n in range(len(kinds)):
+        same &= kinds[n] == species[first + n]
+    return same
 
-    Components are in the order of the rotor's axes a, b, c. If it is not cyclic, the frame is left-handed: SIGN.
-    """
-    longest = 0.0
+
+@kernel
+def _learn(known, kinds, rotor, species, first, h):
+    """Fill the rows that the lanes have to know; returns about which of the axes a, b, c there are rotations."""
     about_a = about_b = about_c = False
-    for n in range(count):
-        m = np.uint64(first + n)
-        kind = np.uint64(species[m])
-        fastest = abs(rotor.common[kind])
-        length = 0.0
-        for k in range(3):
-            axis = np.uint64(rotor.order[kind, k])
-            rate = rotor.excess[kind, axis]
-            fastest = max(fastest, abs(rate))
-            length += abs(angular_momentum_body[m, axis])
-            group[RATE + k, n] = h * rate
-            group[L + k, n] = angular_momentum_body[m, axis]
-            for row in range(3):
-                group[Q + 3 * row + k, n] = rotation[m, row, axis]
-        group[SHARE, n] = h * rotor.common[kind]
-        group[SIGN, n] = 1.0 if (rotor.order[kind, 1] - rotor.order[kind, 0]) % 3 == 1 else -1.0
-        about_a |= group[RATE, n] != 0.0
-        about_b |= group[RATE + 1, n] != 0.0
-        about_c |= group[RATE + 2, n] != 0.0
-        angle = abs(h) * fastest * length
-        longest = angle if not angle <= longest else longest
-    return longest, (about_a, about_b, about_c)
+    for n in range(TOGETHER):
+        kind = species[first + n]
+        kinds[n] = kind
+        a, b, c = rotor.order[kind, 0], rotor.order[kind, 1], rotor.order[kind, 2]
+        share, rates = h * rotor.common[kind], rotor.excess[kind]
+        known[AXIS_A * TOGETHER + n], known[AXIS_B * TOGETHER + n] = a, b
+        known[SHARE * TOGETHER + n] = share
+        known[RATE * TOGETHER + n] = h * rates[a]
+        known[(RATE + 1) * TOGETHER + n] = h * rates[b]
+        known[(RATE + 2) * TOGETHER + n] = h * rates[c]
+        known[FASTEST2 * TOGETHER + n] = max(abs(share), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c])) ** 2
+        known[TURN * TOGETHER + n] = -1.0 if (b - a) % 3 == 1 else 1.0
+        about_a |= rates[a] != 0.0
+        about_b |= rates[b] != 0.0
+        about_c |= rates[c] != 0.0
+    return about_a, about_b, about_c
 
 
 @kernel(inline=True)
-def _about_momenta(group, count):
-    """`rotor.about_momentum` of each body."""
-    for n in range(count):
-        x = group[SHARE, n] * group[L, n]
-        y = group[SHARE, n] * group[L + 1, n]
-        z = group[SHARE, n] * group[L + 2, n]
-        odd, even = series_of_square(x * x + y * y + z * z)
-        odd = -group[SIGN, n] * odd
-        for row in range(Q, Q + 9, 3):
-            group[row, n], group[row + 1, n], group[row + 2, n] = turned(
-                group[row, n], group[row + 1, n], group[row + 2, n], x, y, z, odd, even
-            )
+def _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum):
+    """`rotor.turn_by_parts` of the bodies in lanes, in the frame of the rotor's axes a, b, c."""
+    a, b, turn = load(known, AXIS_A * TOGETHER), load(known, AXIS_B * TOGETHER), load(known, TURN * TOGETHER)
+    axes = (a == 0.0, b == 0.0, a == 1.0, b == 1.0)
+    q = load_matrices(rotation, first)
+    L = _in_order(momentum, axes)
+    share = load(known, SHARE * TOGETHER)
+    along = (share * L[0], share * L[1], share * L[2])
+    ordered = _in_order(q[:3], axes) + _in_order(q[3:6], axes) + _in_order(q[6:], axes)
+    q0, q1, q2, q3, q4, q5, q6, q7, q8 = _about_momenta(ordered, along, turn)
+    L0, L1, L2 = L
+    if about[0]:
+        angle = 0.5 * load(known, RATE * TOGETHER) * L0
+        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, turn, L1, L2, q1, q2, q4, q5, q7, q8)
+    if about[1]:
+        angle = 0.5 * load(known, (RATE + 1) * TOGETHER) * L1
+        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, turn, L2, L0, q2, q0, q5, q3, q8, q6)
+    if about[2]:
+        angle = load(known, (RATE + 2) * TOGETHER) * L2
+        L0, L1, q0, q1, q3, q4, q6, q7 = _about_axis(angle, turn, L0, L1, q0, q1, q3, q4, q6, q7)
+    if about[1]:
+        angle = 0.5 * load(known, (RATE + 1) * TOGETHER) * L1
+        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, turn, L2, L0, q2, q0, q5, q3, q8, q6)
+    if about[0]:
+        angle = 0.5 * load(known, RATE * TOGETHER) * L0
+        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, turn, L1, L2, q1, q2, q4, q5, q7, q8)
+    store_vectors(angular_momentum_body, first, _in_place((L0, L1, L2), axes))
+    back = _in_place((q0, q1, q2), axes) + _in_place((q3, q4, q5), axes) + _in_place((q6, q7, q8), axes)
+    store_matrices(rotation, first, back)
 
 
 @kernel(inline=True)
-def _about_axes(group, count, k, part):
-    """`rotor.about_axis` of each body, about its k-th axis in the rotor's order, for a part of the time."""
-    i, j = (k + 1) % 3, (k + 2) % 3
-    for n in range(count):
-        angle = part * group[RATE + k, n] * group[L + k, n]
-        odd, even = series_of_square(angle * angle)
-        s = group[SIGN, n] * angle * odd
-        versine = angle * angle * even
-        for row in range(L, L + 12, 3):
-            a = group[row + i, n]
-            b = group[row + j, n]
-            group[row + i, n] = a + (s * b - versine * a)
-            group[row + j, n] = b - (s * a + versine * b)
+def _in_order(vector, axes):
+    """Components of a body vector along the rotor's axes a, b, c."""
+    x, y, z = vector
+    a_is_x, b_is_x, a_is_y, b_is_y = axes
+    return (
+        select(a_is_x, x, select(a_is_y, y, z)),
+        select(b_is_x, x, select(b_is_y, y, z)),
+        select(a_is_x | b_is_x, select(a_is_y | b_is_y, z, y), x),
+    )
+
+
+@kernel(inline=True)
+def _in_place(vector, axes):
+    """A body vector from its components along the rotor's axes a, b, c."""
+    a, b, c = vector
+    a_is_x, b_is_x, a_is_y, b_is_y = axes
+    return (
+        select(a_is_x, a, select(b_is_x, b, c)),
+        select(a_is_y, a, select(b_is_y, b, c)),
+        select(a_is_x | a_is_y, select(b_is_x | b_is_y, c, b), a),
+    )
+
+
+@kernel(inline=True)
+def _about_momenta(q, along, turn):
+    """Rows of rotations (nine numbers) after a rotation along a vector: `rotor.turn_along`."""
+    x, y, z = along
+    odd, even = series_of_square(x * x + y * y + z * z)
+    odd = turn * odd
+    return (
+        turned(q[0], q[1], q[2], x, y, z, odd, even)
+        + turned(q[3], q[4], q[5], x, y, z, odd, even)
+        + turned(q[6], q[7], q[8], x, y, z, odd, even)
+    )
+
+
+@kernel(inline=True)
+def _about_axis(angle, turn, La, Lb, a0, b0, a1, b1, a2, b2):
+    """`rotor.about_axis`: the other two components of the momenta, and of each row of the rotations."""
+    odd, even = series_of_square(angle * angle)
+    s = turn * (angle * odd)
+    versine = angle * angle * even
+    return _rotated(La, Lb, s, versine) + _rotated(a0, b0, s, versine) + _rotated(a1, b1, s, versine) + _rotated(a2, b2, s, versine)
+
+
+@kernel(inline=True)
+def _rotated(a, b, s, versine):
+    return a - (s * b + versine * a), b + (s * a - versine * b)
