@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
-from rigidmd.compile.lanes import bits, lane_count, largest, load, root, store, width_of, zeros
-from rigidmd.forces.pairs.sites import place
+from rigidmd.compile.lanes import bits, item, lane_count, largest, load, root, store, width_of, zeros
+from rigidmd.forces.pairs.sites import first_of_slot, place
 
 SERIAL_SITES = 128  # up to this number there is one block
 
@@ -178,7 +178,8 @@ def _count_boxes(boxes, cell, i, at):
 def _in_brick(boxes, cell, i, at):
     """Position of site i, at (x, y, z), after the shift that moved it into the brick when sites were sorted, Å."""
     x, y, z = at
-    a, b, c = boxes[i, 0], boxes[i, 1], boxes[i, 2]
+    back = boxes[np.uint64(i)]
+    a, b, c = back[0], back[1], back[2]
     if c != 0:
         x, y, z = x - c * cell[2, 0], y - c * cell[2, 1], z - c * cell[2, 2]
     if b != 0:
@@ -268,12 +269,11 @@ def place_block(clusters, cell, sites, state, block):
     for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
             x, y, z = _in_brick(clusters.boxes, cell, i, place(sites, state, m, i))
-            slot = clusters.slot[i]
-            c = slot // width
-            at = slot + 2 * width * c
-            local[at] = x - origin[4 * c]
-            local[at + width] = y - origin[4 * c + 1]
-            local[at + 2 * width] = z - origin[4 * c + 2]
+            slot = item(clusters.slot, i)
+            at, c = first_of_slot(slot, width), 4 * (np.uint32(slot) // np.uint32(width))
+            local[np.uint64(at)] = x - item(origin, c)
+            local[np.uint64(at + width)] = y - item(origin, c + 1)
+            local[np.uint64(at + 2 * width)] = z - item(origin, c + 2)
 
 
 @kernel(inline=True, counted=False)

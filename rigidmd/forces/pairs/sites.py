@@ -9,7 +9,7 @@ import numpy as np
 from numba import types
 
 from rigidmd.compile import BLOCKS, MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
-from rigidmd.compile.lanes import lane_count, width_of
+from rigidmd.compile.lanes import item, lane_count, width_of
 from rigidmd.core.state import EXAMPLE
 
 # Up to this number, loops over molecules stay on one thread: they take a few microseconds.
@@ -88,6 +88,12 @@ class InSlots(NamedTuple):
         return np.stack([self.value[at + k * width] for k in range(3)], axis=1).astype(np.float64)
 
 
+@kernel(inline=True)
+def first_of_slot(slot, width):
+    """Where arrays of x, y, z in slots have the x of a slot; `width` is a power of two."""
+    return 3 * slot - 2 * (slot & (width - 1))
+
+
 def of_site(vectors, i):
     """(x, y, z) of site i in an array (s, 3) or `InSlots`."""
     raise TypeError("compiled code only")
@@ -100,9 +106,8 @@ def _of_site(vectors, i):
 
     def from_slot(vectors, i):
         width = width_of(vectors.value)
-        slot = vectors.slot[i]
-        at = slot + 2 * width * (slot // width)
-        return vectors.value[at], vectors.value[at + width], vectors.value[at + 2 * width]
+        at = first_of_slot(item(vectors.slot, i), width)
+        return item(vectors.value, at), item(vectors.value, at + width), item(vectors.value, at + 2 * width)
 
     return from_slot
 
@@ -119,7 +124,8 @@ def _place(sites, state, m, i):
 
     def place(sites, state, m, i):
         x, y, z = turned(sites, state, m, i)
-        return state.position[m, 0] + x, state.position[m, 1] + y, state.position[m, 2] + z
+        centre = state.position[np.uint64(m)]
+        return centre[0] + x, centre[1] + y, centre[2] + z
 
     return place
 
@@ -127,9 +133,10 @@ def _place(sites, state, m, i):
 @kernel(inline=True)
 def turned(sites, state, m, i):
     """Vector (x, y, z) from the centre of mass of molecule m to its site i, lab frame, Å."""
-    at = sites.kind[m] - sites.first[m] + i
+    m = np.uint64(m)
     q = state.rotation[m]
-    x, y, z = sites.offset_body[at, 0], sites.offset_body[at, 1], sites.offset_body[at, 2]
+    offset = sites.offset_body[np.uint64(sites.kind[m] - sites.first[m] + i)]
+    x, y, z = offset[0], offset[1], offset[2]
     return (
         q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
         q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
@@ -156,28 +163,28 @@ def _load_molecule(sites, state, load, m, site_force):
         return load_central
 
     def load_body(sites, state, load, m, site_force):
-        q = state.rotation[m]
+        m = np.uint64(m)  # an index without a sign is not tested for being negative
+        q, force, torque = state.rotation[m], load.force[m], load.torque_body[m]
         begin = sites.kind[m] - sites.first[m]
         sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = 0.0  # kept in registers until the last site
-        for i in range(sites.first[m], sites.first[m + 1]):
+        for i in range(sites.first[m], sites.first[np.uint64(m + 1)]):
             fx, fy, fz = of_site(site_force, i)
             sum_x, sum_y, sum_z = sum_x + fx, sum_y + fy, sum_z + fz
             # n_body = d x (Q^T f), with the site's offset d in the body frame
             bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
             by = q[0, 1] * fx + q[1, 1] * fy + q[2, 1] * fz
             bz = q[0, 2] * fx + q[1, 2] * fy + q[2, 2] * fz
-            x = sites.offset_body[begin + i, 0]
-            y = sites.offset_body[begin + i, 1]
-            z = sites.offset_body[begin + i, 2]
+            offset = sites.offset_body[np.uint64(begin + i)]
+            x, y, z = offset[0], offset[1], offset[2]
             turn_x += y * bz - z * by
             turn_y += z * bx - x * bz
             turn_z += x * by - y * bx
-        load.force[m, 0] += sum_x
-        load.force[m, 1] += sum_y
-        load.force[m, 2] += sum_z
-        load.torque_body[m, 0] += turn_x
-        load.torque_body[m, 1] += turn_y
-        load.torque_body[m, 2] += turn_z
+        force[0] += sum_x
+        force[1] += sum_y
+        force[2] += sum_z
+        torque[0] += turn_x
+        torque[1] += turn_y
+        torque[2] += turn_z
 
     return load_body
 
