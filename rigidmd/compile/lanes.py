@@ -57,8 +57,12 @@ def _address(context, builder, array_type, array, index, lanes):
     return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
 
 
+def _is_contiguous(array) -> bool:
+    return isinstance(array, types.Array) and array.layout == "C"
+
+
 def _is_row(array) -> bool:
-    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C"
+    return _is_contiguous(array) and array.ndim == 1
 
 
 def _load(lanes, array):
@@ -71,8 +75,8 @@ def _load(lanes, array):
 
 @intrinsic
 def load(typing, array, index):
-    """The vector array[index], array[index + 1], ... of a contiguous array with one axis."""
-    return _load(Lanes(array.dtype, COUNT[array.dtype]), array) if _is_row(array) else None
+    """The vector array[index], array[index + 1], ... of a contiguous array; of several axes the last counts first."""
+    return _load(Lanes(array.dtype, COUNT[array.dtype]), array) if _is_contiguous(array) else None
 
 
 @intrinsic

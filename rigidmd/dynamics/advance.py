@@ -12,7 +12,7 @@ from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
 from rigidmd.forces.pairs.sites import blocks_of
 from rigidmd.forces.terms import PLAIN, TALLIED, is_driven, total_energy_rate
-from rigidmd.mechanics.groups import TOGETHER, turn_group
+from rigidmd.mechanics.groups import TOGETHER, kick_group, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
 #: Random numbers that a flow may draw for one molecule in a step.
@@ -249,15 +249,7 @@ def _share(state, block):
 def _kick(parcel, block):
     species, inverse_mass, inverse_inertia, state, load, h = opened(parcel)
     first, end = _share(state, block)
-    for m in range(first, end):
-        kind = species[m]
-        share = h * inverse_mass[kind]
-        for k in range(3):
-            state.velocity[m, k] += share * load.force[m, k]
-        if m < len(state.angular_momentum_body):
-            for k in range(3):
-                if inverse_inertia[kind, k] > 0:  # no momentum gathers on an axis without inertia
-                    state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
+    kick_group(species, inverse_mass, inverse_inertia, state, load, first, end, h)
 
 
 @task()

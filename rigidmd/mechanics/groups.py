@@ -1,12 +1,12 @@
-"""Rotations of many bodies at a time, one in each lane.
+"""Kicks and rotations of many bodies at a time.
 
-With one body at a time, each part of a rotation waits for the one before it.
+Rotations have a body in each lane: with one body at a time, each part of a rotation waits for the one before it.
 """
 
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.lanes import align_stack, bits, lane_count, load, select
+from rigidmd.compile.lanes import align_stack, bits, lane_count, load, select, store
 from rigidmd.compile.records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.mechanics.rotor import SHORT, SplitRotor, series_of_square, turn, turned
 
@@ -14,6 +14,34 @@ TOGETHER = lane_count(np.float64)  # bodies that turn together
 #: Rows of what the lanes have to know of their species: axes a and b (as numbers), h g, h (1/I - g) about a, b and c,
 #: the square of the largest of these, and 1 if the axes a, b, c are left-handed, -1 if right-handed.
 AXIS_A, AXIS_B, SHARE, RATE, FASTEST2, TURN, ROWS = 0, 1, 2, 3, 6, 7, 8
+
+
+@kernel
+def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end, h):
+    """V += h F/m, L += h n_body of molecules first ... end - 1; no momentum gathers on an axis without inertia."""
+    velocity, momentum, force, torque = state.velocity, state.angular_momentum_body, acting.force, acting.torque_body
+    kinds = np.full(TOGETHER, -1)
+    shares, parts = np.empty(3 * TOGETHER), np.empty(3 * TOGETHER)
+    turns = len(momentum) > 0
+    while first + TOGETHER <= end:
+        if not _are(kinds, species, first):
+            for n in range(3 * TOGETHER):
+                kind = species[first + n // 3]
+                shares[n] = h * inverse_mass[kind]
+                parts[n] = h if inverse_inertia[kind, n % 3] > 0 else 0.0
+                kinds[n // 3] = kind
+        for n in range(0, 3 * TOGETHER, TOGETHER):
+            at = 3 * first + n
+            store(velocity, at, load(velocity, at) + load(shares, n) * load(force, at))
+            if turns:
+                store(momentum, at, load(momentum, at) + load(parts, n) * load(torque, at))
+        first += TOGETHER
+    for m in range(first, end):
+        kind = species[m]
+        for k in range(3):
+            velocity[m, k] += h * inverse_mass[kind] * force[m, k]
+            if turns and inverse_inertia[kind, k] > 0:
+                momentum[m, k] += h * torque[m, k]
 
 
 def turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
