@@ -454,11 +454,7 @@ def gather_block(pairs, own, others, tallies, block):
     virial = (zero, zero, zero, zero, zero, zero)
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         at = 3 * width * c
-        force = (
-            _gathered(pairs, own, others, c, 0),
-            _gathered(pairs, own, others, c, 1),
-            _gathered(pairs, own, others, c, 2),
-        )
+        force = _gathered(pairs, own, others, c)
         for k in range(3):
             store(own, at + k * width, narrowed(force[k], own))
         if tallies is not None:
@@ -470,14 +466,17 @@ def gather_block(pairs, own, others, tallies, block):
 
 
 @kernel(inline=True)
-def _gathered(pairs, own, others, c, k):
-    """Component k of the forces on the sites of a cluster, in double precision."""
-    width = width_of(pairs.clusters.local)
-    found = double(load(own, 3 * width * c + k * width))
+def _gathered(pairs, own, others, c):
+    """The forces on the sites of a cluster, in double precision."""
+    width, count = width_of(pairs.clusters.local), len(pairs.clusters.origin) // 4
+    at = 3 * width * c
+    x, y, z = double(load(own, at)), double(load(own, at + width)), double(load(own, at + 2 * width))
     for b in range(len(others)):
         ahead = c - pairs.clusters.bounds[b]
         if ahead < 0:
-            ahead += len(pairs.clusters.origin) // 4
+            ahead += count
         if ahead < pairs.needed[b, WINDOW]:
-            found = found + double(load(others[b], 3 * width * ahead + k * width))
-    return found
+            there, at = others[b], 3 * width * ahead
+            x, y = x + double(load(there, at)), y + double(load(there, at + width))
+            z = z + double(load(there, at + 2 * width))
+    return x, y, z
