@@ -14,6 +14,7 @@ from numba import types
 
 from rigidmd.assemble.system import build
 from rigidmd.compile import SIMD_BITS, Parcel, kernel, lanes
+from rigidmd.compile.records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.forces.pairs.lists import BUILDS
@@ -82,6 +83,34 @@ def test_six_sums_over_lanes_are_stored_in_pairs(dtype):
     expected = np.zeros(10)
     expected[[1, 4, 7]], expected[[2, 5, 8]] = x[:3].sum(axis=1, dtype=float), x[3:].sum(axis=1, dtype=float)
     assert out == pytest.approx(expected, rel=0, abs=16 * float(np.finfo(dtype).eps))
+
+
+@kernel(outer=True)
+def records_in_lanes(vectors, matrices, out):
+    width = lanes.width_of(out)
+    x, y, z = load_vectors(vectors, 1)
+    nine = load_matrices(matrices, 1)
+    lanes.store(out, 0, x)
+    lanes.store(out, width, y)
+    lanes.store(out, 2 * width, z)
+    for k in range(9):
+        lanes.store(out, (3 + k) * width, nine[k])
+    store_vectors(vectors, 0, (z, x, y))
+    store_matrices(matrices, 0, nine)
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS.values())
+def test_records_are_loaded_into_lanes_and_stored(dtype):
+    """From the second record on; they are written one record earlier, and what lies beside them stays."""
+    rng, width = np.random.default_rng(3), lanes.lane_count(dtype)
+    vectors, matrices = rng.random((width + 2, 3)).astype(dtype), rng.random((width + 2, 3, 3)).astype(dtype)
+    moved, turned, out = vectors.copy(), matrices.copy(), np.zeros(12 * width, dtype)
+    records_in_lanes(moved, turned, out)
+    here = slice(1, width + 1)
+    columns = np.concatenate([vectors[here], matrices[here].reshape(width, 9)], axis=1).T
+    assert np.array_equal(out.reshape(12, width), columns)
+    assert np.array_equal(moved, np.concatenate([vectors[here][:, [2, 0, 1]], vectors[width:]]))
+    assert np.array_equal(turned, np.concatenate([matrices[here], matrices[width:]]))
 
 
 @kernel(outer=True)

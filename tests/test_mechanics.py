@@ -7,7 +7,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from rigidmd.compile import kernel
-from rigidmd.mechanics.groups import TOGETHER, turn_group
+from rigidmd.core.state import Load, state_of
+from rigidmd.mechanics.groups import TOGETHER, kick_group, turn_group
 from rigidmd.mechanics.inertia import kind_of_body, principal_frame
 from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations
 from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
@@ -63,6 +64,29 @@ def test_one_body_that_is_no_number_leaves_its_group_alone():
     momentum[7, 1] = np.nan
     turn_all(rotor, species, rotation, momentum, 0.01, True)
     assert np.array_equal(np.isnan(rotation).any(axis=(1, 2)), np.arange(20) == 7)
+
+
+@kernel(outer=True)
+def kick_all(species, inverse_mass, inverse_inertia, state, load, h):
+    kick_group(species, inverse_mass, inverse_inertia, state, load, 0, len(species), h)
+
+
+@pytest.mark.parametrize("turning", [True, False])
+def test_many_bodies_are_kicked_together(turning):
+    """Species in any order, one of them linear; as many bodies as do not fill the last group. Points have no momenta."""
+    rng, n = np.random.default_rng(6), 5 * TOGETHER + 1
+    species, inverse_mass = rng.integers(0, 3, n).astype(np.int32), np.array([1.0, 0.25, 0.0])
+    inverse_inertia = np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    turns = n if turning else 0
+    state = state_of(np.zeros((n, 3)), rng.standard_normal((n, 3)), np.zeros((turns, 3, 3)),
+                     rng.standard_normal((turns, 3)), np.eye(3))  # fmt: skip
+    load = Load(rng.standard_normal((n, 3)), rng.standard_normal((turns, 3)))
+    velocity = state.velocity + 0.3 * inverse_mass[species, None] * load.force
+    moved = 0.3 * load.torque_body * (inverse_inertia[species[:turns]] > 0)
+    momentum = state.angular_momentum_body + moved
+    kick_all(species, inverse_mass, inverse_inertia, state, load, 0.3)
+    assert state.velocity == pytest.approx(velocity, abs=1e-15)
+    assert state.angular_momentum_body == pytest.approx(momentum, abs=1e-15)
 
 
 def test_rotations_agree_with_scipy():

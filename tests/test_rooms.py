@@ -55,7 +55,7 @@ LIBRARIES = {
     "IPython": {"output/progress.py"},
     "chemiscope": {"looking/inline.py"},
     "numba": {
-        "compile/cache.py", "compile/code.py", "compile/crew.py", "compile/kernels.py", "compile/lane_types.py", "compile/lanes.py",
+        "compile/cache.py", "compile/code.py", "compile/crew.py", "compile/kernels.py", "compile/lane_types.py", "compile/records.py", "compile/lanes.py",
         "compile/machine.py", "compile/lane_math.py", "compile/own.py",
         "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",
     },

@@ -31,7 +31,9 @@ def _places(context, builder, array, value, first, size: int, count: int):
     """Pointers to the numbers of records first ... first + count - 1, [record][number]."""
     data = context.make_array(array)(context, builder, value).data
     start = builder.mul(first, first.type(size))
-    return [[builder.gep(data, [builder.add(start, first.type(size * n + k))]) for k in range(size)] for n in range(count)]
+    return [
+        [builder.gep(data, [builder.add(start, first.type(size * n + k))]) for k in range(size)] for n in range(count)
+    ]
 
 
 def _loader(size: int):

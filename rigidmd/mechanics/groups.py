@@ -192,7 +192,12 @@ def _about_axis(angle, turn, La, Lb, a0, b0, a1, b1, a2, b2):
     odd, even = series_of_square(angle * angle)
     s = turn * (angle * odd)
     versine = angle * angle * even
-    return _rotated(La, Lb, s, versine) + _rotated(a0, b0, s, versine) + _rotated(a1, b1, s, versine) + _rotated(a2, b2, s, versine)
+    return (
+        _rotated(La, Lb, s, versine)
+        + _rotated(a0, b0, s, versine)
+        + _rotated(a1, b1, s, versine)
+        + _rotated(a2, b2, s, versine)
+    )
 
 
 @kernel(inline=True)

@@ -51,11 +51,13 @@ def settings(changed: dict) -> Iterator[None]:
 
 def save_figure(figure, target, **options) -> None:
     """`figure.savefig`, with curves of any number of points."""
-    from matplotlib.lines import Line2D
-
-    for line in figure.findobj(Line2D):
-        if len(line.get_xdata()) > AT_ONCE:
-            line.set_path_effects([InPieces()])
+    axes = list(figure.axes)
+    while axes:  # not figure.findobj, which makes all ticks
+        axis = axes.pop()
+        axes += axis.child_axes
+        for line in axis.lines:
+            if len(line.get_xdata()) > AT_ONCE:
+                line.set_path_effects([InPieces()])
     with settings({"agg.path.chunksize": 0}):
         figure.savefig(target, **options)
 
