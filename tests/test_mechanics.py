@@ -82,11 +82,15 @@ def test_many_bodies_are_kicked_together(turning):
                      rng.standard_normal((turns, 3)), np.eye(3))  # fmt: skip
     load = Load(rng.standard_normal((n, 3)), rng.standard_normal((turns, 3)))
     velocity = state.velocity + 0.3 * inverse_mass[species, None] * load.force
-    moved = 0.3 * load.torque_body * (inverse_inertia[species[:turns]] > 0)
+    idle = inverse_inertia[species[:turns]] == 0
+    state.angular_momentum_body[idle] = -0.0  # which a sum with 0 would change
+    moved = 0.3 * load.torque_body * ~idle
+    load.torque_body[idle] = np.nan
     momentum = state.angular_momentum_body + moved
     kick_all(species, inverse_mass, inverse_inertia, state, load, 0.3)
     assert state.velocity == pytest.approx(velocity, abs=1e-15)
     assert state.angular_momentum_body == pytest.approx(momentum, abs=1e-15)
+    assert np.signbit(state.angular_momentum_body[idle]).all()
 
 
 def test_rotations_agree_with_scipy():

@@ -34,7 +34,8 @@ def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end
             at = 3 * first + n
             store(velocity, at, load(velocity, at) + load(shares, n) * load(force, at))
             if turns:
-                store(momentum, at, load(momentum, at) + load(parts, n) * load(torque, at))
+                before, part = load(momentum, at), load(parts, n)
+                store(momentum, at, select(part == 0.0, before, before + part * load(torque, at)))
         first += TOGETHER
     for m in range(first, end):
         kind = species[m]
