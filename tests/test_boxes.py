@@ -211,8 +211,8 @@ def test_a_rejected_move_leaves_no_trace(liquid):
     still, moved = state.copy(), state.copy()
     move(fresh, moved, VERLET.with_box(dear, 1), 0.0, 5)
     assert fresh.moves == (5, 0)
-    for name, a, b in zip(state._fields, still, moved, strict=True):  # a rotation by 0 may change the sign of a 0
-        assert name in ("step", "time") or np.array_equal(a, b), name
+    for name, a, b in zip(state._fields, still, moved, strict=True):
+        assert name in ("step", "time") or a.tobytes() == b.tobytes(), name
 
 
 @pytest.fixture(scope="module")

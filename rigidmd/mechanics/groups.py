@@ -145,7 +145,11 @@ def _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum):
     if about[0]:
         angle = 0.5 * load(known, RATE * TOGETHER) * L0
         L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, turn, L1, L2, q1, q2, q4, q5, q7, q8)
-    store_vectors(angular_momentum_body, first, _in_place((L0, L1, L2), axes))
+    x, y, z = _in_place((L0, L1, L2), axes)
+    still = load(known, RATE * TOGETHER) == 0.0  # its momentum is kept, with the signs of zeros
+    still = still & (load(known, (RATE + 1) * TOGETHER) == 0.0) & (load(known, (RATE + 2) * TOGETHER) == 0.0)
+    kept = select(still, momentum[0], x), select(still, momentum[1], y), select(still, momentum[2], z)
+    store_vectors(angular_momentum_body, first, kept)
     back = _in_place((q0, q1, q2), axes) + _in_place((q3, q4, q5), axes) + _in_place((q6, q7, q8), axes)
     store_matrices(rotation, first, back)
 
