@@ -14,7 +14,7 @@ from rigidmd.core.state import no_load
 from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.clusters import clusters_of
-from rigidmd.forces.pairs.lists import BUILDS, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
+from rigidmd.forces.pairs.lists import AHEAD, BUILDS, BUILT, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
 from rigidmd.forces.pairs.space import cell_of
 from rigidmd.forces.pairs.tree import ahead
 from rigidmd.forces.terms import Loading
@@ -422,6 +422,47 @@ def test_a_list_lasts_until_sites_have_moved_by_half_its_skin():
     expected = sum(Oracle(system).energy(state.position, state.rotation))
     assert sum(energies(engine, state).values()) == pytest.approx(expected, rel=1e-12)
     assert abs(expected) > 1.001 * abs(alone)
+
+
+def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
+    """Forward and back in time."""
+    forces = {"cutoff_A": 7.0, "skin_A": 1.2, "truncation": "force_shift"}
+    system, engine, state = built({"spce": 150, "nitrogen": 20}, 20.0, 3, spread=0.1, forces=forces)
+    other, same = system.engine(), state.copy()
+    for n in range(160):
+        dt = 0.001 if n < 80 else -0.001
+        move(engine, state, SCHEMES["velocity_verlet"], dt, 1)
+        for own in other.workspaces.values():
+            own.pairs.times[BUILT] = np.nan  # so that it is built for the present places
+        move(other, same, SCHEMES["velocity_verlet"], dt, 1)
+        if n % 10 == 9:
+            load, expected = engine.evaluate(state)[0], system.engine().evaluate(state)[0]
+            assert load.force == pytest.approx(expected.force, abs=1e-10 * np.abs(expected.force).max())
+    for own in engine.workspaces.values():
+        assert own.pairs.times[AHEAD] < 0  # built on the way back
+    assert all(own.pairs.times[AHEAD] == 0.0 for own in other.workspaces.values())
+    builds = [sum(own.pairs.counters[BUILDS] for own in of.workspaces.values()) for of in (engine, other)]
+    assert builds[0] < 0.95 * builds[1]
+
+
+@pytest.mark.parametrize("change", ["lately", "long ago", "fast", "unknown"])
+def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
+    """Where they are not, bodies turn by more than 0.3 rad on the way, and sites of a molecule keep their distances."""
+    forces = {"cutoff_A": 6.0, "skin_A": 4.0}
+    system, engine, state = built({"spce": 150}, 20.0, 3, spread=0.1, forces=forces)
+    move(engine, state, SCHEMES["velocity_verlet"], 0.001, 1)
+    expected = system.engine().evaluate(state)[0]
+    for own in engine.workspaces.values():
+        own.pairs.counters[USABLE] = 0
+        own.pairs.times[BUILT] = -1e9 if change == "long ago" else -0.06
+    if change in ("fast", "unknown"):
+        state.velocity[17, 1] = state.angular_momentum_body[20, 2] = 1e5 if change == "fast" else np.nan
+    load = engine.evaluate(state)[0]
+    assert load.force == pytest.approx(expected.force, abs=1e-10 * np.abs(expected.force).max())
+    assert all((own.pairs.times[AHEAD] != 0.0) == (change == "lately") for own in engine.workspaces.values())
+    if change == "lately":
+        rate = np.abs(state.angular_momentum_body * system.model.inverse_inertia[system.model.species]).max()
+        assert 0.3 < rate * own.pairs.times[AHEAD] < 1.0
 
 
 def test_the_pressure_of_an_ideal_gas():

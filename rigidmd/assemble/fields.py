@@ -89,7 +89,7 @@ def _walls(walls: Walls, k: int, parts: Parts, moves: np.ndarray, faults: list[s
         for m, own, free in zip(parts.species, chosen, moves, strict=True)
         if free and not len(own)
     ]
-    sites = sites_of(parts.model.species, chosen)
+    sites = sites_of(parts.model.species, chosen, parts.model.inverse_inertia)
     where = (walls.direction, *walls.positions_A)
     if walls.kind == "harmonic":
         return HarmonicWalls(*where, settled(walls.stiffness_kJ_mol_A2) * KJ_PER_MOL, sites)

@@ -30,9 +30,10 @@ class Interactions(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def _taking_part(species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]):
+def _taking_part(species: list[Molecule], model: Model, chosen: list[np.ndarray]):
     """Sites of a law: chosen[k] lists the sites of species k that have it."""
-    return sites_of(index, [m.positions_body[c] for m, c in zip(species, chosen, strict=True)])
+    offsets = [m.positions_body[c] for m, c in zip(species, chosen, strict=True)]
+    return sites_of(model.species, offsets, model.inverse_inertia)
 
 
 def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
@@ -74,14 +75,14 @@ def interactions(
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
     if scene.forces.lennard_jones and any(len(c) for c in chosen):
         law = _lennard_jones(scene, species, index, named, chosen)
-        sites = _taking_part(species, index, chosen)
+        sites = _taking_part(species, model, chosen)
         found.terms["lennard_jones"] = pair_forces(law, sites, groups(sites, frozen))
         if scene.forces.tail_correction:
             found = found._replace(tail=tail(law))
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
         return found
-    sites = _taking_part(species, index, chosen)
+    sites = _taking_part(species, model, chosen)
     charged = Charged(species, index, frozen, chosen, sites, groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(

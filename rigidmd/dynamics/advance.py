@@ -17,6 +17,10 @@ from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
 
 #: Random numbers that a flow may draw for one molecule in a step.
 DRAWS = 1 << 20
+#: Times of two kicks, 0 of one that there is not: kicks by the present load that are still to be done.
+NONE_WAITS = (0.0, 0.0)
+#: Molecules that are kicked, moved and turned before the next ones: so many that a core keeps them at hand.
+AT_HAND = 32 * TOGETHER
 
 
 class Model(NamedTuple):
@@ -36,9 +40,8 @@ def code_of(model: NamedTuple, bath: tuple) -> Code | None:
     if not isinstance(model, Model):
         return None
     state, load = EXAMPLE
-    kicked = (model.species, model.inverse_mass, model.inverse_inertia, state, load, 0.0)
-    drifting = (model.rotor, model.species, state, 0.0)
-    return Code(kick=(_kick, kicked), drift=(_drift, drifting), **bath_code(bath, model))
+    bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
+    return Code(move=(_move, (*bodies, state, load, NONE_WAITS, 0.0, False)), **bath_code(bath, model))
 
 
 class Row(NamedTuple):
@@ -77,8 +80,11 @@ def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, 
         (2); whether a move of the box is made and not yet judged
 
     Forces are evaluated before a kick where positions have changed since, so the last evaluation of a step serves the
-    next one. A status code: when it is not OK, state and cursor are such that calling again continues without a trace.
+    next one. Kicks of molecules wait for the drift that follows, which does them on its way: the last of a step and the
+    first of the next are done in one pass with the drift. A status code: when it is not OK, state and cursor are such
+    that calling again continues without a trace.
     """
+    waiting = NONE_WAITS
     while state.step[NOW] < until:
         while cursor[0] < len(row.kind):
             k = cursor[0]
@@ -93,43 +99,52 @@ def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, 
                         cursor[1] = 1
                 else:
                     while cursor[1] < (1 if row.gradient[k] == 0.0 else 2):
+                        waiting = catch_up(model, code, state, load, waiting)
                         status = evaluate(model, state, load, terms, probe, row.gradient[k] * dt * dt, cursor[1] == 1)
                         if status != OK:
                             return status
                         cursor[1] += 1
                 pay(model, terms, state, 0.5 * h)
-                kick(model, code, state, load, h)
+                waiting = kick(model, code, state, load, waiting, h)
                 pay(model, terms, state, 0.5 * h)
             elif row.kind[k] == DRIFT:
-                drift(model, code, state, h)
+                drift(model, code, state, load, waiting, h)
+                waiting = NONE_WAITS
                 state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + row.moment[k]) * dt
                 cursor[1] = 0
-            elif (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] != 0:
-                pass
-            elif row.kind[k] == BATH:
-                apply(bath, model, code, state, heat, h, DRAWS * k)
-            elif row.kind[k] == BOX:
-                status = move_box(box, model, terms, state, load, room, cursor, h, DRAWS * k)
-                if status != OK:
-                    return status
-            elif row.kind[k] == STRETCH:
-                stretch(box, state, h)
-                cursor[1] = 0
-            else:
-                rest(model, state)
+            elif (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] == 0:
+                waiting = catch_up(model, code, state, load, waiting)
+                if row.kind[k] == BATH:
+                    apply(bath, model, code, state, heat, h, DRAWS * k)
+                elif row.kind[k] == BOX:
+                    status = move_box(box, model, terms, state, load, room, cursor, h, DRAWS * k)
+                    if status != OK:
+                        return status
+                elif row.kind[k] == STRETCH:
+                    stretch(box, state, h)
+                    cursor[1] = 0
+                else:
+                    rest(model, state)
             cursor[0] += 1
         cursor[0] = 0
         state.step[NOW] += 1
+    catch_up(model, code, state, load, waiting)
     return OK
 
 
-def kick(model, code, state, load, h):
-    """Exact flow of the potential, in place: V += h F/m, L += h n_body."""
+def kick(model, code, state, load, waiting, h):
+    """Exact flow of the potential, in place: V += h F/m, L += h n_body. Returns the kicks that wait: of molecules, with
+    those that have waited before, the kick itself; a body is kicked at once."""
     raise TypeError("compiled code only")
 
 
-def drift(model, code, state, h):
-    """Flow of the kinetic energy, in place: free flight and free rotation."""
+def drift(model, code, state, load, waiting, h):
+    """The kicks that wait, and the flow of the kinetic energy, in place: free flight and free rotation."""
+    raise TypeError("compiled code only")
+
+
+def catch_up(model, code, state, load, waiting):
+    """Do the kicks that wait, in place; returns that none waits."""
     raise TypeError("compiled code only")
 
 
@@ -170,26 +185,43 @@ def _rest_molecules(model, state):
 
 
 @implements(kick)
-def _kick_molecules(model, code, state, load, h):
+def _kick_molecules(model, code, state, load, waiting, h):
     if not is_a(model, Model):
         return None
 
-    def kick_molecules(model, code, state, load, h):
-        parcel = packed((model.species, model.inverse_mass, model.inverse_inertia, state, load, h))
-        call_blocks(code, "kick", parcel, blocks_of(len(state.position)))
+    def kick_molecules(model, code, state, load, waiting, h):
+        if waiting[0] == 0.0:
+            return h, 0.0
+        if waiting[1] == 0.0:
+            return waiting[0], h
+        catch_up(model, code, state, load, waiting)
+        return h, 0.0
 
     return kick_molecules
 
 
 @implements(drift)
-def _drift_molecules(model, code, state, h):
+def _drift_molecules(model, code, state, load, waiting, h):
     if not is_a(model, Model):
         return None
 
-    def drift_molecules(model, code, state, h):
-        call_blocks(code, "drift", packed((model.rotor, model.species, state, h)), blocks_of(len(state.position)))
+    def drift_molecules(model, code, state, load, waiting, h):
+        _move_all(model, code, state, load, waiting, h, True)
 
     return drift_molecules
+
+
+@implements(catch_up)
+def _catch_up(model, code, state, load, waiting):
+    if not is_a(model, Model):
+        return lambda model, code, state, load, waiting: waiting
+
+    def catch_up_molecules(model, code, state, load, waiting):
+        if waiting[0] != 0.0:
+            _move_all(model, code, state, load, waiting, 0.0, False)
+        return NONE_WAITS
+
+    return catch_up_molecules
 
 
 @implements(displace)
@@ -237,6 +269,12 @@ def _pay_for_molecules(model, terms, state, h):
     return pay_for_molecules
 
 
+@kernel
+def _move_all(model, code, state, load, waiting, h, drifts):
+    bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
+    call_blocks(code, "move", packed((*bodies, state, load, waiting, h, drifts)), blocks_of(len(state.position)))
+
+
 @kernel(inline=True)
 def _share(state, block):
     """The first molecule of a block, and the first that is no more in it: as many as turn together, again and again."""
@@ -246,17 +284,17 @@ def _share(state, block):
 
 
 @task()
-def _kick(parcel, block):
-    species, inverse_mass, inverse_inertia, state, load, h = opened(parcel)
+def _move(parcel, block):
+    """The kicks that wait; and then, if there is a drift, free flight and free rotation."""
+    rotor, species, inverse_mass, inverse_inertia, state, load, waiting, h, drifts = opened(parcel)
     first, end = _share(state, block)
-    kick_group(species, inverse_mass, inverse_inertia, state, load, first, end, h)
-
-
-@task()
-def _drift(parcel, block):
-    rotor, species, state, h = opened(parcel)
-    first, end = _share(state, block)
-    for m in range(first, end):
-        for k in range(3):
-            state.position[m, k] += h * state.velocity[m, k]
-    turn_group(rotor, species, state.rotation, state.angular_momentum_body, first, end, h)
+    for start in range(first, end, AT_HAND):
+        stop = min(end, start + AT_HAND)
+        for kick in waiting:
+            if kick != 0.0:
+                kick_group(species, inverse_mass, inverse_inertia, state, load, start, stop, kick)
+        if drifts:
+            for m in range(start, stop):
+                for k in range(3):
+                    state.position[m, k] += h * state.velocity[m, k]
+            turn_group(rotor, species, state.rotation, state.angular_momentum_body, start, stop, h)

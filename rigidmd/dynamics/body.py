@@ -23,19 +23,23 @@ class Body(NamedTuple):
 
 
 @implements(kick, inline=True)
-def _kick_body(model, code, state, load, h):
-    if is_a(model, Body):
-        return lambda model, code, state, load, h: push(
-            model.resistance, model.flight, model.rotor, model.frame, state, load, h
-        )
-
-
-@implements(drift, inline=True)
-def _drift_body(model, code, state, h):
+def _kick_body(model, code, state, load, waiting, h):
     if not is_a(model, Body):
         return None
 
-    def drift_body(model, code, state, h):
+    def kick_body(model, code, state, load, waiting, h):
+        push(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
+        return waiting
+
+    return kick_body
+
+
+@implements(drift, inline=True)
+def _drift_body(model, code, state, load, waiting, h):
+    if not is_a(model, Body):
+        return None
+
+    def drift_body(model, code, state, load, waiting, h):
         time = state.time[NOW]
         carry(model.flight, model.rotor, state, time, h)
         follow(model.frame, state, time, h)

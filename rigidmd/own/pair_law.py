@@ -83,7 +83,8 @@ class PairLaw:
         if not any(len(own) for own in chosen):
             raise LawError("no site of the scene takes part in it")
         index = system.model.species
-        sites = sites_of(index, [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)])
+        offsets = [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)]
+        sites = sites_of(index, offsets, system.model.inverse_inertia)
         numbers_of = [[kinds.number[entry] for entry in of if entry is not None] for of in kinds.of_species]
         kind = of_each([np.array(own, int) for own in numbers_of], index)
         shape = shape_of(name, cutoff, start)

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
 from rigidmd.compile.lanes import bits, item, lane_count, largest, load, root, store, width_of, zeros
-from rigidmd.forces.pairs.sites import first_of_slot, place
+from rigidmd.forces.pairs.sites import first_of_slot, place, place_ahead
 
 SERIAL_SITES = 128  # up to this number there is one block
 
@@ -26,10 +26,10 @@ class Clusters(NamedTuple):
     group: np.ndarray  # (slots,) int32 group of the site in each slot
     boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is moved back into the brick
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
-    local: np.ndarray  # (3 slots,) positions relative to the origins, Å
-    half_square: np.ndarray  # (3 slots,) half the squared distances from the origins when sorted, Å²; later scratch
-    reference: np.ndarray  # (3 slots,) `local` when last sorted
-    moved: np.ndarray  # (slots,) displacement of each site since then, Å
+    local: np.ndarray  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
+    half_square: np.ndarray  # (3 slots,) half the squares of `reference` as vectors, Å²; later scratch
+    reference: np.ndarray  # (3 slots,) the places for which the sites were sorted, as `local`
+    moved: np.ndarray  # (slots,) distance of each site from there, Å
     farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
     extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
 
@@ -66,48 +66,50 @@ def _share(sites, blocks, block):
 
 
 @kernel(counted=False)
-def wrap_block(clusters, cell, sites, state, farthest, block):
-    """Number of edges that move the sites of a share of the molecules into the brick, and their extent there.
+def wrap_block(clusters, cell, sites, state, lead, farthest, block):
+    """Places in the brick of the sites of a share of the molecules, for `bin_block` into `local`, and their extent.
 
     The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
-    extent is NaN if a coordinate is farther from the origin than `farthest`, or is not finite.
+    places are those ahead by a time `lead`, see `place_ahead`. The extent is NaN if a coordinate is farther from the
+    origin than `farthest`, or is not finite.
     """
-    extent = clusters.extent[block]
+    extent, local = clusters.extent[block], clusters.local
     for k in range(3):
         extent[k], extent[3 + k] = inf, -inf
     first, end = _share(sites, len(clusters.extent), block)
     for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
-            at = place(sites, state, m, i)
-            if not max(abs(at[0]), abs(at[1]), abs(at[2])) < farthest:
+            at = _ahead(sites, state, m, i, lead)
+            if not abs(at[0]) + abs(at[1]) + abs(at[2]) < farthest:
                 extent[0] = nan
                 return
             _count_boxes(clusters.boxes, cell, i, at)
             at = _in_brick(clusters.boxes, cell, i, at)
             for k in range(3):
-                extent[k] = min(extent[k], at[k])
-                extent[3 + k] = max(extent[3 + k], at[k])
+                local[3 * i + k] = at[k]
+                extent[k] = min(extent[k], local[3 * i + k])
+                extent[3 + k] = max(extent[3 + k], local[3 * i + k])
 
 
 @kernel(counted=False)
-def bin_block(clusters, cell, sites, state, block):
+def bin_block(clusters, sites, block):
     """Bins of the sites of a share of the molecules, and heights within bins, into `slot` and `moved`.
 
     Bins form columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that
     begins in one column and ends in the next is compact too.
     """
     low, extent, (nx, ny, nz) = _bins(clusters)
+    local = clusters.local
     first, end = _share(sites, len(clusters.extent), block)
-    for m in range(first, end):
-        for i in range(sites.first[m], sites.first[m + 1]):
-            at = _in_brick(clusters.boxes, cell, i, place(sites, state, m, i))
-            x = _bin(at[0] - low[0], extent[0], nx)
-            y = _bin(at[1] - low[1], extent[1], ny)
-            z = _bin(at[2] - low[2], extent[2], nz)
-            column = x * ny + (y if x % 2 == 0 else ny - 1 - y)
-            up = column % 2 == 0
-            clusters.moved[i] = at[2] if up else -at[2]
-            clusters.slot[i] = column * nz + (z if up else nz - 1 - z)
+    for i in range(sites.first[first], sites.first[end]):
+        height = local[3 * i + 2]
+        x = _bin(local[3 * i] - low[0], extent[0], nx)
+        y = _bin(local[3 * i + 1] - low[1], extent[1], ny)
+        z = _bin(height - low[2], extent[2], nz)
+        column = x * ny + (y if x % 2 == 0 else ny - 1 - y)
+        up = column % 2 == 0
+        clusters.moved[i] = height if up else -height
+        clusters.slot[i] = column * nz + (z if up else nz - 1 - z)
 
 
 @kernel
@@ -195,36 +197,44 @@ def _bin(x, extent, count):
 
 
 @kernel(counted=False)
-def settle_block(clusters, cell, sites, state, group, block):
-    """Origins and positions of newly sorted clusters; the origin is the middle of the bounding box."""
+def settle_block(clusters, cell, sites, state, lead, group, block):
+    """Origins and references of newly sorted clusters; the origin is the middle of the bounding box."""
     width = width_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
-    clusters.farthest[block] = 0.0
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        low, high = (inf, inf, inf), (-inf, -inf, -inf)
+        first = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
+        low, high = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)  # relative to the first site, so that float32 is accurate
         for slot in range(width * c, width * (c + 1)):
-            i = order[slot]
-            x, y, z = _in_brick(clusters.boxes, cell, i, place(sites, state, sites.molecule[i], i))
+            at = _ahead_in_brick(clusters, cell, sites, state, order[slot], lead)
+            x, y, z = at[0] - first[0], at[1] - first[1], at[2] - first[2]
             low = (min(low[0], x), min(low[1], y), min(low[2], z))
             high = (max(high[0], x), max(high[1], y), max(high[2], z))
-            at = slot + 2 * width * c
-            reference[at], reference[at + width], reference[at + 2 * width] = x, y, z
-        for k in range(3):
-            origin[4 * c + k] = 0.5 * (low[k] + high[k])
+            n = slot + 2 * width * c
+            reference[n], reference[n + width], reference[n + 2 * width] = x, y, z
         _pair_up(order, reference, width, width * c, min(width * (c + 1), len(clusters.slot)))
+        for k in range(3):
+            origin[4 * c + k] = first[k] + 0.5 * (low[k] + high[k])
         for slot in range(width * c, width * (c + 1)):
             i = order[slot]
             if slot < len(clusters.slot):
                 clusters.slot[i] = slot
             clusters.group[slot] = group[i]
-            clusters.moved[slot] = 0.0
             clusters.half_square[slot] = 0.0
-            at = _in_brick(clusters.boxes, cell, i, place(sites, state, sites.molecule[i], i))
             for k in range(3):
                 n = slot + 2 * width * c + k * width
-                clusters.local[n] = at[k] - origin[4 * c + k]
-                reference[n] = clusters.local[n]
-                clusters.half_square[slot] += 0.5 * clusters.local[n] ** 2
+                reference[n] -= 0.5 * (low[k] + high[k])
+                clusters.half_square[slot] += 0.5 * reference[n] ** 2
+
+
+@kernel(inline=True)
+def _ahead_in_brick(clusters, cell, sites, state, i, lead):
+    """The place of site i for which sites are sorted, in the brick, Å."""
+    return _in_brick(clusters.boxes, cell, i, _ahead(sites, state, sites.molecule[i], i, lead))
+
+
+@kernel(inline=True)
+def _ahead(sites, state, m, i, lead):
+    return place_ahead(sites, state, m, i, lead) if lead != 0.0 else place(sites, state, m, i)
 
 
 @kernel(inline=True)
@@ -249,20 +259,20 @@ def _pair_up(order, at, width, first, end):
 
 @kernel(counted=False)
 def settle_again(clusters):
-    """Positions and distances as `settle_block` left them, from order, origin and reference."""
+    """Distances as `settle_block` left them, from order, origin and reference."""
     width = width_of(clusters.local)
     for slot in range(len(clusters.order)):
-        clusters.moved[slot] = 0.0
         clusters.half_square[slot] = 0.0
         for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
-            clusters.local[n] = clusters.reference[n]
-            clusters.half_square[slot] += 0.5 * clusters.local[n] ** 2
-    clusters.farthest[:] = 0.0
+            clusters.half_square[slot] += 0.5 * clusters.reference[n] ** 2
 
 
 @kernel(counted=False)
 def place_block(clusters, cell, sites, state, block):
-    """Set `local` of the sites of a share of the molecules to the present positions of the molecules."""
+    """Set `local` of the sites of a share of the molecules to the present positions of the molecules.
+
+    The slots without a site stay at their references.
+    """
     width = width_of(clusters.local)
     local, origin = clusters.local, clusters.origin
     first, end = _share(sites, len(clusters.extent), block)
@@ -274,6 +284,11 @@ def place_block(clusters, cell, sites, state, block):
             local[np.uint64(at)] = x - item(origin, c)
             local[np.uint64(at + width)] = y - item(origin, c + 1)
             local[np.uint64(at + 2 * width)] = z - item(origin, c + 2)
+    if block == len(clusters.extent) - 1:
+        for slot in range(len(clusters.slot), len(clusters.order)):
+            at = first_of_slot(slot, width)
+            for n in range(at, at + 3 * width, width):
+                local[n] = clusters.reference[n]
 
 
 @kernel(inline=True, counted=False)

@@ -3,11 +3,12 @@
 A row is two sites near one another, so whatever is loaded of a cluster serves both. The rows of a cluster meet much the
 same clusters: these are listed once, with the vectors between, and an entry of a row is a place in that list.
 
-A list is valid until some site has moved more than half the skin since it was built, by translation or rotation of its
-body. The engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. A box that
-has changed since then has moved the images: that is taken from the skin. The clusters of each row are sorted into
-shells by distance. The displacements since the build tell how many shells can matter, so the loop works through a new
-list as if it had no skin.
+A list is built for places of the sites, and is valid while no site is farther from its own than half the skin. The
+engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. The places are some
+steps ahead: the sites come nearer to them before they go away, and the list serves the longer. A box that has changed
+since the build has moved the images: that is taken from the skin. The clusters of each row are sorted into shells by
+distance. How far the sites are from their places tells how many shells can matter, so the loop works through a list
+whose sites are there as if it had no skin.
 
 Each pair of clusters is stored once, in a row of the cluster behind, with the clusters taken as a ring. The list is
 divided into blocks of rows, and any thread may fill any block: the list, and every sum over it, has the same bits for
@@ -16,7 +17,7 @@ any number of threads.
 This file has the list itself and how it is read; `update` says when it is rebuilt, `rows` fills it.
 """
 
-from math import ceil, inf, pi
+from math import ceil, inf, nan, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,7 @@ ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 # Columns of PairList.needed and PairList.counters.
 ENTRIES, MASKED, MET, WINDOW, MET_BY_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
+BUILT, AHEAD = 0, 1  # of PairList.times
 
 
 class PairList(NamedTuple):
@@ -73,6 +75,7 @@ class PairList(NamedTuple):
     apart: np.ndarray  # (blocks, 3 capacity) from the origins of what is met to that of c, Å; (blocks, 0) in float64
     needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters from the first, met by one
     counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
+    times: np.ndarray  # (2,) when the list was built, NaN before; how far ahead the places are for which it was; ps
 
 
 @kernel(inline=True)
@@ -126,6 +129,7 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         apart=_room_for_apart(blocks, met, dtype),
         needed=needed,
         counters=np.zeros(4, np.int64),
+        times=np.array([nan, 0.0]),
     )
 
 
@@ -173,7 +177,8 @@ def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
     """What `recalled` needs to have this list again, bit for bit, where sites have moved since it was built."""
     found = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
-        found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED} | {"built": pairs.built}
+        found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED}
+        found |= {"built": pairs.built, "times": pairs.times}
     return found
 
 
@@ -199,6 +204,8 @@ def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
         clusters.group[: len(clusters.order)] = pairs.group[clusters.order]
     if "built" in memory:  # the update of the list then follows the cell of the state
         pairs.cell[:] = memory["built"]
+    if "times" in memory:
+        pairs.times[:] = memory["times"]
     return pairs
 
 
@@ -244,7 +251,7 @@ def most_needed(pairs, k):
 
 @kernel(inline=True)
 def farthest(pairs):
-    """The largest displacement of any site's image since the list was built, Å; infinite if it is no longer valid."""
+    """The largest distance of any site's image from its place in the list, Å; infinite if the list is not valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
         found = max(found, pairs.clusters.farthest[block])

@@ -294,21 +294,21 @@ def _measure(pairs, c, kind, candidate, at):
     lanes.
     """
     clusters = pairs.clusters
-    local = clusters.local
-    width = width_of(local)
+    places = clusters.reference
+    width = width_of(places)
     other, image = cluster_of(candidate), number_of(candidate)
     begin = 3 * width * c
-    x = load(local, begin) + _apart(pairs, c, other, image, 0)
-    y = load(local, begin + width) + _apart(pairs, c, other, image, 1)
-    z = load(local, begin + 2 * width) + _apart(pairs, c, other, image, 2)
+    x = load(places, begin) + _apart(pairs, c, other, image, 0)
+    y = load(places, begin + width) + _apart(pairs, c, other, image, 1)
+    z = load(places, begin + 2 * width) + _apart(pairs, c, other, image, 2)
     # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|²,
     # is subtracted. Of two sums none waits for the other.
-    one, two = fill(inf, local), fill(inf, local)
+    one, two = fill(inf, places), fill(inf, places)
     for lane in range(0, width, 2):
         one = smaller(one, _rest(clusters, other, lane, x, y, z))
         two = smaller(two, _rest(clusters, other, lane + 1, x, y, z))
     nearest2 = 2.0 * smaller(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
-    kinds = fill(0.0, local)
+    kinds = fill(0.0, places)
     if pairs.cutoff < inf:
         distance = root(larger(smaller_of_two(nearest2), 0.0))
         scale = pairs.shells_per_A
@@ -321,11 +321,11 @@ def _measure(pairs, c, kind, candidate, at):
 @kernel(inline=True)
 def _rest(clusters, other, lane, x, y, z):
     """|y|²/2 - x y for one site y of another cluster."""
-    local = clusters.local
-    width = width_of(local)
+    places = clusters.reference
+    width = width_of(places)
     at = 3 * width * other + lane
-    rest = spread(clusters.half_square, width * other + lane) - z * spread(local, at + 2 * width)
-    return rest - y * spread(local, at + width) - x * spread(local, at)
+    rest = spread(clusters.half_square, width * other + lane) - z * spread(places, at + 2 * width)
+    return rest - y * spread(places, at + width) - x * spread(places, at)
 
 
 @kernel(inline=True)
@@ -352,16 +352,16 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     if i >= len(pairs.group):
         return 0
     clusters = pairs.clusters
-    local = clusters.local
-    width = width_of(local)
+    places = clusters.reference
+    width = width_of(places)
     everyone = (1 << width) - 1
     c, other, image = i // width, cluster_of(candidate), number_of(candidate)
     at = 2 * width * c + i
     start = 3 * width * other
-    dx = local[at] + _apart(pairs, c, other, image, 0) - load(local, start)
-    dy = local[at + width] + _apart(pairs, c, other, image, 1) - load(local, start + width)
-    dz = local[at + 2 * width] + _apart(pairs, c, other, image, 2) - load(local, start + 2 * width)
-    left_out = bits(load_beside(clusters.group, width * other, local) == clusters.group[i])
+    dx = places[at] + _apart(pairs, c, other, image, 0) - load(places, start)
+    dy = places[at + width] + _apart(pairs, c, other, image, 1) - load(places, start + width)
+    dz = places[at + 2 * width] + _apart(pairs, c, other, image, 2) - load(places, start + 2 * width)
+    left_out = bits(load_beside(clusters.group, width * other, places) == clusters.group[i])
     if other == c:
         left_out |= (2 << (i - width * c)) - 1  # each pair once
     if other == len(clusters.origin) // 4 - 1:

@@ -36,6 +36,7 @@ class BodySites(NamedTuple):
     molecule: np.ndarray  # (s,) int32 molecule of each site
     kind: np.ndarray  # (n,) int32 molecule m has offsets offset_body[kind[m]], offset_body[kind[m] + 1], ...
     offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
+    inverse_inertia: np.ndarray  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 where the moment is 0
 
     def offsets(self) -> np.ndarray:
         """Offsets (s, 3) of all sites, body frame, Å."""
@@ -53,8 +54,11 @@ class CentralSites(NamedTuple):
         return np.zeros((len(self.molecule), 3))
 
 
-def sites_of(species: np.ndarray, offsets: list[np.ndarray]) -> BodySites | CentralSites:
-    """The sites of molecules whose species (n,) are given, with offsets[k] (own, 3) in species k, body frame, Å."""
+def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np.ndarray) -> BodySites | CentralSites:
+    """The sites of molecules whose species (n,) are given, with offsets[k] (own, 3) in species k, body frame, Å.
+
+    inverse_inertia : (species, 3) as in `Model`
+    """
     counts = np.array([len(own) for own in offsets])
     first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
     molecule = np.repeat(np.arange(len(species), dtype=np.int32), counts[species])
@@ -62,7 +66,7 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray]) -> BodySites | Cent
     if not offset.any():
         return CentralSites(first, molecule)
     kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
-    return BodySites(first, molecule, kind, np.ascontiguousarray(offset))
+    return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
 
 
 def groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
@@ -128,6 +132,45 @@ def _place(sites, state, m, i):
         return centre[0] + x, centre[1] + y, centre[2] + z
 
     return place
+
+
+def place_ahead(sites, state, m, i, lead):
+    """Where site i of molecule m will be after a time `lead` if nothing acts and it keeps its angular velocity, Å."""
+    raise TypeError("compiled code only")
+
+
+@implements(place_ahead, inline=True)
+def _place_ahead(sites, state, m, i, lead):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, m, i, lead: (
+            state.position[m, 0] + lead * state.velocity[m, 0],
+            state.position[m, 1] + lead * state.velocity[m, 1],
+            state.position[m, 2] + lead * state.velocity[m, 2],
+        )
+
+    def place_ahead(sites, state, m, i, lead):
+        q, centre, velocity, momentum = (
+            state.rotation[m], state.position[m], state.velocity[m], state.angular_momentum_body[m]
+        )  # fmt: skip
+        row = sites.kind[m] - sites.first[m] + i
+        offset, inverse = sites.offset_body[row], sites.inverse_inertia[row]
+        # Cayley's rotation: by 2 atan(|a|) about a = lead omega / 2; distances within a molecule stay what they are
+        a, b, c = (
+            0.5 * lead * inverse[0] * momentum[0],
+            0.5 * lead * inverse[1] * momentum[1],
+            0.5 * lead * inverse[2] * momentum[2],
+        )
+        x, y, z = offset[0], offset[1], offset[2]
+        share = 2 / (1 + a * a + b * b + c * c)
+        u, v, w = share * (b * z - c * y), share * (c * x - a * z), share * (a * y - b * x)
+        x, y, z = x + u + (b * w - c * v), y + v + (c * u - a * w), z + w + (a * v - b * u)
+        return (
+            centre[0] + lead * velocity[0] + q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
+            centre[1] + lead * velocity[1] + q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
+            centre[2] + lead * velocity[2] + q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
+        )
+
+    return place_ahead
 
 
 @kernel(inline=True)

@@ -34,7 +34,7 @@ def box_tree(count: int) -> BoxTree:
 
 @kernel(counted=False)
 def grow(tree, clusters):
-    """Fit the boxes to the present clusters."""
+    """Fit the boxes to newly sorted clusters."""
     arity = width_of(tree.low)
     width = width_of(clusters.local)
     tree.low[:] = inf
@@ -42,7 +42,7 @@ def grow(tree, clusters):
     for c in range(len(clusters.origin) // 4):
         for k in range(3):
             for at in range(3 * width * c + k * width, 3 * width * c + (k + 1) * width):
-                x = clusters.origin[4 * c + k] + clusters.local[at]
+                x = clusters.origin[4 * c + k] + clusters.reference[at]
                 tree.low[k, c] = min(tree.low[k, c], x)
                 tree.high[k, c] = max(tree.high[k, c], x)
     for upper in range(1, len(tree.level) - 1):
