@@ -465,6 +465,17 @@ def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
         assert 0.3 < rate * own.pairs.times[AHEAD] < 1.0
 
 
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+def test_a_list_with_almost_no_skin_is_built_at_every_step(precision):
+    """Its sites are where they are to rounding, which is more than the skin."""
+    forces = {"cutoff_A": 6.0, "skin_A": 1e-15}
+    system, engine, state = built({"spce": 60, "nitrogen": 10}, 20.0, 3, forces=forces, precision=precision)
+    move(engine, state, SCHEMES["velocity_verlet"], 0.0005, 4)
+    expected, digits = system.engine().evaluate(state)[0], {"double": 1e-10, "mixed": 1e-5}[precision]
+    assert engine.evaluate(state)[0].force == pytest.approx(expected.force, abs=digits * np.abs(expected.force).max())
+    assert [own.pairs.counters[BUILDS] for own in engine.workspaces.values()] == [5, 5]
+
+
 def test_the_pressure_of_an_ideal_gas():
     """Molecules beyond each other's reach: P V = 2/3 of the energy of translation, whatever rotates."""
     system, engine, state = built({"nitrogen": 12}, 200.0, forces={"cutoff_A": 8.0, "truncation": "shift"})

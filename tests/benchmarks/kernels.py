@@ -134,19 +134,21 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
     forces = milliseconds(run_blocks, code, "forces", content, blocks)
     gather = milliseconds(run_blocks, code, "gather", content, blocks)
     follow = milliseconds(run_blocks, lists, "follow", pairs, blocks)
-    sites = milliseconds(run_blocks, lists, "place", placed, blocks)
-    sites += milliseconds(run_blocks, code, "load", on_sites, blocks_of(len(state.position)))
+    place = milliseconds(run_blocks, lists, "place", placed, blocks)
+    loads = milliseconds(run_blocks, code, "load", on_sites, blocks_of(len(state.position)))
     build = (  # in their order: each needs what the one before it leaves
         milliseconds(run_blocks, lists, "wrap", placed, blocks)
         + milliseconds(run_blocks, lists, "bin", placed, blocks)
         + milliseconds(run_once, lists, "prepare", pairs)
         + milliseconds(run_blocks, lists, "settle", placed, blocks)
+        + place
+        + follow
         + milliseconds(run_once, lists, "grow", pairs)
         + milliseconds(run_blocks, lists, "fill", pairs, blocks)
     )
     return {
         "every": every, "per_pair": 1e6 * forces / useful, "per_lane": 1e6 * forces / lanes, "useful": useful / lanes,
-        "parts": {"pairs": forces, "gather": gather, "follow": follow, "sites": sites, "list": build / every},
+        "parts": {"pairs": forces, "gather": gather, "follow": follow, "sites": place + loads, "list": build / every},
     }  # fmt: skip
 
 

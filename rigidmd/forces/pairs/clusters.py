@@ -291,6 +291,13 @@ def place_block(clusters, cell, sites, state, block):
                 local[n] = clusters.reference[n]
 
 
+@kernel(counted=False)
+def hold(clusters):
+    """Let the present positions be the references. A skin may be smaller than the rounding between the two."""
+    for n in range(len(clusters.local)):
+        clusters.reference[n] = clusters.local[n]
+
+
 @kernel(inline=True, counted=False)
 def follow_block(clusters, limit, block):
     """Displacements of the sites of a block: `moved`, and `farthest`, infinite if one exceeds the limit."""

@@ -7,6 +7,7 @@ from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW
 from rigidmd.forces.pairs.clusters import (
     bin_block,
     follow_block,
+    hold,
     place_block,
     settle_again,
     settle_block,
@@ -92,6 +93,8 @@ def update_list(pairs, code, sites, state):
         if pairs.counters[STATUS] == OK:
             call_blocks(code, "settle", placed, blocks)
             call_blocks(code, "place", placed, blocks)
+            if ahead == 0.0:
+                hold(pairs.clusters)
             call_blocks(code, "follow", parcel, blocks)
             if farthest(pairs) < inf:
                 break
