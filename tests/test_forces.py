@@ -15,6 +15,7 @@ from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import AHEAD, BUILDS, BUILT, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
+from rigidmd.forces.pairs.sites import place_ahead
 from rigidmd.forces.pairs.space import cell_of
 from rigidmd.forces.pairs.tree import ahead
 from rigidmd.forces.terms import Loading
@@ -443,6 +444,36 @@ def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
     assert all(own.pairs.times[AHEAD] == 0.0 for own in other.workspaces.values())
     builds = [sum(own.pairs.counters[BUILDS] for own in of.workspaces.values()) for of in (engine, other)]
     assert builds[0] < 0.95 * builds[1]
+
+
+@kernel(outer=True)
+def places_ahead(sites, state, lead, places):
+    for i in range(len(places)):
+        for k, x in enumerate(place_ahead(sites, state, sites.molecule[i], i, lead)):
+            places[i, k] = x
+
+
+def test_places_ahead_are_where_velocities_lead_and_molecules_stay_rigid():
+    """Over a short time to second order, and after a turn of more than a radian."""
+    system, _, state = built({"spce": 20, "nitrogen": 10}, 20.0, 3)
+    sites = system.terms["coulomb"].sites
+    h = 1e-4  # ps
+
+    def at(lead):
+        places = np.zeros((len(sites.molecule), 3))
+        places_ahead(sites, state, lead, places)
+        return places
+
+    velocity = (at(h) - at(-h)) / (2 * h)
+    charged = system.of_sites(lambda m: m.charges != 0)
+    assert velocity == pytest.approx(system.site_velocities(state)[charged], abs=1e-4 * np.abs(velocity).max())
+    before, after = at(0.0), at(0.2)
+    assert before == pytest.approx(system.site_positions(state)[charged], abs=1e-12)
+    rate = np.abs(state.angular_momentum_body * system.model.inverse_inertia[system.model.species]).max()
+    assert 0.2 * rate > 1.0
+    one, two = np.nonzero(np.triu(sites.molecule[:, None] == sites.molecule, 1))
+    spans = [np.linalg.norm(places[one] - places[two], axis=1) for places in (before, after)]
+    assert spans[1] == pytest.approx(spans[0], abs=1e-12)
 
 
 @pytest.mark.parametrize("change", ["lately", "long ago", "fast", "unknown"])

@@ -202,18 +202,18 @@ def settle_block(clusters, cell, sites, state, lead, group, block):
     width = width_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
-        first = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
+        base = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
         low, high = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)  # relative to the first site, so that float32 is accurate
         for slot in range(width * c, width * (c + 1)):
             at = _ahead_in_brick(clusters, cell, sites, state, order[slot], lead)
-            x, y, z = at[0] - first[0], at[1] - first[1], at[2] - first[2]
+            x, y, z = at[0] - base[0], at[1] - base[1], at[2] - base[2]
             low = (min(low[0], x), min(low[1], y), min(low[2], z))
             high = (max(high[0], x), max(high[1], y), max(high[2], z))
             n = slot + 2 * width * c
             reference[n], reference[n + width], reference[n + 2 * width] = x, y, z
         _pair_up(order, reference, width, width * c, min(width * (c + 1), len(clusters.slot)))
         for k in range(3):
-            origin[4 * c + k] = first[k] + 0.5 * (low[k] + high[k])
+            origin[4 * c + k] = base[k] + 0.5 * (low[k] + high[k])
         for slot in range(width * c, width * (c + 1)):
             i = order[slot]
             if slot < len(clusters.slot):
@@ -234,6 +234,7 @@ def _ahead_in_brick(clusters, cell, sites, state, i, lead):
 
 @kernel(inline=True)
 def _ahead(sites, state, m, i, lead):
+    """`place_ahead`, or the present place, for which no velocity has to be a number."""
     return place_ahead(sites, state, m, i, lead) if lead != 0.0 else place(sites, state, m, i)
 
 

@@ -85,6 +85,7 @@ def update_list(pairs, code, sites, state):
         return CELL_CHANGED
     now = state.time[NOW]
     lead = LEAD * (now - pairs.times[BUILT])
+    # the second time where some site is too far from its place ahead
     for ahead in (lead if abs(lead) < inf else 0.0), 0.0:
         pairs.times[AHEAD] = ahead
         call_blocks(code, "wrap", placed, blocks)
