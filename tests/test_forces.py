@@ -190,6 +190,47 @@ def test_virial_is_the_slope_of_the_energy_with_the_box(angles):
     assert virial.trace() == pytest.approx(-(energy(1 + h) - energy(1 - h)) / (2 * h), rel=1e-6)
 
 
+@pytest.mark.parametrize(("precision", "digits"), [("double", 1e-9), ("mixed", 2e-6)])
+@pytest.mark.parametrize("box", [
+    {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]},
+    {"lengths_A": 21.0},
+    {"lengths_A": 21.0, "periodic": False},
+], ids=["triclinic", "cubic", "none"])  # fmt: skip
+def test_virials_are_sums_over_pairs(box, precision, digits):
+    """For a list that has served for some steps, of sites far from the origin; by all pairs of images."""
+    forces = {"cutoff_A": 6.0, "truncation": "force_shift"}
+    system, engine, state = built({"nitrogen": 300}, None, 3, 0.1, box=box, forces=forces, precision=precision)
+    state.position[:] += [3e5, -2e5, 1e5]
+    move(engine, state, SCHEMES["velocity_verlet"], 0.0002, 20)
+    virial = engine.evaluate(state)[1]["lennard_jones"].virial
+    pairs = engine.workspaces["lennard_jones"].pairs
+    assert pairs.counters[BUILDS] == 1 and pairs.clusters.farthest.max() > 0.02
+    site, owner = system.site_positions(state), system.sites.molecule
+    centre = state.position[owner]
+    well, size = system.species[0].epsilon[0], system.species[0].sigma[0]
+    periodic = box.get("periodic", True)
+    images = np.array(list(np.ndindex(3, 3, 3))) - 1 if periodic else np.zeros((1, 3))
+    expected = np.zeros((3, 3))
+    for i in range(len(site)):
+        apart = site[i] - site[owner != owner[i]]
+        centres = centre[i] - centre[owner != owner[i]]
+        if periodic:
+            edges = np.round(apart @ np.linalg.inv(state.cell))
+            apart, centres = apart - edges @ state.cell, centres - edges @ state.cell
+        for image in images:
+            shift = image @ state.cell if periodic else 0.0
+            d, between = apart + shift, centres + shift
+            r = np.sqrt((d**2).sum(axis=1))
+            near = r < 6.0
+            force = _force(well, size, r[near]) - _force(well, size, 6.0)
+            expected += 0.5 * (d[near] * (force / r[near])[:, None]).T @ between[near]
+    assert virial == pytest.approx(expected, abs=digits * np.abs(expected).max())
+
+
+def _force(well, size, r):
+    return 24 * well / r * (2 * (size / r) ** 12 - (size / r) ** 6)
+
+
 def test_newton_and_no_net_torque_in_free_space():
     _, engine, state = built({"spce": 10, "nitrogen": 5, "argon": 5}, None, 3)
     load, _ = engine.evaluate(state)
@@ -362,10 +403,11 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
     engine.evaluate(state)
     own = engine.workspaces["lennard_jones"]
     sites = own.sites._replace(first=own.sites.first.astype(np.int64))
+    loading = Loading((own,), False, np.ones(1, np.int64))
     with pytest.raises(TypingError, match="find was compiled for parcel"):
-        Loading((own._replace(sites=sites),), called=False)
+        Loading((own._replace(sites=sites),), False, np.ones(1, np.int64))
     with pytest.raises(TypingError, match="tallied was compiled for parcel"):
-        Loading((own,), called=False).bind((own._replace(sites=sites),), state, no_load(state))
+        loading.bind((own._replace(sites=sites),), state, no_load(state))
 
 
 WAVY = {"name": "wavy", "energy": "A*exp(-B*r) - C/r**6 + 0.1*sin(r)*log(r)", "truncation": "force_switch",

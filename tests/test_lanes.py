@@ -26,7 +26,7 @@ W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}
 
 @kernel(inline=True)
 def cube(x):
-    one, two = lanes.inverse_cube(x)
+    _, one, two = lanes.root_and_cube(x)
     return one * two
 
 
@@ -113,6 +113,12 @@ def test_records_are_loaded_into_lanes_and_stored(dtype):
     assert np.array_equal(turned, np.concatenate([matrices[here], matrices[width:]]))
 
 
+@kernel(inline=True)
+def root(x):
+    found, _, _ = lanes.root_and_cube(x)
+    return found
+
+
 @kernel(outer=True)
 def inverses(x, out):
     width = lanes.width_of(x)
@@ -121,16 +127,17 @@ def inverses(x, out):
         lanes.store(out[0], i, lanes.inverse(at))
         lanes.store(out[1], i, lanes.inverse_root(at))
         lanes.store(out[2], i, cube(at))
+        lanes.store(out[3], i, root(at))
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
 def test_inverses_are_accurate_to_the_last_digits(dtype):
     """Over all fractions that an estimate of the machine can have, and sizes as of squared distances."""
     x = np.concatenate([np.linspace(1, 4, 1 << 16), np.geomspace(1e-3, 1e6, 1 << 12)]).astype(dtype)
-    out = np.zeros((3, len(x)), dtype)
+    out = np.zeros((4, len(x)), dtype)
     inverses(x, out)
     exact = x.astype(np.longdouble)
-    for found, power in zip(out, (-1, -0.5, -1.5), strict=True):
+    for found, power in zip(out, (-1, -0.5, -1.5, -0.5), strict=True):
         assert np.abs(found * exact ** np.longdouble(-power) - 1).max() < 3 * np.finfo(dtype).eps
 
 

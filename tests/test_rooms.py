@@ -55,9 +55,9 @@ LIBRARIES = {
     "IPython": {"output/progress.py"},
     "chemiscope": {"looking/inline.py"},
     "numba": {
-        "compile/cache.py", "compile/code.py", "compile/crew.py", "compile/kernels.py", "compile/lane_types.py", "compile/records.py", "compile/lanes.py",
-        "compile/machine.py", "compile/lane_math.py", "compile/own.py",
-        "compile/numba_private.py", "forces/terms.py", "forces/pairs/sites.py",
+        "compile/cache.py", "compile/code.py", "compile/crew.py", "compile/kernels.py", "compile/lane_math.py",
+        "compile/lane_types.py", "compile/lanes.py", "compile/machine.py", "compile/numba_private.py",
+        "compile/own.py", "compile/records.py", "forces/pairs/loop.py", "forces/pairs/sites.py", "forces/terms.py",
     },
 }  # fmt: skip
 

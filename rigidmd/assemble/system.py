@@ -154,7 +154,8 @@ class System:
 
     def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> Engine:
         """A new engine for some terms of this system."""
-        return Engine(self.model, terms, precision, self.scene.forces.skin_A, self.told, self.scene.threads)
+        presses = any(stage.ensemble == "nph" for stage in self.scene.stages)
+        return Engine(self.model, terms, precision, self.scene.forces.skin_A, self.told, self.scene.threads, presses)
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values for all sites (s,), from `of`, which gives those of one molecule."""

@@ -317,16 +317,17 @@ def _inverse_root(x):
     return refined
 
 
-def inverse_cube(x):
-    """Two numbers whose product is 1/sqrt(x)³, accurate to about the last digit.
+def root_and_cube(x):
+    """1/sqrt(x), and two numbers whose product is 1/sqrt(x)³, each accurate to about the last digit.
 
-    The caller multiplies them, in one multiply-add with what is added to the cube.
+    The caller multiplies the two in one multiply-add with what is added to the cube. The root costs nothing where it is
+    not used.
     """
     raise TypeError("compiled code only")
 
 
-@implements(inverse_cube, inline=True)
-def _inverse_cube(x):
+@implements(root_and_cube, inline=True)
+def _root_and_cube(x):
     if isinstance(x, Lanes) and _terms(x):
         series = (1.0, *CUBE[: _terms(x)])
 
@@ -336,13 +337,14 @@ def _inverse_cube(x):
             y = _root_estimate(x)
             y2 = y * y
             e = 1.0 - x * y2
-            return y * y2, _nested(series, e)
+            one, two = y * y2, _nested(series, e)
+            return x * one * two, one, two
 
         return from_estimate
 
     def cubed(x):
         y = inverse_root(x)
-        return y, y * y
+        return y, y, y * y
 
     return cubed
 

@@ -21,7 +21,7 @@ from rigidmd.dynamics.gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
 from rigidmd.forces.pairs.space import volume_of
-from rigidmd.forces.terms import TALLIED, load_now
+from rigidmd.forces.terms import PRESSED, TALLIED, load_now
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -137,7 +137,8 @@ def box_room(state: State) -> BoxRoom:
 def load_for(box, terms, state, load, room, row, which):
     """Forces and torques at the present positions; a status code.
 
-    which : PLAIN, or TALLIED for energies and virials too, which a step in which the box moves always computes
+    which : PLAIN, or TALLIED for energies and virials too. A step in which the box moves always computes virials, and
+        energies too where the move depends on them
     """
     raise TypeError("compiled code only")
 
@@ -157,20 +158,25 @@ def _load_for(box, terms, state, load, room, row, which):
     if is_a(box, NoBox):
         return lambda box, terms, state, load, room, row, which: load_now(terms, state, load, which)
 
-    def with_energies(box, terms, state, load, room, row, which):
+    needed = PRESSED if is_a(box, Piston) else TALLIED
+
+    def with_virials(box, terms, state, load, room, row, which):
         room.known[0] = 0
         for k in range(len(row.kind)):
             if row.kind[k] == BOX and (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] == 0:
-                return tally_bodies(terms, state, load, room)
+                return tally_bodies(terms, state, load, room, which if which == TALLIED else needed)
         return load_now(terms, state, load, which)
 
-    return with_energies
+    return with_virials
 
 
 @kernel(inline=True)
-def tally_bodies(terms, state, load, room):
-    """Forces and torques, energies and virial at the present positions; a status code."""
-    status = load_now(terms, state, load, TALLIED)
+def tally_bodies(terms, state, load, room, which):
+    """Forces and torques and virial at the present positions, with TALLIED also energies; a status code.
+
+    which : TALLIED or PRESSED
+    """
+    status = load_now(terms, state, load, which)
     for k in range(TALLY_SIZE):
         room.tally[0, k] = 0.0
         for tally in terms.tallies:
@@ -203,7 +209,7 @@ def _kick_piston(box, model, terms, state, load, room, cursor, h, draw):
 
     def kick_piston(box, model, terms, state, load, room, cursor, h, draw):
         if cursor[1] != 1 or room.known[0] == 0:
-            status = tally_bodies(terms, state, load, room)
+            status = tally_bodies(terms, state, load, room, PRESSED)
             if status != OK:
                 return status
             cursor[1] = 1
@@ -229,7 +235,7 @@ def _move_box(box, model, terms, state, load, room, cursor, h, draw):
         if cursor[2] == 0:
             if cursor[1] != 1 or room.known[0] == 0:
                 cursor[1] = 0
-                status = tally_bodies(terms, state, load, room)
+                status = tally_bodies(terms, state, load, room, TALLIED)
                 if status != OK:
                     return status
                 cursor[1] = 1
@@ -237,7 +243,7 @@ def _move_box(box, model, terms, state, load, room, cursor, h, draw):
             keep(state, load, room)
             apply_strain(box, state, room)
             cursor[2] = 1
-        status = tally_bodies(terms, state, load, room)
+        status = tally_bodies(terms, state, load, room, TALLIED)
         if status != OK:
             return status
         cursor[2] = 0

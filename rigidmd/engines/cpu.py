@@ -73,6 +73,7 @@ class Engine:
     applied : the functions that terms of type `Told` (of a body) and `ToldForces` stand for: name -> function, as their
         workspaces call it
     threads : number of threads that compute, at most those of `NUMBA_NUM_THREADS`; None: all. Speed only
+    presses : whether a piston will move, which needs virials at every step and no energies. Speed only
     """
 
     def __init__(
@@ -83,11 +84,12 @@ class Engine:
         skin: float = 1.9,
         applied: dict[str, Callable] | None = None,
         threads: int | None = None,
+        presses: bool = False,
     ):
         self.model = model
         self.terms = terms
         self.names = list(terms)
-        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin)
+        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, np.ones(1, np.int64), presses)
         self._applied = applied or {}
         self.threads = threads
         self._workspaces: tuple[NamedTuple, ...] | None = None
@@ -166,7 +168,7 @@ class Engine:
     def _loading_for(self, use: str, workspaces: tuple[NamedTuple, ...]) -> Loading:
         """The terms behind a loader, one for steps and one for looks, each bound to a load of its own."""
         if use not in self._loadings:
-            self._loadings[use] = Loading(workspaces, isinstance(self.model, Model))
+            self._loadings[use] = Loading(workspaces, isinstance(self.model, Model), self._setup.with_energies)
         return self._loadings[use]
 
     def model_for(self, scheme: Scheme) -> Model | Body:
@@ -258,7 +260,7 @@ class Engine:
     def _codes_for(self, room: tuple[NamedTuple, ...]) -> None:
         """Make all machine code of molecules that does not depend on a thermostat or a barostat."""
         workspaces = tuple(with_code(workspace) for workspace in room)
-        Loading(workspaces, True)
+        Loading(workspaces, True, self._setup.with_energies)
         code_of(self.model, NoBath())
 
     def _answer(self, status: int, state: State) -> tuple[NamedTuple, ...]:

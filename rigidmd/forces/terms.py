@@ -33,6 +33,8 @@ class Setup(NamedTuple):
     cell: np.ndarray  # (3, 3) at the start; workspaces follow the cell of the state
     dtype: type  # of the arithmetic between sites: numpy.float64 or numpy.float32
     skin: float  # extra radius of neighbour lists, Å
+    with_energies: np.ndarray  # (1,) of the loader
+    presses: bool  # whether virials without energies will be asked for
 
 
 def workspace_of(term: NamedTuple, setup: Setup) -> NamedTuple:
@@ -114,8 +116,9 @@ def _add_no_force(term, state, load, tally):
         return lambda term, state, load, tally: OK
 
 
-#: What is asked of `load_now`: forces; forces with energies and virial; forces into the other load.
-PLAIN, TALLIED, OTHER = 0, 1, 2
+#: What is asked of `load_now`: forces; forces with energies and virials; forces into the other load; forces with
+#: virials, and with energies only where they cost nothing.
+PLAIN, TALLIED, OTHER, PRESSED = 0, 1, 2, 3
 
 
 class Loader(NamedTuple):
@@ -130,17 +133,19 @@ class Loader(NamedTuple):
     rate: np.ndarray | None  # (terms,) of `_add_rate`; None where no term drives
     content: np.ndarray  # (terms,)
     tallies: np.ndarray  # (terms, 10) energy and virial of each
+    with_energies: np.ndarray  # (1,) whether tallies have to have the energies
     known: np.ndarray  # (1,) whether `tallies` are those of the last forces
     status: np.ndarray  # (1,) the worst status code
     power: np.ndarray  # (1,) sum of the rates
 
 
-def loader_for(terms: int, drives: bool) -> Loader:
+def loader_for(terms: int, drives: bool, with_energies: np.ndarray) -> Loader:
     """An empty loader for so many terms."""
     plain, tallied, rate, content = np.zeros((4, terms), np.intp)
     known, status = np.zeros((2, 1), np.int64)
     tallies = np.zeros((terms, TALLY_SIZE))
-    return Loader(plain, tallied, rate if drives else None, content, tallies, known, status, np.zeros(1))
+    rates = rate if drives else None
+    return Loader(plain, tallied, rates, content, tallies, with_energies, known, status, np.zeros(1))
 
 
 def term_code(term: NamedTuple, loader: Loader, called: bool) -> Code:
@@ -180,11 +185,14 @@ def _lay_down(loader, k, code, term, state, load, other, room):
 
 
 class Loading:
-    """The terms of an engine behind their loader; keeps alive what it refers to."""
+    """The terms of an engine behind their loader; keeps alive what it refers to.
 
-    def __init__(self, workspaces: tuple[NamedTuple, ...], called: bool):
+    called : whether the loop over steps calls the terms by address. with_energies : that of the `Setup`
+    """
+
+    def __init__(self, workspaces: tuple[NamedTuple, ...], called: bool, with_energies: np.ndarray):
         drives = any(getattr(type(own), "drives", False) for own in workspaces)
-        self.loader = loader_for(len(workspaces), called and drives)
+        self.loader = loader_for(len(workspaces), called and drives, with_energies)
         self._codes = [term_code(own, self.loader, called) for own in workspaces]
         self._rooms = [np.zeros(64) for _ in workspaces]
         self._kept: tuple = ()
@@ -228,8 +236,8 @@ def is_driven(loader: types.Type) -> bool:
 def load_now(terms, state, load, which):
     """Write the forces and torques of all terms at the present positions; the worst status code.
 
-    terms : a tuple of terms, or a `Loader`. which : PLAIN, TALLIED or OTHER. A loader knows its loads, and `load` must
-    be the one asked for; energies and virials go into its tallies. Of a tuple there are only forces.
+    terms : a tuple of terms, or a `Loader`. which : PLAIN, TALLIED, OTHER or PRESSED. A loader knows its loads, and
+    `load` must be the one asked for; energies and virials go into its tallies. Of a tuple there are only forces.
     """
     raise TypeError("compiled code only")
 
@@ -244,10 +252,12 @@ def _load_now(terms, state, load, which):
         clear(load.torque_body)
         terms.status[0] = OK
         terms.known[0] = 0
-        if which == TALLIED:
+        tallied = which in (TALLIED, PRESSED)
+        if tallied:
             terms.tallies[:] = 0.0
+            terms.with_energies[0] = which == TALLIED
         for k in range(len(terms.content)):
-            address = terms.tallied[k] if which == TALLIED else terms.plain[k]
+            address = terms.tallied[k] if tallied else terms.plain[k]
             jump_to(address, terms.content[k], which)
             if terms.status[0] != OK:  # asked again, all terms begin again: no need to go on
                 return terms.status[0]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.lanes import inverse_cube, inverse_root, load, zeros
+from rigidmd.compile.lanes import inverse_root, load, root_and_cube, zeros
 from rigidmd.forces.laws.endings import SWITCHES, Name, Plain, Polynomial, Shape, ended, ending, shape_of
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.units import COULOMB_CHARGE
@@ -47,24 +47,28 @@ def reaction_field(
     return ReactionField(cutoff, shape, end, field, charge_e * COULOMB_CHARGE)
 
 
-def _cube(shape, inverse, r2):
-    """Two factors of 1/r³; without an ending from r² alone, so that forces need no 1/r."""
+def powers(shape, r2):
+    """1/r, and two factors of 1/r³; without an ending the force needs no 1/r."""
     raise TypeError("compiled code only")
 
 
-@implements(_cube, inline=True)
-def _cube_of(shape, inverse, r2):
+@implements(powers, inline=True)
+def _powers_of(shape, r2):
     if is_a(shape, Plain):
-        return lambda shape, inverse, r2: inverse_cube(r2)
-    return lambda shape, inverse, r2: (inverse, inverse * inverse)
+        return lambda shape, r2: root_and_cube(r2)
+
+    def of_inverse(shape, r2):
+        inverse = inverse_root(r2)
+        return inverse, inverse, inverse * inverse
+
+    return of_inverse
 
 
 @kernel(inline=True, outer=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
-    inverse = inverse_root(r2)
+    inverse, one, two = powers(law.shape, r2)
     u = inverse + law.field * r2 + law.end[0]
-    one, two = _cube(law.shape, inverse, r2)
     w = one * two - 2 * law.field
     return ended(law.shape, law.end, r2 * inverse, inverse, u, w)
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import erfc, ive
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.lanes import HAS_AVX512, inverse_cube, inverse_root, load, parted, picked, polynomial, zeros
+from rigidmd.compile.lanes import HAS_AVX512, inverse_root, load, parted, picked, polynomial, root_and_cube, zeros
 from rigidmd.forces.pairs import loop as pairs
 from rigidmd.units import COULOMB_CHARGE
 
@@ -239,7 +239,8 @@ def _pair(law, i, j, r2):
 
         def ewald_pair(law, i, j, r2):
             qq = law.charge[i] * load(law.charge, j)
-            u, w = screened(law.screening, inverse_root(r2), inverse_cube(r2), r2)
+            inverse, one, two = root_and_cube(r2)
+            u, w = screened(law.screening, inverse, (one, two), r2)
             return qq * (u - law.shift), qq * w
 
         return ewald_pair

@@ -9,6 +9,7 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 
 from rigidmd.compile import Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.compile.lanes import (
@@ -67,6 +68,7 @@ class Sums(NamedTuple):
 
     own: np.ndarray  # (3 slots,) force on each site from its own row, then from all rows; stored as Clusters.local
     others: np.ndarray  # (blocks, room) forces of a block's rows on the clusters from its first one on
+    before: np.ndarray  # (blocks, 3 lanes) force on a row when the image of its entries changed last, see `_cross`
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `room_for_virial`
 
@@ -87,10 +89,12 @@ class PairForces(NamedTuple):
         sums = Sums(
             own=pairs.clusters.half_square,  # no list is built while forces are summed
             others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
+            before=zeros((blocks, 3 * lane_count(setup.dtype)), setup.dtype),
             tallies=np.zeros((blocks, TALLY_SIZE)),
             virial=room_for_virial(),
         )
-        return PairWorkspace(law, law.room(slots, setup.dtype), sites, pairs, sums)
+        with_energies = setup.with_energies if setup.presses else None
+        return PairWorkspace(law, law.room(slots, setup.dtype), sites, pairs, sums, with_energies)
 
 
 class PairWorkspace(NamedTuple):
@@ -101,6 +105,7 @@ class PairWorkspace(NamedTuple):
     sites: BodySites | CentralSites
     pairs: PairList
     sums: Sums
+    with_energies: np.ndarray | None  # (1,) of the loader; None where virials are never asked for without them
     list_code: Code | None = None
     code: Code | None = None
 
@@ -119,6 +124,7 @@ class PairWorkspace(NamedTuple):
         state, load = EXAMPLE
         lists = list_code(self.pairs, self.sites)
         content = (self.arranged, self.pairs, self.sums)
+        pressed = {} if self.with_energies is None else {"forces_and_virial": (_forces_and_virial, content)}
         code = Code(
             find=(_find, (lists, self.law, self.arranged, self.sites, self.pairs, self.sums, state)),
             forces=(_forces, content),
@@ -127,6 +133,7 @@ class PairWorkspace(NamedTuple):
             gather_and_count=(_gather_and_count, content),
             load=(load_some, (self.sites, state, load, self.forces_in_slots)),
             count=(count_some, (self.sites, state, self.forces_in_slots, self.sums.virial)),
+            **pressed,
         )
         return self._replace(code=code, list_code=lists)
 
@@ -205,7 +212,7 @@ def _add_pair_forces(term, state, load, tally):
             call_blocks(code, "forces", parcel, blocks)
             call_blocks(code, "gather", parcel, blocks)
         else:
-            call_blocks(code, "forces_and_energies", parcel, blocks)
+            _call_tallied(term.with_energies, code, parcel, blocks)
             call_blocks(code, "gather_and_count", parcel, blocks)
         force = InSlots(sums.own, pairs.clusters.slot)
         call_blocks(code, "load", packed((term.sites, state, load, force)), blocks_of(len(state.position)))
@@ -217,6 +224,25 @@ def _add_pair_forces(term, state, load, tally):
         return OK
 
     return add_pair_forces
+
+
+def _call_tallied(with_energies, code, parcel, blocks):
+    """Call the task that also finds virials, and energies if they are wanted."""
+    raise TypeError("compiled code only")
+
+
+@implements(_call_tallied)
+def _call_with_energies(with_energies, code, parcel, blocks):
+    if with_energies is types.none:
+        return lambda with_energies, code, parcel, blocks: call_blocks(code, "forces_and_energies", parcel, blocks)
+
+    def call_tallied(with_energies, code, parcel, blocks):
+        if with_energies[0] != 0:
+            call_blocks(code, "forces_and_energies", parcel, blocks)
+        else:
+            call_blocks(code, "forces_and_virial", parcel, blocks)
+
+    return call_tallied
 
 
 @task()
@@ -254,13 +280,19 @@ def _refill(term):
 @task(counted=False)
 def _forces(parcel, block):
     law, pairs, sums = opened(parcel)
-    block_forces(law, pairs, sums.own, sums.others, None, block)
+    block_forces(law, pairs, sums, None, None, block)
 
 
 @task(counted=False)
 def _forces_and_energies(parcel, block):
     law, pairs, sums = opened(parcel)
-    block_forces(law, pairs, sums.own, sums.others, sums.tallies, block)
+    block_forces(law, pairs, sums, sums.tallies, sums.tallies, block)
+
+
+@task(counted=False)
+def _forces_and_virial(parcel, block):
+    law, pairs, sums = opened(parcel)
+    block_forces(law, pairs, sums, sums.tallies, None, block)
 
 
 @task(counted=False)
@@ -276,17 +308,19 @@ def _gather_and_count(parcel, block):
 
 
 @kernel(inline=True, counted=False)
-def block_forces(law, pairs, own, others, tallies, block):
+def block_forces(law, pairs, into, tallies, energies, block):
     """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`.
 
-    With tallies, energies and a part of the virial are summed. The distance of two sites is the vector between the
-    origins of their clusters and the difference of their places there. So the virial is the sum over entries of the
-    force on the row (x) that vector, which is summed here, and that over sites of f (x) place, see `gather_block`.
+    into : `Sums`. tallies : (blocks, 10) for a part of the virial, or None. energies : the same array, or None
+
+    The distance of two sites is the difference of their places in the box, less the shift of an image. So the virial is
+    the sum over sites of f (x) place, see `gather_block`, less that over entries of the force on the row (x) shift.
+    Entries of one image follow one another, so the latter is summed here for all of them at once.
     """
     align_stack()
     clusters = pairs.clusters
     width = width_of(clusters.local)
-    others = others[block]
+    others, before = into.others[block], into.before[block]
     others[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
     if tallies is not None:
         tallies[block] = 0.0
@@ -305,57 +339,81 @@ def block_forces(law, pairs, own, others, tallies, block):
                 (clusters.local[at + 1], clusters.local[at + width + 1], clusters.local[at + 2 * width + 1]),
             )
             still = (zero, zero, zero)
-            sums, virial = (still, still, zero), (zero, zero, zero, zero, zero, zero)
+            sums, number = (still, still, zero), 0
             for n in range(first_special, pairs.special[i // 2]):
-                other, between = _displacements(pairs, c, here, met, apart, masked[n, 0])
-                masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
-                sums, force = _meet(law, pairs, first, i, other, between, masks, others, sums, tallies)
+                image, between = _displacements(pairs, c, here, met, apart, masked[n, 0])
                 if tallies is not None:
-                    virial = _with_product(virial, force, origins_apart(pairs, c, met, apart, masked[n, 0]))
+                    number = _cross(pairs, number, number_of(image), sums, before, tallies[block])
+                masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
+                sums = _meet(law, pairs, first, i, image, between, masks, others, sums, energies)
             # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
             # processor's queues before those of the next entry could enter.
             last = end_of_row(pairs, i // 2, moved) - 1
-            other = np.int32(0)
+            image = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
             if first_entry <= last:
-                other, between = _displacements(pairs, c, here, met, apart, item(entries, first_entry))
+                image, between = _displacements(pairs, c, here, met, apart, item(entries, first_entry))
             for n in range(first_entry, last + 1):
                 ahead, after = _displacements(pairs, c, here, met, apart, item(entries, min(n + 1, last)))
-                sums, force = _meet(law, pairs, first, i, other, between, (None, None), others, sums, tallies)
                 if tallies is not None:
-                    virial = _with_product(virial, force, origins_apart(pairs, c, met, apart, item(entries, n)))
-                other, between = ahead, after
+                    number = _cross(pairs, number, number_of(image), sums, before, tallies[block])
+                sums = _meet(law, pairs, first, i, image, between, (None, None), others, sums, energies)
+                image, between = ahead, after
+            if tallies is not None:
+                _cross(pairs, number, 0, sums, before, tallies[block])
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
             on_one, on_two, energy = sums
-            store_totals(own, at, width, on_one, on_two)
-            if tallies is not None:
-                tallies[block, 0] += total(energy)
-                _count(tallies[block], virial)
+            store_totals(into.own, at, width, on_one, on_two)
+            if energies is not None:
+                energies[block, 0] += total(energy)
         first_met = pairs.near[c]
 
 
 @kernel(inline=True)
+def _cross(pairs, number, now, sums, before, tally):
+    """Go from entries of one image, if it is another one, to those of the next; returns its number.
+
+    The force on the row since the last change (x) the shift of the image is subtracted from the tally; `before` has the
+    force on the row at that change.
+    """
+    if now != number:
+        width = width_of(before)
+        on_one, on_two, _ = sums
+        x, y, z = on_one[0] + on_two[0], on_one[1] + on_two[1], on_one[2] + on_two[2]
+        if number != 0:
+            at = 4 * number
+            a, b, c = pairs.shift[at], pairs.shift[at + 1], pairs.shift[at + 2]
+            fx, fy = total(x - load(before, 0)), total(y - load(before, width))
+            fz = total(z - load(before, 2 * width))
+            _count(tally, (-fx * a, -fx * b, -fx * c, -fy * b, -fy * c, -fz * c))
+        store(before, 0, x)
+        store(before, width, y)
+        store(before, 2 * width, z)
+    return now
+
+
+@kernel(inline=True)
 def _count(tally, virial):
-    """Add the six numbers of a symmetric virial, sums over lanes, to the nine of a tally."""
+    """Add the six numbers of a symmetric virial to the nine of a tally."""
     for k, of in enumerate((0, 1, 2, 1, 3, 4, 2, 4, 5)):
-        tally[1 + k] += total(virial[of])
+        tally[1 + k] += virial[of]
 
 
 @kernel(inline=True)
 def _displacements(pairs, c, here, met, apart, number):
-    """The cluster met by an entry, and displacements from its sites, as vectors, to each of two sites of c.
+    """The image met by an entry, and displacements from its sites, as vectors, to each of two sites of c.
 
     These are as of `_separation`.
     """
     local = pairs.clusters.local
     width = width_of(local)
-    other = cluster_of(item(met, number))
-    at = 3 * width * other
+    image = item(met, number)
+    at = 3 * width * cluster_of(image)
     dx, dy, dz = origins_apart(pairs, c, met, apart, number)
     x = load(local, at) - dx
     y = load(local, at + width) - dy
     z = load(local, at + 2 * width) - dz
-    return other, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
+    return image, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
 
 
 def origins_apart(pairs, c, met, apart, number):
@@ -393,12 +451,12 @@ def _separation(here, x, y, z):
 
 
 @kernel(inline=True)
-def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
+def _meet(law, pairs, first, i, image, between, masks, others, sums, energies):
     """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too.
 
-    first : the first cluster of the block. Also returns the sum of the forces on both sites.
+    energies : None if they are not wanted. first : the first cluster of the block
     """
-    width = width_of(pairs.clusters.local)
+    width, other = width_of(pairs.clusters.local), cluster_of(image)
     on_one, on_two, energy = sums
     ax, ay, az, _ = between[0]
     bx, by, bz, _ = between[1]
@@ -412,10 +470,9 @@ def _meet(law, pairs, first, i, other, between, masks, others, sums, tallies):
     store(others, at + 2 * width, load(others, at + 2 * width) - one * az - two * bz)
     on_one = (on_one[0] + one * ax, on_one[1] + one * ay, on_one[2] + one * az)
     on_two = (on_two[0] + two * bx, on_two[1] + two * by, on_two[2] + two * bz)
-    if tallies is None:
-        return (on_one, on_two, energy), None
-    force = (one * ax + two * bx, one * ay + two * by, one * az + two * bz)
-    return (on_one, on_two, energy + (of_one + of_two)), force
+    if energies is None:
+        return on_one, on_two, energy
+    return on_one, on_two, energy + (of_one + of_two)
 
 
 @kernel(inline=True)
@@ -446,9 +503,12 @@ def _act(law, i, j, r2, mask):
 def gather_block(pairs, own, others, tallies, block):
     """Forces on the sites of a block from their own rows and from all blocks, added in a fixed order.
 
-    With tallies, the rest of the virial is added: the sum over sites of f (x) place from the origin of their cluster.
+    With tallies, the rest of the virial is added: the sum over sites of f (x) place. All forces add up to zero, so that
+    places may be relative to a cluster of the system: where they are small, so is what rounding of forces does.
     """
     clusters = pairs.clusters
+    origin = clusters.origin
+    middle = 4 * (len(origin) // 8)
     width = width_of(clusters.local)
     zero = double(fill(0.0, own))
     virial = (zero, zero, zero, zero, zero, zero)
@@ -459,10 +519,15 @@ def gather_block(pairs, own, others, tallies, block):
             store(own, at + k * width, narrowed(force[k], own))
         if tallies is not None:
             local = clusters.local
-            there = double(load(local, at)), double(load(local, at + width)), double(load(local, at + 2 * width))
+            there = (
+                double(load(local, at)) + (origin[4 * c] - origin[middle]),
+                double(load(local, at + width)) + (origin[4 * c + 1] - origin[middle + 1]),
+                double(load(local, at + 2 * width)) + (origin[4 * c + 2] - origin[middle + 2]),
+            )
             virial = _with_product(virial, force, there)
     if tallies is not None:
-        _count(tallies[block], virial)
+        xx, xy, xz, yy, yz, zz = virial
+        _count(tallies[block], (total(xx), total(xy), total(xz), total(yy), total(yz), total(zz)))
 
 
 @kernel(inline=True)
