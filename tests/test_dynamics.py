@@ -10,7 +10,6 @@ from rigidmd.assemble.system import build
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import HEAT, State, no_load, state_of
-from rigidmd.dynamics import baths
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.dynamics.ramps import steady
@@ -20,6 +19,7 @@ from rigidmd.errors import SceneError
 from rigidmd.forces.pairs.sites import blocks_of
 from rigidmd.measure.drift import slope
 from rigidmd.measure.observables import observe
+from rigidmd.mechanics import groups
 from rigidmd.mechanics.rotation import orthogonality_error, random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -257,8 +257,23 @@ def test_maxwell_boltzmann_on_every_axis():
 
 
 @numba.njit
-def kinetic_energy(model, state):
-    return baths.kinetic_energy(model, state)
+def kinetic_energies(model, state, first, end):
+    return groups.kinetic_energies(
+        model.species, model.mass, model.inverse_inertia, state.velocity, state.angular_momentum_body, first, end
+    )
+
+
+@pytest.mark.parametrize(("first", "end"), [(0, 61), (3, 61), (8, 9), (5, 5)])
+@pytest.mark.parametrize("counts", [{"spce": 40, "nitrogen": 13, "argon": 8}, {"argon": 61}])
+def test_kinetic_energies_are_sums_over_molecules(counts, first, end):
+    system = build(small_scene(counts, 40.0))
+    state, share = system.state, slice(first, end)
+    kind = system.model.species[share]
+    moving = (system.model.mass[kind] * (state.velocity[share] ** 2).sum(axis=1)).sum() / 2
+    turning = 0.0
+    if len(state.angular_momentum_body):
+        turning = (system.model.inverse_inertia[kind] * state.angular_momentum_body[share] ** 2).sum() / 2
+    assert kinetic_energies(system.model, state, first, end) == pytest.approx((moving, turning), rel=1e-13)
 
 
 def test_the_thermostat_samples_the_canonical_kinetic_energy():
@@ -271,7 +286,7 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
     samples, heat = [], []
     for _ in range(6000):
         move(engine, state, row, 0.01, 4)
-        samples.append(kinetic_energy(system.model, state))
+        samples.append(sum(kinetic_energies(system.model, state, 0, 6)))
         heat.append(samples[-1] - state.books[HEAT])
     samples = np.array(samples) / thermal
     assert samples.mean() == pytest.approx(freedom / 2, rel=0.01)

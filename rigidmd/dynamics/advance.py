@@ -10,7 +10,7 @@ from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN, WORK
 from rigidmd.dynamics.baths import apply, bath_code
 from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
-from rigidmd.forces.pairs.sites import blocks_of
+from rigidmd.forces.pairs.sites import blocks_of, share_of
 from rigidmd.forces.terms import PLAIN, TALLIED, is_driven, total_energy_rate
 from rigidmd.mechanics.groups import TOGETHER, kick_group, turn_group
 from rigidmd.mechanics.rotor import ExactRotor, NoRotor, SplitRotor, turn_along
@@ -275,19 +275,11 @@ def _move_all(model, code, state, load, waiting, h, drifts):
     call_blocks(code, "move", packed((*bodies, state, load, waiting, h, drifts)), blocks_of(len(state.position)))
 
 
-@kernel(inline=True)
-def _share(state, block):
-    """The first molecule of a block, and the first that is no more in it: as many as turn together, again and again."""
-    n, blocks = len(state.position), blocks_of(len(state.position))
-    groups = (n + TOGETHER - 1) // TOGETHER
-    return TOGETHER * (groups * block // blocks), min(n, TOGETHER * (groups * (block + 1) // blocks))
-
-
 @task()
 def _move(parcel, block):
     """The kicks that wait; and then, if there is a drift, free flight and free rotation."""
     rotor, species, inverse_mass, inverse_inertia, state, load, waiting, h, drifts = opened(parcel)
-    first, end = _share(state, block)
+    first, end = share_of(len(state.position), block, TOGETHER)
     for start in range(first, end, AT_HAND):
         stop = min(end, start + AT_HAND)
         for kick in waiting:

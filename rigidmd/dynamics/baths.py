@@ -14,7 +14,8 @@ from rigidmd.compile import MOST_BLOCKS, call_blocks, implements, is_a, kernel, 
 from rigidmd.core.state import EXAMPLE, HEAT, NOW
 from rigidmd.dynamics.noise import Key, chi_square, fill_words, normal_of, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
-from rigidmd.forces.pairs.sites import blocks_of
+from rigidmd.forces.pairs.sites import blocks_of, share_of
+from rigidmd.mechanics.groups import TOGETHER, kinetic_energies, scale_group
 
 
 class NoBath(NamedTuple):
@@ -84,15 +85,18 @@ class NoseHoover(NamedTuple):
 
 
 def heat_room() -> np.ndarray:
-    """Room (MOST_BLOCKS,) for the heat that goes into each block of molecules."""
-    return np.zeros(MOST_BLOCKS)
+    """Room (MOST_BLOCKS, 2) for energies of each block of molecules."""
+    return np.zeros((MOST_BLOCKS, 2))
 
 
 def bath_code(bath: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
-    """The tasks of a bath that acts on molecules in blocks, see `compile.Code`; none of others."""
-    if not isinstance(bath, Langevin | Andersen):
-        return {}
-    return {"stir": (_stir, (bath, model, EXAMPLE[0], heat_room(), 0.0, 0))}
+    """The tasks of a bath that act on molecules in blocks, see `compile.Code`; none of others."""
+    state, room = EXAMPLE[0], heat_room()
+    if isinstance(bath, Langevin | Andersen):
+        return {"stir": (_stir, (bath, model, state, room, 0.0, 0))}
+    if isinstance(bath, VelocityRescaling | NoseHoover):
+        return {"weigh": (_weigh, (model, state, room)), "scale": (_scale, (state, 0.0, 0.0))}
+    return {}
 
 
 def apply(bath, model, code, state, room, h, draw):
@@ -114,7 +118,8 @@ def _apply_rescaling(bath, model, code, state, room, h, draw):
     def rescale(bath, model, code, state, room, h, draw):
         if bath.time_constant == inf:
             return
-        kinetic = kinetic_energy(model, state)
+        moving, turning = kinetic_of(model, code, state, room)
+        kinetic = moving + turning
         freedom = bath.degrees_of_freedom
         if kinetic == 0.0 or freedom == 0:
             return
@@ -125,9 +130,7 @@ def _apply_rescaling(bath, model, code, state, room, h, draw):
         others = chi_square(bath.key, draw + 1, 0, state.step[NOW], freedom - 1)
         scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
         state.books[HEAT] += (scale2 - 1) * kinetic
-        scale = sqrt(scale2)
-        scale_array(state.velocity, scale)
-        scale_array(state.angular_momentum_body, scale)
+        scale_momenta(code, state, sqrt(scale2), sqrt(scale2))
 
     return rescale
 
@@ -141,7 +144,7 @@ def _apply_by_molecule(bath, model, code, state, room, h, draw):
         blocks = blocks_of(len(state.velocity))
         call_blocks(code, "stir", packed((bath, model, state, room, h, draw)), blocks)
         for block in range(blocks):
-            state.books[HEAT] += room[block]
+            state.books[HEAT] += room[block, 0]
 
     return apply_by_molecule
 
@@ -153,7 +156,7 @@ NORMALS, UNIFORM, FURTHER = 2, 2, 1 << 10
 
 @task()
 def _stir(parcel, block):
-    """The share of a bath that acts on each molecule by itself; its heat into room[block]."""
+    """The share of a bath that acts on each molecule by itself; its heat into room[block, 0]."""
     bath, model, state, room, h, draw = opened(parcel)
     n, blocks = len(state.velocity), blocks_of(len(state.velocity))
     first, end = n * block // blocks, n * (block + 1) // blocks
@@ -190,7 +193,7 @@ def _stir(parcel, block):
                     after = keep_turning * before + new[kind, k] * xi
                     heat += 0.5 * (after * after - before * before) * model.inverse_inertia[kind, k]
                     state.angular_momentum_body[m, k] = after
-    room[block] = heat
+    room[block, 0] = heat
 
 
 def shares(bath, h):
@@ -239,16 +242,11 @@ def _apply_nose_hoover(bath, model, code, state, room, h, draw):
     def apply_chains(bath, model, code, state, room, h, draw):
         thermal = present(bath.thermal_energy, state)
         half = 2 * bath.links
-        moving = translational_energy(model, state)
-        turning = kinetic_energy(model, state) - moving
-        chain = state.bath[:half]
-        scale, heat = drive_chain(bath, chain, thermal, moving, bath.freedom_translation, h)
-        scale_array(state.velocity, scale)
-        state.books[HEAT] += heat
-        chain = state.bath[half:]
-        scale, heat = drive_chain(bath, chain, thermal, turning, bath.freedom_rotation, h)
-        scale_array(state.angular_momentum_body, scale)
-        state.books[HEAT] += heat
+        moving, turning = kinetic_of(model, code, state, room)
+        scale, heat = drive_chain(bath, state.bath[:half], thermal, moving, bath.freedom_translation, h)
+        scale_turning, heat_turning = drive_chain(bath, state.bath[half:], thermal, turning, bath.freedom_rotation, h)
+        scale_momenta(code, state, scale, scale_turning)
+        state.books[HEAT] += heat + heat_turning
 
     return apply_chains
 
@@ -300,30 +298,37 @@ def chain_energy(bath, chain, thermal, freedom):
 
 
 @kernel
-def scale_array(values, scale):
-    """Multiply an array (n, 3) by a number, in place."""
-    for m in range(len(values)):
-        for k in range(3):
-            values[m, k] *= scale
+def kinetic_of(model, code, state, room):
+    """Translational and rotational kinetic energy of all molecules (u Å²/ps²), by blocks and in their order."""
+    blocks = blocks_of(len(state.velocity))
+    call_blocks(code, "weigh", packed((model, state, room)), blocks)
+    moving = turning = 0.0
+    for block in range(blocks):
+        moving += room[block, 0]
+        turning += room[block, 1]
+    return moving, turning
 
 
 @kernel
-def kinetic_energy(model, state):
-    """Translational and rotational kinetic energy of all molecules (u Å²/ps²)."""
-    total = translational_energy(model, state)
-    for m in range(len(state.angular_momentum_body)):
-        for k in range(3):
-            total += 0.5 * state.angular_momentum_body[m, k] ** 2 * model.inverse_inertia[model.species[m], k]
-    return total
+def scale_momenta(code, state, scale, scale_turning):
+    """Multiply velocities and angular momenta by a number each, in place."""
+    call_blocks(code, "scale", packed((state, scale, scale_turning)), blocks_of(len(state.velocity)))
 
 
-@kernel
-def translational_energy(model, state):
-    """Translational kinetic energy of all molecules (u Å²/ps²)."""
-    total = 0.0
-    for m in range(len(state.velocity)):
-        v2 = 0.0
-        for k in range(3):
-            v2 += state.velocity[m, k] ** 2
-        total += 0.5 * model.mass[model.species[m]] * v2
-    return total
+@task()
+def _weigh(parcel, block):
+    model, state, room = opened(parcel)
+    velocity, momentum = state.velocity, state.angular_momentum_body
+    first, end = share_of(len(velocity), block, TOGETHER)
+    room[block, 0], room[block, 1] = kinetic_energies(
+        model.species, model.mass, model.inverse_inertia, velocity, momentum, first, end
+    )
+
+
+@task()
+def _scale(parcel, block):
+    state, scale, scale_turning = opened(parcel)
+    first, end = share_of(len(state.velocity), block, TOGETHER)
+    scale_group(state.velocity, first, end, scale)
+    if len(state.angular_momentum_body) > 0:
+        scale_group(state.angular_momentum_body, first, end, scale_turning)

@@ -1,4 +1,4 @@
-"""Kicks and rotations of many bodies at a time.
+"""Kinetic energies, kicks and rotations of many bodies at a time.
 
 Rotations have a body in each lane: with one body at a time, each part of a rotation waits for the one before it.
 """
@@ -6,7 +6,7 @@ Rotations have a body in each lane: with one body at a time, each part of a rota
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.lanes import align_stack, bits, lane_count, load, select, store
+from rigidmd.compile.lanes import align_stack, bits, fill, lane_count, load, select, store, total
 from rigidmd.compile.records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.mechanics.rotor import SHORT, SplitRotor, series_of_square, turn, turned
 
@@ -43,6 +43,56 @@ def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end
             velocity[m, k] += h * inverse_mass[kind] * force[m, k]
             if turns and inverse_inertia[kind, k] > 0:
                 momentum[m, k] += h * torque[m, k]
+
+
+@kernel
+def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, end):
+    """Translational and rotational kinetic energy of molecules first ... end - 1."""
+    kinds = np.full(TOGETHER, -1)
+    masses, inverses = np.empty(3 * TOGETHER), np.empty(3 * TOGETHER)
+    turns = len(momentum) > 0
+    zero = fill(0.0, velocity)
+    moving, turning = (zero, zero, zero), (zero, zero, zero)
+    while first + TOGETHER <= end:
+        if not _are(kinds, species, first):
+            for n in range(3 * TOGETHER):
+                kind = species[first + n // 3]
+                masses[n], inverses[n] = mass[kind], inverse_inertia[kind, n % 3]
+                kinds[n // 3] = kind
+        moving = _with_squares(moving, masses, velocity, 3 * first)
+        if turns:
+            turning = _with_squares(turning, inverses, momentum, 3 * first)
+        first += TOGETHER
+    moved, turned = total(moving[0] + moving[1] + moving[2]), total(turning[0] + turning[1] + turning[2])
+    for m in range(first, end):
+        kind = species[m]
+        for k in range(3):
+            moved += mass[kind] * velocity[m, k] ** 2
+            if turns:
+                turned += inverse_inertia[kind, k] * momentum[m, k] ** 2
+    return 0.5 * moved, 0.5 * turned
+
+
+@kernel(inline=True)
+def _with_squares(sums, weights, values, at):
+    """Three vectors of sums, with the weighted squares of the values (n, 3) of as many molecules as lanes added."""
+    x, y, z = load(values, at), load(values, at + TOGETHER), load(values, at + 2 * TOGETHER)
+    return (
+        sums[0] + load(weights, 0) * x * x,
+        sums[1] + load(weights, TOGETHER) * y * y,
+        sums[2] + load(weights, 2 * TOGETHER) * z * z,
+    )
+
+
+@kernel
+def scale_group(values, first, end, scale):
+    """Multiply rows first ... end - 1 of an array (n, 3) by a number, in place."""
+    at = 3 * first
+    while at + TOGETHER <= 3 * end:
+        store(values, at, load(values, at) * scale)
+        at += TOGETHER
+    for n in range(at, 3 * end):
+        values[n // 3, n % 3] *= scale
 
 
 def turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):

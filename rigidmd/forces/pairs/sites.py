@@ -24,6 +24,13 @@ def blocks_of(molecules):
 
 
 @kernel(inline=True)
+def share_of(molecules, block, together):
+    """The first molecule of a block, and the first that is no more in it: whole groups of so many, but for the last."""
+    blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
+    return together * (groups * block // blocks), min(molecules, together * (groups * (block + 1) // blocks))
+
+
+@kernel(inline=True)
 def _molecules_of(state, block):
     n, blocks = len(state.position), blocks_of(len(state.position))
     return range(n * block // blocks, n * (block + 1) // blocks)
