@@ -14,6 +14,7 @@ from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.compile.machine import threads_for
+from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
@@ -195,7 +196,11 @@ class MolecularSimulation(Simulation):
             for k, stage in enumerate(self.scene.stages):
                 if not (stage.is_open or stage.is_minimisation):
                     row = row_of_stage(self.system, k)
-                    self.engine.advance(self.engine.begin(self.state, row), row, 0.0, 0)
+                    self.engine.advance(self._begun(row), row, 0.0, 0)
+
+    def _begun(self, row: Scheme | Solver) -> State:
+        """The present state, its arrays as they are, with the variables that a row moves besides."""
+        return self.state._replace(bath=self.engine.begin(self.state, row).bath)
 
     def _check(self, other: "OtherEngine") -> None:
         """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""
@@ -285,7 +290,7 @@ class MolecularSimulation(Simulation):
         if k or was_open or self.scene.engine.is_other or (self._relief is not None and self._relief.steps):
             self.engine = self._engine_of(k)
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
-        self.state = self.engine.begin(self.state, row)
+        self.state = self._begun(row)
         self.state.begin_stretch()
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
         keeps = self.system.keeps_momentum_in
@@ -298,7 +303,7 @@ class MolecularSimulation(Simulation):
     def _enter_minimisation(self, k: int) -> Stretch:
         stage = self.scene.stages[k]
         self.engine = self.system.engine()
-        self.state = self.engine.begin(self.state, stage.scheme)
+        self.state = self._begun(stage.scheme)
         self.state.begin_stretch()
         if self._conserved is not None:
             self._origins[k] = self._conserved
