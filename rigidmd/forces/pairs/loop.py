@@ -341,24 +341,24 @@ def block_forces(law, pairs, into, tallies, energies, block):
             still = (zero, zero, zero)
             sums, number = (still, still, zero), 0
             for n in range(first_special, pairs.special[i // 2]):
-                image, between = _displacements(pairs, c, here, met, apart, masked[n, 0])
+                other, image, between = _displacements(pairs, c, here, met, apart, masked[n, 0])
                 if tallies is not None:
                     number = _cross(pairs, number, number_of(image), sums, before, tallies[block])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
-                sums = _meet(law, pairs, first, i, image, between, masks, others, sums, energies)
+                sums = _meet(law, pairs, first, i, other, between, masks, others, sums, energies)
             # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
             # processor's queues before those of the next entry could enter.
             last = end_of_row(pairs, i // 2, moved) - 1
-            image = np.int32(0)
+            other = image = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
             if first_entry <= last:
-                image, between = _displacements(pairs, c, here, met, apart, item(entries, first_entry))
+                other, image, between = _displacements(pairs, c, here, met, apart, item(entries, first_entry))
             for n in range(first_entry, last + 1):
-                ahead, after = _displacements(pairs, c, here, met, apart, item(entries, min(n + 1, last)))
+                ahead, its_image, after = _displacements(pairs, c, here, met, apart, item(entries, min(n + 1, last)))
                 if tallies is not None:
                     number = _cross(pairs, number, number_of(image), sums, before, tallies[block])
-                sums = _meet(law, pairs, first, i, image, between, (None, None), others, sums, energies)
-                image, between = ahead, after
+                sums = _meet(law, pairs, first, i, other, between, (None, None), others, sums, energies)
+                other, image, between = ahead, its_image, after
             if tallies is not None:
                 _cross(pairs, number, 0, sums, before, tallies[block])
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
@@ -401,19 +401,20 @@ def _count(tally, virial):
 
 @kernel(inline=True)
 def _displacements(pairs, c, here, met, apart, number):
-    """The image met by an entry, and displacements from its sites, as vectors, to each of two sites of c.
+    """The cluster and the image met by an entry, and displacements from its sites, as vectors, to each of two of c.
 
     These are as of `_separation`.
     """
     local = pairs.clusters.local
     width = width_of(local)
     image = item(met, number)
-    at = 3 * width * cluster_of(image)
+    other = cluster_of(image)
+    at = 3 * width * other
     dx, dy, dz = origins_apart(pairs, c, met, apart, number)
     x = load(local, at) - dx
     y = load(local, at + width) - dy
     z = load(local, at + 2 * width) - dz
-    return image, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
+    return other, image, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
 
 
 def origins_apart(pairs, c, met, apart, number):
@@ -451,12 +452,12 @@ def _separation(here, x, y, z):
 
 
 @kernel(inline=True)
-def _meet(law, pairs, first, i, image, between, masks, others, sums, energies):
+def _meet(law, pairs, first, i, other, between, masks, others, sums, energies):
     """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too.
 
     energies : None if they are not wanted. first : the first cluster of the block
     """
-    width, other = width_of(pairs.clusters.local), cluster_of(image)
+    width = width_of(pairs.clusters.local)
     on_one, on_two, energy = sums
     ax, ay, az, _ = between[0]
     bx, by, bz, _ = between[1]
