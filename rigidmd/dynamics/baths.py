@@ -297,6 +297,34 @@ def chain_energy(bath, chain, thermal, freedom):
     return total
 
 
+# For thermostats of one's own and boxes, on one thread.
+
+
+@kernel
+def scale_array(values, scale):
+    """Multiply an array (n, 3) by a number, in place."""
+    scale_group(values, 0, len(values), scale)
+
+
+@kernel
+def translational_energy(model, state):
+    """Translational kinetic energy of all molecules (u Å²/ps²)."""
+    return _energies(model, state, 0, len(state.velocity))[0]
+
+
+@kernel
+def kinetic_energy(model, state):
+    """Translational and rotational kinetic energy of all molecules (u Å²/ps²)."""
+    moving, turning = _energies(model, state, 0, len(state.velocity))
+    return moving + turning
+
+
+@kernel
+def _energies(model, state, first, end):
+    velocity, momentum = state.velocity, state.angular_momentum_body
+    return kinetic_energies(model.species, model.mass, model.inverse_inertia, velocity, momentum, first, end)
+
+
 @kernel
 def kinetic_of(model, code, state, room):
     """Translational and rotational kinetic energy of all molecules (u Å²/ps²), by blocks and in their order."""
@@ -318,11 +346,8 @@ def scale_momenta(code, state, scale, scale_turning):
 @task()
 def _weigh(parcel, block):
     model, state, room = opened(parcel)
-    velocity, momentum = state.velocity, state.angular_momentum_body
-    first, end = share_of(len(velocity), block, TOGETHER)
-    room[block, 0], room[block, 1] = kinetic_energies(
-        model.species, model.mass, model.inverse_inertia, velocity, momentum, first, end
-    )
+    first, end = share_of(len(state.velocity), block, TOGETHER)
+    room[block, 0], room[block, 1] = _energies(model, state, first, end)
 
 
 @task()

@@ -16,12 +16,12 @@ import numpy as np
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.schemes import BOX
 from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
+from rigidmd.dynamics.baths import scale_array, translational_energy
 from rigidmd.dynamics.gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
 from rigidmd.forces.pairs.space import volume_of
 from rigidmd.forces.terms import PRESSED, TALLIED, load_now
-from rigidmd.mechanics.groups import kinetic_energies, scale_group
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -194,9 +194,9 @@ def _stretch(box, state, h):
         volume = volume_of(state.cell)
         after = volume + h * box.inverse_mass * state.bath[-1]
         scale = (after / volume) ** (1 / 3)
-        scale_group(state.position, 0, len(state.position), scale)
-        scale_group(state.velocity, 0, len(state.velocity), 1 / scale)
-        scale_group(state.cell, 0, 3, scale)
+        scale_array(state.position, scale)
+        scale_array(state.velocity, 1 / scale)
+        scale_array(state.cell, scale)
         state.books[WORK] -= asked(box.pressure, state, 0) * (after - volume)
 
     return stretch
@@ -215,11 +215,7 @@ def _kick_piston(box, model, terms, state, load, room, cursor, h, draw):
             cursor[1] = 1
         volume = volume_of(state.cell)
         virial = room.tally[0, 1] + room.tally[0, 5] + room.tally[0, 9]
-        velocity, momentum = state.velocity, state.angular_momentum_body
-        moving, _ = kinetic_energies(
-            model.species, model.mass, model.inverse_inertia, velocity, momentum, 0, len(velocity)
-        )
-        pressure = (2 * moving + virial) / (3 * volume) + box.beyond[1] / volume**2
+        pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + box.beyond[1] / volume**2
         before = state.bath[-1]
         state.bath[-1] += h * (pressure - asked(box.pressure, state, 0))
         state.books[WORK] -= 0.5 * box.inverse_mass * (state.bath[-1] ** 2 - before**2)
