@@ -297,7 +297,7 @@ def chain_energy(bath, chain, thermal, freedom):
     return total
 
 
-# For thermostats of one's own and boxes, on one thread.
+# Sums over all molecules on one thread: for boxes, and for thermostats of one's own, which have no tasks.
 
 
 @kernel

@@ -108,7 +108,7 @@ def piston(pressure: Pressure, period: float, compressibility: float, volume: fl
 class BoxRoom(NamedTuple):
     """Where a move is made and, if it is rejected, taken back."""
 
-    tally: np.ndarray  # (2, 10) energies and virials: now, before the move
+    tally: np.ndarray  # (2, 10) energies and virials: now, before the move; of a piston virials only
     strain: np.ndarray  # (3, 6) of the move; its drift; its variance
     turned: np.ndarray  # (2, 3, 3) T, its inverse
     position: np.ndarray  # as in State

@@ -315,7 +315,8 @@ def block_forces(law, pairs, into, tallies, energies, block):
 
     The distance of two sites is the difference of their places in the box, less the shift of an image. So the virial is
     the sum over sites of f (x) place, see `gather_block`, less that over entries of the force on the row (x) shift.
-    Entries of one image follow one another, so the latter is summed here for all of them at once.
+    The latter is summed here where the image changes along a row. That is seldom: in each shell the entries of one
+    image follow one another, and rows far from the edges meet no other image.
     """
     align_stack()
     clusters = pairs.clusters
