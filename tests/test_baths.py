@@ -38,25 +38,39 @@ def kinetic(system, state):
 
 @numba.njit
 def numbers(key, count, step):
-    words = np.empty((4, 64), np.uint64)
-    found = np.empty(4 * 64 * count)
+    words = np.empty((2, 4, noise.BATCH), np.uint64)
+    found = np.empty((count, 6 * noise.BATCH))
     for batch in range(count):
-        noise.fill_words(words, key, 0, 64 * batch, step)
-        for m in range(64):
-            for k in range(4):
-                own = noise.normal_of(words[k, m], key, 1024 * (k + 1), 64 * batch + m, step)
-                found[4 * (64 * batch + m) + k] = own
+        noise.fill_normals(found[batch], words, key, 7, noise.BATCH * batch, step)
     return found
 
 
 def test_numbers_of_words_are_normal():
-    found = numbers(key_of(5, BATH), 4000, 3)
-    assert stats.kstest(found, "norm").pvalue > 1e-3
-    for x in (2.0, 3.0, 3.6, 4.0):  # the last two lie in the tail of the ziggurat
-        expected = len(found) * stats.norm.sf(x)
+    key = key_of(5, BATH)
+    found = numbers(key, 4000, 3)
+    assert stats.kstest(found.ravel(), "norm").pvalue > 1e-3
+    for x in (2.0, 3.0, 4.0):
+        expected = found.size * stats.norm.sf(x)
         assert abs((np.abs(found) > x).sum() / 2 - expected) < 4 * np.sqrt(expected)
-    rows = found.reshape(-1, 4)
-    assert np.abs(np.corrcoef(rows.T) - np.eye(4)).max() < 5 / np.sqrt(len(rows))
+    rows = found.reshape(4000, 6, noise.BATCH).transpose(0, 2, 1).reshape(-1, 6)  # the six of each molecule
+    for values in (rows, rows**2):
+        assert np.abs(np.corrcoef(values.T) - np.eye(6)).max() < 5 / np.sqrt(len(rows))
+        assert abs(np.corrcoef(values[1:].ravel(), values[:-1].ravel())[0, 1]) < 5 / np.sqrt(rows.size)
+
+
+def test_numbers_are_those_of_their_words():
+    """Radii of 53 bits and angles of 32, in NumPy."""
+    key, step = key_of(5, BATH), 11
+    found = numbers(key, 3, step)
+    for m in (0, 1, 63, 64, 130, 191):
+        words = [[int(word) for word in noise.philox(key, draw, m, step)] for draw in (7, 8)]
+        (a, b, c, d), (e, f, more, rest) = words
+        extra = more % 2**21, rest % 2**21, (more >> 21) * 2**10 + (rest >> 22)
+        u = [(word * 2**21 + low + 0.5) / 2**53 for word, low in zip((a, b, c), extra, strict=True)]
+        radius, angle = np.sqrt(-2 * np.log(u)), 2 * np.pi * np.array([d, e, f]) / 2**32
+        expected = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+        own = found.reshape(3, 6, noise.BATCH)[m // noise.BATCH, :, m % noise.BATCH]
+        assert own == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
 @pytest.mark.parametrize("bath", [Langevin(steady(THERMAL), 3.0, 7.0, key_of(2, BATH)),

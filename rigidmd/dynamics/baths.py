@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile.lanes import align_stack
 from rigidmd.core.state import EXAMPLE, HEAT, NOW
-from rigidmd.dynamics.noise import Key, chi_square, fill_words, normal_of, normals, uniforms
+from rigidmd.dynamics.noise import BATCH, Key, chi_square, fill_normals, normals, uniforms
 from rigidmd.dynamics.ramps import Ramp, present
 from rigidmd.forces.pairs.sites import blocks_of, share_of
-from rigidmd.mechanics.groups import TOGETHER, kinetic_energies, scale_group
+from rigidmd.mechanics.groups import TOGETHER, kinetic_energies, scale_group, stir_group
 
 
 class NoBath(NamedTuple):
@@ -93,7 +94,7 @@ def bath_code(bath: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
     """The tasks of a bath that act on molecules in blocks, see `compile.Code`; none of others."""
     state, room = EXAMPLE[0], heat_room()
     if isinstance(bath, Langevin | Andersen):
-        return {"stir": (_stir, (bath, model, state, room, 0.0, 0))}
+        return {"stir": (_stir if isinstance(bath, Langevin) else _collide, (bath, model, state, room, 0.0, 0))}
     if isinstance(bath, VelocityRescaling | NoseHoover):
         return {"weigh": (_weigh, (model, state, room)), "scale": (_scale, (state, 0.0, 0.0))}
     return {}
@@ -149,85 +150,60 @@ def _apply_by_molecule(bath, model, code, state, room, h, draw):
     return apply_by_molecule
 
 
-BATCH = 64  # molecules whose random words are made at once
-# Draws of a molecule in a step: two of four words each, one for its chance, and from FURTHER on those of each number.
-NORMALS, UNIFORM, FURTHER = 2, 2, 1 << 10
-
-
 @task()
 def _stir(parcel, block):
-    """The share of a bath that acts on each molecule by itself; its heat into room[block, 0]."""
+    """Langevin's friction and noise for the molecules of a block; their heat into room[block, 0]."""
     bath, model, state, room, h, draw = opened(parcel)
-    n, blocks = len(state.velocity), blocks_of(len(state.velocity))
-    first, end = n * block // blocks, n * (block + 1) // blocks
-    step, key = state.step[NOW], bath.key
+    align_stack()
+    first, end = share_of(len(state.velocity), block, TOGETHER)
     thermal = present(bath.thermal_energy, state)
-    keep, spread, keep_turning, spread_turning = shares(bath, h)
-    new = np.empty((len(model.mass), 4))  # of each species: size of what is new of a velocity and of angular momenta
-    for kind in range(len(model.mass)):
-        new[kind, 3] = spread * sqrt(thermal * model.inverse_mass[kind])
-        for k in range(3):
-            new[kind, k] = spread_turning * sqrt(thermal * model.inertia[kind, k])
-    words = np.empty((4 * NORMALS, BATCH), np.uint64)
+    keep, keep_turning = exp(-bath.friction_translation * h), exp(-bath.friction_rotation * h)
+    new = thermal_sizes(model, thermal * (1 - keep * keep), thermal * (1 - keep_turning * keep_turning))
+    words, numbers = np.empty((2, 4, BATCH), np.uint64), np.empty(6 * BATCH)
     heat = 0.0
     for start in range(first, end, BATCH):
-        count = min(BATCH, end - start)
-        for k in range(NORMALS):
-            fill_words(words[4 * k : 4 * (k + 1), :count], key, draw + k, start, step)
-        for m in range(start, start + count):
-            if not is_hit(bath, h, key, draw + UNIFORM, m, step):
-                continue
-            kind = model.species[m]
-            gained = 0.0
-            for k in range(3):
-                before = state.velocity[m, k]
-                xi = normal_of(words[k, m - start], key, draw + FURTHER * (k + 1), m, step)
-                after = keep * before + new[kind, 3] * xi
-                gained += after * after - before * before
-                state.velocity[m, k] = after
-            heat += 0.5 * model.mass[kind] * gained
-            if m < len(state.angular_momentum_body):
-                for k in range(3):
-                    before = state.angular_momentum_body[m, k]
-                    xi = normal_of(words[3 + k, m - start], key, draw + FURTHER * (k + 4), m, step)
-                    after = keep_turning * before + new[kind, k] * xi
-                    heat += 0.5 * (after * after - before * before) * model.inverse_inertia[kind, k]
-                    state.angular_momentum_body[m, k] = after
+        fill_normals(numbers, words, bath.key, draw, start, state.step[NOW])
+        heat += stir_group(model, state, keep, keep_turning, new, numbers, start, min(end, start + BATCH))
     room[block, 0] = heat
 
 
-def shares(bath, h):
-    """What is kept of a momentum and how much is new, of the thermal size of it; translation, then rotation."""
-    raise TypeError("compiled code only")
+@task()
+def _collide(parcel, block):
+    """Andersen's collisions with the molecules of a block; their heat into room[block, 0]."""
+    bath, model, state, room, h, draw = opened(parcel)
+    velocity, momentum = state.velocity, state.angular_momentum_body
+    first, end = share_of(len(velocity), block, TOGETHER)
+    step, missed = state.step[NOW], exp(-h / bath.time_constant)
+    thermal = present(bath.thermal_energy, state)
+    new = thermal_sizes(model, thermal, thermal)
+    heat = 0.0
+    for m in range(first, end):
+        chance, _ = uniforms(bath.key, draw, m, step)
+        if chance <= missed:
+            continue
+        kind = model.species[m]
+        for k in range(3):
+            of_velocity, of_momentum = normals(bath.key, draw + 1 + k, m, step)
+            after = new[kind, 3] * of_velocity
+            heat += 0.5 * model.mass[kind] * (after * after - velocity[m, k] ** 2)
+            velocity[m, k] = after
+            if len(momentum) > 0:
+                after = new[kind, k] * of_momentum
+                heat += 0.5 * model.inverse_inertia[kind, k] * (after * after - momentum[m, k] ** 2)
+                momentum[m, k] = after
+    room[block, 0] = heat
 
 
-def is_hit(bath, h, key, draw, molecule, step):
-    """Whether a bath acts on a molecule in a step."""
-    raise TypeError("compiled code only")
-
-
-@implements(shares)
-def _shares(bath, h):
-    if is_a(bath, Andersen):
-        return lambda bath, h: (0.0, 1.0, 0.0, 1.0)
-
-    def of_friction(bath, h):
-        c, turning = exp(-bath.friction_translation * h), exp(-bath.friction_rotation * h)
-        return c, sqrt(1 - c * c), turning, sqrt(1 - turning * turning)
-
-    return of_friction
-
-
-@implements(is_hit, inline=True)
-def _is_hit(bath, h, key, draw, molecule, step):
-    if is_a(bath, Langevin):
-        return lambda bath, h, key, draw, molecule, step: True
-
-    def by_chance(bath, h, key, draw, molecule, step):
-        chance, _ = uniforms(key, draw, molecule, step)
-        return chance > exp(-h / bath.time_constant)
-
-    return by_chance
+@kernel
+def thermal_sizes(model, moving, turning):
+    """Sizes (species, 4) of the angular momenta along the axes of a body, and of a component of its velocity, at
+    thermal energies of both motions."""
+    sizes = np.empty((len(model.mass), 4))
+    for kind in range(len(model.mass)):
+        for k in range(3):
+            sizes[kind, k] = sqrt(turning * model.inertia[kind, k])
+        sizes[kind, 3] = sqrt(moving * model.inverse_mass[kind])
+    return sizes
 
 
 #: Fractions of a flow of the chains, Suzuki & Yoshida.

@@ -4,12 +4,13 @@ A number is a function of a key and a counter, so there is no generator and no s
 same for any number of threads. The key depends on (seed, purpose, stage); the counter is (draw, molecule, step).
 """
 
-from math import cos, exp, log, pi, sin, sqrt
+from math import cos, log, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import kernel
+from rigidmd.compile.lanes import load, store, width_of
 
 #: Purposes. Each has its own stream, so that an additional draw for one changes nothing for the others.
 LATTICE, MOMENTA, BATH, BOX = 1, 2, 3, 4
@@ -19,6 +20,7 @@ WEYL_0, WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 LOW = np.uint64(0xFFFFFFFF)
 HALF = np.uint64(32)
 WHOLE = 2.0**-32
+BITS_10, BITS_21, BITS_22, LOW_21 = np.uint64(10), np.uint64(21), np.uint64(22), np.uint64((1 << 21) - 1)
 
 
 class Key(NamedTuple):
@@ -34,7 +36,7 @@ def key_of(seed: int, purpose: int, stage: int = 0) -> Key:
     return Key(np.uint64(low), np.uint64(high))
 
 
-@kernel(outer=True)
+@kernel(outer=True, inline=True)
 def philox(key, draw, molecule, step):
     """Four 32-bit numbers, as uint64, for a counter with draw and molecule below 2^32, step below 2^63."""
     a, b = np.uint64(draw) & LOW, np.uint64(molecule) & LOW
@@ -88,67 +90,46 @@ def chi_square(key, draw, molecule, step, freedom):
             return 2 * scale * d * v
 
 
-# The ziggurat of Marsaglia & Tsang (2000, J. Stat. Softw. 5, 8) with 128 strips; strip and place in it come from
-# different bits of a word, as Doornik (2005) asks for.
-STRIPS = 128
-LAST_EDGE, STRIP_AREA = 3.442619855899, 9.91256303526217e-3
-
-
-def _ziggurat() -> tuple[np.ndarray, np.ndarray]:
-    """Edges (STRIPS + 1,) of the strips, and which part (STRIPS,) of each lies under the curve altogether."""
-    edge = np.zeros(STRIPS + 1)
-    height = np.exp(-0.5 * LAST_EDGE**2)
-    edge[0], edge[1] = STRIP_AREA / height, LAST_EDGE
-    for n in range(2, STRIPS):
-        edge[n] = np.sqrt(-2 * np.log(STRIP_AREA / edge[n - 1] + height))
-        height = np.exp(-0.5 * edge[n] ** 2)
-    return edge, edge[1:] / edge[:-1]
-
-
-EDGE, INSIDE = _ziggurat()
+#: Molecules whose random words are made at once, by loops over them that are vectorised.
+BATCH = 64
 
 
 @kernel
 def fill_words(words, key, draw, first, step):
-    """The four words of so many molecules, from `first` on, into words (4, molecules); a loop that is vectorised."""
+    """The four words of BATCH molecules, from `first` on, into words (4, BATCH)."""
     for m in range(words.shape[1]):
         words[0, m], words[1, m], words[2, m], words[3, m] = philox(key, draw, first + m, step)
 
 
-@kernel(inline=True)
-def normal_of(word, key, draw, molecule, step):
-    """A normal number, to 2^-24 of a strip of the ziggurat, of one 32-bit word.
+@kernel
+def fill_normals(found, words, key, draw, first, step):
+    """Six normal numbers of each of BATCH molecules, from `first` on: two draws (Box & Muller 1958, with vectors).
 
-    With its word it took 5 to 6 ns on a loaded machine: for baths that draw for every molecule in every step. One in 80
-    takes further draws, from `draw` on.
+    Number k of molecule first + m goes to found[BATCH k + m]. words (2, 4, BATCH): room. Each radius is of 53 bits, so
+    that numbers go up to 8.6, each angle of 32.
     """
-    strip = np.int64(word & np.uint64(STRIPS - 1))
-    u = (np.int64(word >> np.uint64(8)) + 0.5) * 2.0**-23 - 1
-    if abs(u) < INSIDE[strip]:
-        return u * EDGE[strip]
-    return _of_edge(strip, u, key, draw, molecule, step)
+    fill_words(words[0], key, draw, first, step)
+    fill_words(words[1], key, draw + 1, first, step)
+    _fill_pairs(found, words.reshape(-1))
+    for m in range(0, 3 * BATCH, width_of(found)):
+        radius, angle = sqrt(-2.0 * log(load(found, m))), load(found, 3 * BATCH + m)
+        store(found, m, radius * cos(angle))
+        store(found, 3 * BATCH + m, radius * sin(angle))
 
 
-@kernel(outer=True)
-def _of_edge(strip, u, key, draw, molecule, step):
-    """A number from where a strip is cut by the curve, or from the tail."""
-    while True:
-        if strip == 0:
-            while True:
-                v, w = uniforms(key, draw, molecule, step)
-                draw += 1
-                beyond = -log(v) / LAST_EDGE
-                if -2 * log(w) > beyond * beyond:
-                    return LAST_EDGE + beyond if u > 0 else -LAST_EDGE - beyond
-        x = u * EDGE[strip]
-        v, w = uniforms(key, draw, molecule, step)
-        low = exp(-0.5 * (EDGE[strip] ** 2 - x * x))
-        high = exp(-0.5 * (EDGE[strip + 1] ** 2 - x * x))
-        if low + v * (high - low) < 1.0:
-            return x
-        a, _, _, _ = philox(key, draw + 1, molecule, step)
-        draw += 2
-        strip = np.int64(a & np.uint64(STRIPS - 1))
-        u = 2 * w - 1
-        if abs(u) < INSIDE[strip]:
-            return u * EDGE[strip]
+@kernel
+def _fill_pairs(found, words):
+    """Three uniform numbers in (0, 1] of each molecule, then three angles, of eight words."""
+    for m in range(BATCH):
+        more, rest = words[6 * BATCH + m], words[7 * BATCH + m]
+        found[m] = _fraction(words[m], more & LOW_21)
+        found[BATCH + m] = _fraction(words[BATCH + m], rest & LOW_21)
+        found[2 * BATCH + m] = _fraction(words[2 * BATCH + m], (more >> BITS_21) << BITS_10 | rest >> BITS_22)
+    for m in range(3 * BATCH):
+        found[3 * BATCH + m] = 2 * pi * WHOLE * np.int64(words[3 * BATCH + m])
+
+
+@kernel(inline=True)
+def _fraction(word, more):
+    """A uniform number in (0, 1], from a word and 21 more bits: never 0, and 1 only by rounding."""
+    return (np.int64(word << BITS_21 | more) + 0.5) * 2.0**-53

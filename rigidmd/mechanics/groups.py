@@ -1,4 +1,4 @@
-"""Kinetic energies, kicks and rotations of many bodies at a time.
+"""Kinetic energies, kicks, friction with noise and rotations of many bodies at a time.
 
 Rotations have a body in each lane: with one body at a time, each part of a rotation waits for the one before it.
 """
@@ -24,12 +24,11 @@ def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end
     shares, parts = np.empty(3 * TOGETHER), np.empty(3 * TOGETHER)
     turns = len(momentum) > 0
     while first + TOGETHER <= end:
-        if not _are(kinds, species, first):
+        if _are_others(kinds, species, first):
             for n in range(3 * TOGETHER):
-                kind = species[first + n // 3]
+                kind = kinds[n // 3]
                 shares[n] = h * inverse_mass[kind]
                 parts[n] = h if inverse_inertia[kind, n % 3] > 0 else 0.0
-                kinds[n // 3] = kind
         for n in range(0, 3 * TOGETHER, TOGETHER):
             at = 3 * first + n
             store(velocity, at, load(velocity, at) + load(shares, n) * load(force, at))
@@ -54,11 +53,9 @@ def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, 
     zero = fill(0.0, velocity)
     moving, turning = (zero, zero, zero), (zero, zero, zero)
     while first + TOGETHER <= end:
-        if not _are(kinds, species, first):
+        if _are_others(kinds, species, first):
             for n in range(3 * TOGETHER):
-                kind = species[first + n // 3]
-                masses[n], inverses[n] = mass[kind], inverse_inertia[kind, n % 3]
-                kinds[n // 3] = kind
+                masses[n], inverses[n] = mass[kinds[n // 3]], inverse_inertia[kinds[n // 3], n % 3]
         moving = _with_squares(moving, masses, velocity, 3 * first)
         if turns:
             turning = _with_squares(turning, inverses, momentum, 3 * first)
@@ -95,6 +92,75 @@ def scale_group(values, first, end, scale):
         values[n // 3, n % 3] *= scale
 
 
+@kernel
+def stir_group(model, state, keep, keep_turning, new, numbers, first, end):
+    """Friction and noise: v <- keep v + size xi, and so the angular momenta, of molecules first ... end - 1.
+
+    new (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) : number j of molecule
+    first + m is numbers[k j + m]; three for its velocity, then three for its angular momentum. Returns the kinetic
+    energy gained.
+    """
+    species, velocity, momentum = model.species, state.velocity, state.angular_momentum_body
+    kinds, known = np.full(TOGETHER, -1), np.empty(8 * TOGETHER)
+    turns, apart = len(momentum) > 0, len(numbers) // 6
+    gained, at = fill(0.0, velocity), 0
+    while first + TOGETHER <= end:
+        if _are_others(kinds, species, first):
+            for n in range(TOGETHER):
+                kind = kinds[n]
+                for k in range(3):
+                    known[k * TOGETHER + n] = new[kind, k]
+                    known[(4 + k) * TOGETHER + n] = model.inverse_inertia[kind, k]
+                known[3 * TOGETHER + n], known[7 * TOGETHER + n] = new[kind, 3], model.mass[kind]
+        size = load(known, 3 * TOGETHER)
+        before = load_vectors(velocity, first)
+        after = _stirred(before, keep, (size, size, size), numbers, at, apart)
+        store_vectors(velocity, first, after)
+        x, y, z = _growth(before, after)
+        gained += load(known, 7 * TOGETHER) * (x + y + z)
+        if turns:
+            sizes = load(known, 0), load(known, TOGETHER), load(known, 2 * TOGETHER)
+            before = load_vectors(momentum, first)
+            after = _stirred(before, keep_turning, sizes, numbers, 3 * apart + at, apart)
+            store_vectors(momentum, first, after)
+            x, y, z = _growth(before, after)
+            gained += load(known, 4 * TOGETHER) * x + load(known, 5 * TOGETHER) * y + load(known, 6 * TOGETHER) * z
+        first, at = first + TOGETHER, at + TOGETHER
+    heat = total(gained)
+    for m in range(first, end):
+        kind = species[m]
+        for k in range(3):
+            old = velocity[m, k]
+            velocity[m, k] = keep * old + new[kind, 3] * numbers[apart * k + at]
+            heat += model.mass[kind] * (velocity[m, k] ** 2 - old * old)
+            if turns:
+                old = momentum[m, k]
+                momentum[m, k] = keep_turning * old + new[kind, k] * numbers[apart * (3 + k) + at]
+                heat += model.inverse_inertia[kind, k] * (momentum[m, k] ** 2 - old * old)
+        at += 1
+    return 0.5 * heat
+
+
+@kernel(inline=True)
+def _stirred(before, keep, sizes, numbers, at, apart):
+    """Vectors of as many molecules as lanes after friction and noise."""
+    return (
+        keep * before[0] + sizes[0] * load(numbers, at),
+        keep * before[1] + sizes[1] * load(numbers, at + apart),
+        keep * before[2] + sizes[2] * load(numbers, at + 2 * apart),
+    )
+
+
+@kernel(inline=True)
+def _growth(before, after):
+    """By how much the square of each component has grown."""
+    return (
+        after[0] * after[0] - before[0] * before[0],
+        after[1] * after[1] - before[1] * before[1],
+        after[2] * after[2] - before[2] * before[2],
+    )
+
+
 def turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
     """`turn` of molecules first ... end - 1."""
     raise TypeError("compiled code only")
@@ -113,8 +179,8 @@ def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
         whole = (1 << TOGETHER) - 1
         about = (False, False, False)
         while first + TOGETHER <= end:
-            if not _are(kinds, species, first):
-                about = _learn(known, kinds, rotor, species, first, h)
+            if _are_others(kinds, species, first):
+                about = _learn(known, kinds, rotor, h)
             momentum = load_vectors(angular_momentum_body, first)
             x, y, z = momentum
             if bits(load(known, FASTEST2 * TOGETHER) * (x * x + y * y + z * z) < SHORT) != whole:
@@ -138,21 +204,23 @@ def _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end
 
 
 @kernel(inline=True)
-def _are(kinds, species, first):
-    """Whether the lanes' bodies are of these kinds."""
+def _are_others(kinds, species, first):
+    """Whether the lanes' bodies are of other kinds than before; the kinds become theirs."""
     same = True
     for n in range(len(kinds)):
         same &= kinds[n] == species[first + n]
-    return same
+    if not same:
+        for n in range(len(kinds)):
+            kinds[n] = species[first + n]
+    return not same
 
 
 @kernel
-def _learn(known, kinds, rotor, species, first, h):
+def _learn(known, kinds, rotor, h):
     """Fill the rows that the lanes have to know; returns about which of the axes a, b, c there are rotations."""
     about_a = about_b = about_c = False
     for n in range(TOGETHER):
-        kind = species[first + n]
-        kinds[n] = kind
+        kind = kinds[n]
         a, b, c = rotor.order[kind, 0], rotor.order[kind, 1], rotor.order[kind, 2]
         share, rates = h * rotor.common[kind], rotor.excess[kind]
         known[AXIS_A * TOGETHER + n], known[AXIS_B * TOGETHER + n] = a, b
