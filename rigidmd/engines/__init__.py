@@ -18,8 +18,12 @@ class Tally(NamedTuple):
 class Engine(Protocol):
     """The methods of an engine that a run uses."""
 
+    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+        """What a row moves besides the bodies, for `state.bath`, as it is when a stretch of steps begins."""
+        ...
+
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state, with room for all variables that a row moves."""
+        """A copy of a state, with the variables of a row."""
         ...
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:

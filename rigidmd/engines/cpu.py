@@ -120,11 +120,14 @@ class Engine:
         """Declare that positions were changed from outside since the last step."""
         self._stale = True
 
-    def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state, with room for all variables that a scheme moves; chains and pistons begin at rest."""
+    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+        """What a scheme moves besides the bodies, for `state.bath`; chains and pistons begin at rest."""
         row = _scheme_of(row)
-        variables = getattr(row.bath, "variables", 0) + isinstance(row.box, Piston)
-        return state.copy()._replace(bath=np.zeros(variables))
+        return np.zeros(getattr(row.bath, "variables", 0) + isinstance(row.box, Piston))
+
+    def begin(self, state: State, row: Scheme | Solver) -> State:
+        """A copy of a state, with the variables of a row."""
+        return state.copy()._replace(bath=self.variables(state, row))
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
         """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError.

@@ -161,8 +161,8 @@ class OdeEngine(Engine):
         """Evaluations of the slopes by DOP853 or Radau since its last start."""
         return self._solver.nfev if self._solver is not None else 0
 
-    def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state with the variables of a solver."""
+    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+        """The variables of a solver at a state."""
         solver = _solver_of(row)
         omega = []
         if len(state.rotation):
@@ -173,7 +173,7 @@ class OdeEngine(Engine):
         y = np.concatenate([variables_of(_form(solver, state), state.rotation), omega, *flight, state.books[[WORK]]])
         if solver.name != RK4:
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._sizes(solver, state, y)])
-        return state.copy()._replace(bath=y)
+        return y
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
         """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError."""

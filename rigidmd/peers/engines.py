@@ -31,9 +31,13 @@ class OtherEngine(ABC):
         self._books = 0.0  # heat in the books of a state that it was given, less what it had counted by then
         self._moved: State | None = None
 
+    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+        """None: what thermostats and barostats evolve is the program's own."""
+        return np.zeros(0)
+
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state; what thermostats and barostats evolve is the program's own."""
-        return state.copy()._replace(bath=np.zeros(0))
+        """A copy of a state."""
+        return state.copy()._replace(bath=self.variables(state, row))
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
         """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError."""

@@ -200,7 +200,7 @@ class MolecularSimulation(Simulation):
 
     def _begun(self, row: Scheme | Solver) -> State:
         """The present state, its arrays as they are, with the variables that a row moves besides."""
-        return self.state._replace(bath=self.engine.begin(self.state, row).bath)
+        return self.state._replace(bath=self.engine.variables(self.state, row))
 
     def _check(self, other: "OtherEngine") -> None:
         """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""

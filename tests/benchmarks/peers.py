@@ -156,7 +156,7 @@ class Curve:
     def treatment(self, work: Workload) -> str:
         """How its forces end at the cut-off, in words."""
         if work.pme:
-            own = f", PME for an rms error of forces of {PME_ACCURACY:g} e²/Å²"
+            own = f", PME, error of forces {PME_ACCURACY:g} e²/Å²"
             theirs = {
                 "gromacs": ", PME with its defaults", "openmm": f", PME with a tolerance of {OPENMM_TOLERANCE:g}",
                 "lammps": f", PPPM {PME_ACCURACY:g}", "rigidmd": own,
@@ -557,8 +557,8 @@ def draw(path: Path, name: str, found: dict) -> None:
             for axis, y in ((left, row["energy_rms"]), (right, drift)):
                 axis.annotate(f"{row['timestep_fs']:g}", (x, y), xytext=(4, 3), textcoords="offset points", fontsize=7,
                               color=curve.color)  # fmt: skip
-    left.set_title("rms of the total energy about its line, kJ/mol per molecule", loc="left", fontsize=9, color=INK)
-    right.set_title("|drift|, kJ/mol/ns per molecule", loc="left", fontsize=9, color=INK)
+    left.set_title("rms of the total energy about its line\n(kJ/mol per molecule)", loc="left", fontsize=9, color=INK)
+    right.set_title("|drift|\n(kJ/mol/ns per molecule)", loc="left", fontsize=9, color=INK)
     for axis in (left, right):
         axis.set_xlabel("seconds of computing per ps")
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
