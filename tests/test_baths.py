@@ -1,6 +1,5 @@
 """Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve, the same bits."""
 
-import numba
 import numpy as np
 import pytest
 from conftest import built, move, small_scene
@@ -8,15 +7,16 @@ from scipy import stats
 
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import build
+from rigidmd.compile import kernel
 from rigidmd.core.schemes import SCHEMES, WITH_BATH
 from rigidmd.core.state import HEAT
-from rigidmd.dynamics import noise
 from rigidmd.dynamics.baths import Andersen, Langevin, NoseHoover
-from rigidmd.dynamics.noise import BATH, key_of
+from rigidmd.dynamics.noise import BATCH, BATH, key_of
 from rigidmd.dynamics.ramps import Ramp, steady
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.measure.observables import observe
+from rigidmd.mechanics.groups import stir_group
 from rigidmd.run import Simulation
 from rigidmd.run.relief import relieve
 from rigidmd.units import BOLTZMANN
@@ -34,43 +34,6 @@ def kinetic(system, state):
     with np.errstate(invalid="ignore", divide="ignore"):
         turning = np.where(inertia > 0, state.angular_momentum_body**2 / inertia, np.nan)
     return 0.5 * moving.sum() + 0.5 * np.nansum(turning), moving, turning
-
-
-@numba.njit
-def numbers(key, count, step):
-    words = np.empty((2, 4, noise.BATCH), np.uint64)
-    found = np.empty((count, 6 * noise.BATCH))
-    for batch in range(count):
-        noise.fill_normals(found[batch], words, key, 7, noise.BATCH * batch, step)
-    return found
-
-
-def test_numbers_of_words_are_normal():
-    key = key_of(5, BATH)
-    found = numbers(key, 4000, 3)
-    assert stats.kstest(found.ravel(), "norm").pvalue > 1e-3
-    for x in (2.0, 3.0, 4.0):
-        expected = found.size * stats.norm.sf(x)
-        assert abs((np.abs(found) > x).sum() / 2 - expected) < 4 * np.sqrt(expected)
-    rows = found.reshape(4000, 6, noise.BATCH).transpose(0, 2, 1).reshape(-1, 6)  # the six of each molecule
-    for values in (rows, rows**2):
-        assert np.abs(np.corrcoef(values.T) - np.eye(6)).max() < 5 / np.sqrt(len(rows))
-        assert abs(np.corrcoef(values[1:].ravel(), values[:-1].ravel())[0, 1]) < 5 / np.sqrt(rows.size)
-
-
-def test_numbers_are_those_of_their_words():
-    """Radii of 53 bits and angles of 32, in NumPy."""
-    key, step = key_of(5, BATH), 11
-    found = numbers(key, 3, step)
-    for m in (0, 1, 63, 64, 130, 191):
-        words = [[int(word) for word in noise.philox(key, draw, m, step)] for draw in (7, 8)]
-        (a, b, c, d), (e, f, more, rest) = words
-        extra = more % 2**21, rest % 2**21, (more >> 21) * 2**10 + (rest >> 22)
-        u = [(word * 2**21 + low + 0.5) / 2**53 for word, low in zip((a, b, c), extra, strict=True)]
-        radius, angle = np.sqrt(-2 * np.log(u)), 2 * np.pi * np.array([d, e, f]) / 2**32
-        expected = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
-        own = found.reshape(3, 6, noise.BATCH)[m // noise.BATCH, :, m % noise.BATCH]
-        assert own == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
 @pytest.mark.parametrize("bath", [Langevin(steady(THERMAL), 3.0, 7.0, key_of(2, BATH)),
@@ -91,6 +54,29 @@ def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
                     assert stats.kstest(own, "chi2", args=(1,)).pvalue > 1e-4, (name, k)
     assert np.isnan(turning[kind == "argon"]).all() and not state.angular_momentum_body[kind == "argon"].any()
     assert (np.isnan(turning[kind == "nitrogen"]).sum(axis=1) == 1).all()
+
+
+@kernel(outer=True)
+def stir(model, state, keep, keep_turning, new, numbers, first, end):
+    return stir_group(model, state, keep, keep_turning, new, numbers, first, end)
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_friction_and_noise_of_many_molecules_are_those_of_each(first):
+    """Groups of several species, and those left over, against NumPy; the rest is left alone."""
+    system = build(small_scene({"spce": 21, "argon": 5, "nitrogen": 6, "benzene_opls": 7}, 80.0))
+    model, state, end = system.model, system.state.copy(), 38
+    rng, keep = np.random.default_rng(1), np.array([0.8, 0.8, 0.8, 0.6, 0.6, 0.6])
+    new, numbers = rng.random((len(system.species), 4)), rng.normal(size=(6, BATCH))
+    heat = stir(model, state, 0.8, 0.6, new, numbers.ravel(), first, end)
+    size = new[model.species][:, [3, 3, 3, 0, 1, 2]]
+    before = np.hstack([system.state.velocity, system.state.angular_momentum_body])
+    after = np.hstack([state.velocity, state.angular_momentum_body])
+    expected = before.copy()
+    expected[first:end] = keep * before[first:end] + size[first:end] * numbers.T[: end - first]
+    assert after == pytest.approx(expected, rel=1e-14, abs=1e-14)
+    weight = np.hstack([np.repeat(model.mass[:, None], 3, axis=1), model.inverse_inertia])[model.species]
+    assert heat == pytest.approx(0.5 * (weight * (expected**2 - before**2)).sum(), rel=1e-12)
 
 
 def test_friction_is_that_of_each_motion():

@@ -5,7 +5,19 @@ import pytest
 from scipy import stats
 
 from rigidmd.compile import kernel
-from rigidmd.dynamics.noise import BATH, LATTICE, MOMENTA, Key, chi_square, key_of, normals, philox, uniforms
+from rigidmd.dynamics.noise import (
+    BATCH,
+    BATH,
+    LATTICE,
+    MOMENTA,
+    Key,
+    chi_square,
+    fill_normals,
+    key_of,
+    normals,
+    philox,
+    uniforms,
+)
 
 
 def words(*values):
@@ -49,6 +61,44 @@ def test_distributions(freedom):
     assert stats.kstest(square, "chi2", args=(freedom,)).pvalue > 1e-3
     for pair in (uniform, normal):
         assert abs(np.corrcoef(pair.T)[0, 1]) < 4 / np.sqrt(n)
+
+
+@kernel(outer=True)
+def fill_batches(found, key, step):
+    words = np.empty((2, 4, BATCH), np.uint64)
+    for batch in range(len(found)):
+        fill_normals(found[batch], words, key, 7, BATCH * batch, step)
+
+
+def six_of_each(batches, key, step):
+    """The numbers (molecules, 6) of molecules 0, 1, ... in so many batches."""
+    found = np.empty((batches, 6 * BATCH))
+    fill_batches(found, key, step)
+    return found.reshape(batches, 6, BATCH).transpose(0, 2, 1).reshape(-1, 6)
+
+
+def test_numbers_in_batches_are_normal():
+    rows = six_of_each(4000, key_of(5, BATH), 3)
+    assert stats.kstest(rows.ravel(), "norm").pvalue > 1e-3
+    for x in (2.0, 3.0, 4.0):
+        expected = rows.size * stats.norm.sf(x)
+        assert abs((np.abs(rows) > x).sum() / 2 - expected) < 4 * np.sqrt(expected)
+    for values in (rows, rows**2):
+        assert np.abs(np.corrcoef(values.T) - np.eye(6)).max() < 5 / np.sqrt(len(rows))
+        assert abs(np.corrcoef(values[1:].ravel(), values[:-1].ravel())[0, 1]) < 5 / np.sqrt(rows.size)
+
+
+def test_numbers_in_batches_are_those_of_their_words():
+    """Radii of 53 bits and angles of 32, in Python."""
+    key, step = key_of(5, BATH), 11
+    found = six_of_each(3, key, step)
+    for m in (0, 1, BATCH - 1, BATCH, 2 * BATCH + 2, 3 * BATCH - 1):
+        (a, b, c, d), (e, f, more, rest) = ([int(word) for word in philox(key, draw, m, step)] for draw in (7, 8))
+        extra = more % 2**21, rest % 2**21, (more >> 21) * 2**10 + (rest >> 22)
+        u = [(word * 2**21 + low + 0.5) / 2**53 for word, low in zip((a, b, c), extra, strict=True)]
+        radius, angle = np.sqrt(-2 * np.log(u)), 2 * np.pi * np.array([d, e, f]) / 2**32
+        expected = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+        assert found[m] == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
 def test_no_freedom_has_no_energy():
