@@ -13,6 +13,8 @@ from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import no_load
 from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
+from rigidmd.forces.laws.coulomb import radial, reaction_field
+from rigidmd.forces.laws.lennard_jones import energy_and_force, lennard_jones
 from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import AHEAD, BUILDS, BUILT, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
 from rigidmd.forces.pairs.sites import place_ahead
@@ -565,3 +567,38 @@ def test_the_self_energy_of_the_reaction_field():
     field = 0.5 / 9.0**3
     dipole2 = (system.species[0].dipole_debye / 4.803204712570263) ** 2
     assert system.constants["reaction_field_self"] == pytest.approx(-4 * field * dipole2 * 138935.457644, rel=1e-9)
+
+
+@kernel(outer=True)
+def pair_forces_at(argon, charges, r2, found):
+    for k in range(len(r2)):
+        found[k, 0] = energy_and_force(argon, argon.c12, argon.c6, argon.bend, r2[k])[1]
+        found[k, 1] = energy_and_force(argon, argon.c12, argon.c6, (), r2[k])[1]
+        found[k, 2] = radial(charges, r2[k])[1]
+
+
+@pytest.mark.parametrize(("name", "start"), [("switch", 8.0), ("switch", 7.2), ("smooth_switch", 8.0)])
+def test_forces_of_a_switch_are_corrected_as_precisely_as_its_product_is_rounded(name, start):
+    """In mixed precision: without a root, a polynomial in r² is added to the force. Here both in double precision."""
+    law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start).room(1, np.float32)
+    whole = reaction_field(np.zeros(1), 9.0, 78.5, name, start)
+    charges = whole.room(1, np.float32)
+    assert law.bend and charges.bend and not whole.room(1, np.float64).bend
+    r = np.linspace(start - 1, 9.0, 2001)
+    found, exact = np.empty((len(r), 3)), np.empty((len(r), 3))
+    pair_forces_at(law, charges, r**2, found)
+    pair_forces_at(law, whole, r**2, exact)
+    before = r < start
+    for corrected, product in ((found[:, 0], exact[:, 1]), (found[:, 2], exact[:, 2])):
+        largest = np.abs(product[~before]).max()
+        assert np.abs(corrected - product).max() < 3e-7 * largest
+        assert corrected[before] == pytest.approx(product[before], rel=1e-14)
+    assert (found[:, 0] != found[:, 1])[~before].mean() > 0.9  # the correction was used
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("switch", 0.0), ("switch", 5.0), ("smooth_switch", 5.4), ("force_switch", 8.0)]
+)
+def test_forces_of_a_wide_switch_are_the_product(name, start):
+    law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start)
+    assert law.room(1, np.float32).bend == ()

@@ -23,8 +23,11 @@ from collections.abc import Callable
 from math import inf
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
+from numpy.polynomial import chebyshev
+
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.lanes import larger
+from rigidmd.compile.lanes import inverse_root, larger, polynomial
 
 Name = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 NAMES: tuple[str, ...] = get_args(Name)
@@ -86,39 +89,98 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
     return (quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic)
 
 
-def ended(shape, end, r, inverse, u, w):
-    """(energy, force/r) with the ending, from u, w without it at distance r = 1/inverse; scalars or vectors.
+#: The error of a correction, relative to its largest value, and the most coefficients that it may take.
+CORRECTION_ERROR, MOST_COEFFICIENTS = 2e-7, 18
 
-    u already includes the constant of `end`.
+
+def correction(
+    shape: Shape, at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], dtype: type
+) -> tuple[float, ...]:
+    """Coefficients c0, c1, ... of what a switch adds to force/r beyond its start: y² or y⁴ (c0 + c1 y + c2 y² + ...).
+
+    y is 0 at the start and 1 at the cut-off, evenly in r², so that forces need no root and no energy. at(r) gives
+    energy and force/r of the law without its ending. There are none, (), in double precision, which would take so many
+    that little is gained; of other endings; and of a switch that is too wide.
+    """
+    if type(shape) not in CORRECTED or dtype != np.float32:
+        return ()
+    order, factors = CORRECTED[type(shape)]
+    width, square = shape.cutoff - shape.start, shape.cutoff**2 - shape.start**2
+
+    def over_power(x: np.ndarray) -> np.ndarray:
+        y = (x + 1) / 2
+        r = np.sqrt(shape.start**2 + y * square)
+        per_y = square / ((r + shape.start) * width)  # t = (r - start)/width is per_y y
+        u, w = at(r)
+        fallen, slope = factors(y * per_y)
+        return per_y**order * (fallen * w + slope / width * u / r)
+
+    with np.errstate(all="ignore"):  # a switch from 0 on is too wide
+        found = chebyshev.chebinterpolate(over_power, 2 * MOST_COEFFICIENTS)
+        largest = np.abs(over_power(np.linspace(-1, 1, 200)) * np.linspace(0, 1, 200) ** order).max()
+    left_out = np.abs(found[::-1]).cumsum()[::-1]  # what is lost without this coefficient and those after it
+    count = int(np.argmax(left_out < CORRECTION_ERROR * largest))
+    if not 0 < count <= MOST_COEFFICIENTS:
+        return ()
+    of_y = chebyshev.Chebyshev(found[:count], domain=(0, 1)).convert(kind=np.polynomial.Polynomial, domain=(-1, 1))
+    return tuple(of_y.coef.tolist())
+
+
+#: Of each switch S(t), the power of t that S' has as a factor, and functions of t: (S - 1)/t^power, -S'/t^power.
+CORRECTED: dict[type, tuple[int, Callable]] = {
+    Switched: (2, lambda t: (-t * (10 - t * (15 - 6 * t)), 30 * (1 - t) ** 2)),
+    SmoothlySwitched: (
+        4,
+        lambda t: (-t * (126 - t * (420 - t * (540 - t * (315 - 70 * t)))), 630 * (1 - t) ** 4),
+    ),
+}
+
+
+def ended(shape, end, bend, r2, inverse, u, w):
+    """(energy, force/r) with the ending, from u, w without it at squared distances r2; scalars or vectors.
+
+    u already includes the constant of `end`. inverse : 1/r, where `needs_root` says so. bend : see `correction`
     """
     raise TypeError("compiled code only")
 
 
+def needs_root(shape, bend) -> bool:
+    """Whether a force with an ending needs 1/r, by their Numba types."""
+    return not is_a(shape, Plain) and len(bend) == 0
+
+
 @implements(ended, inline=True)
-def _ended(shape, end, r, inverse, u, w):
+def _ended(shape, end, bend, r2, inverse, u, w):
     if is_a(shape, Plain):
-        return lambda shape, end, r, inverse, u, w: (u, w)
+        return lambda shape, end, bend, r2, inverse, u, w: (u, w)
     if is_a(shape, Bent):
 
-        def bent(shape, end, r, inverse, u, w):
-            du, df = added(end, larger(r - shape.start, 0.0))
+        def bent(shape, end, bend, r2, inverse, u, w):
+            du, df = added(end, larger(r2 * inverse - shape.start, 0.0))
             return u + du, w + df * inverse
 
         return bent
 
-    if is_a(shape, Switched):
+    factor = quintic if is_a(shape, Switched) else nonic
+    if len(bend) == 0:
 
-        def switched(shape, end, r, inverse, u, w):
-            s, slope = quintic(shape, r)
+        def switched(shape, end, bend, r2, inverse, u, w):
+            s, slope = factor(shape, r2 * inverse)
             return s * u, s * w - slope * u * inverse
 
         return switched
 
-    def smoothly_switched(shape, end, r, inverse, u, w):
-        s, slope = nonic(shape, r)
-        return s * u, s * w - slope * u * inverse
+    is_nonic = factor is nonic
 
-    return smoothly_switched
+    def corrected(shape, end, bend, r2, inverse, u, w):
+        first = shape.start * shape.start
+        per_square = 1 / (shape.cutoff * shape.cutoff - first)
+        y = larger(r2 * per_square - first * per_square, 0.0)
+        power = y * y * y * y if is_nonic else y * y
+        s, _ = factor(shape, r2 * inverse_root(r2))  # for the energy alone
+        return s * u, w + power * polynomial(bend, y)
+
+    return corrected
 
 
 @kernel(inline=True, outer=True)

@@ -16,8 +16,10 @@ from rigidmd.forces.laws.endings import (
     Polynomial,
     Shape,
     added,
+    correction,
     ended,
     ending,
+    needs_root,
     shape_of,
 )  # fmt: skip
 from rigidmd.forces.pairs import loop as pairs
@@ -40,7 +42,9 @@ class LennardJones(NamedTuple):
         """What the loop reads: two numbers if all sites are of one kind, else a table with room for all slots."""
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
-            return OneKind(*head, float(self.c12[0, 0]), float(self.c6[0, 0]))
+            c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
+            bend = correction(self.shape, lambda r: _energy_and_force_at(c12, c6, r), dtype)
+            return OneKind(*head, c12, c6, bend)
         table = zeros((2, kinds * slots), dtype)
         return ManyKinds(*head, np.zeros(slots, np.int32), *table)
 
@@ -54,6 +58,7 @@ class OneKind(NamedTuple):
     end6: Polynomial
     c12: float
     c6: float
+    bend: tuple[float, ...]  # see endings.correction
 
 
 class ManyKinds(NamedTuple):
@@ -104,42 +109,47 @@ def _inverse_power(p: int):
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
 
 
+def _energy_and_force_at(c12: float, c6: float, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(energy, force/r) without an ending, in NumPy."""
+    return c12 * r**-12.0 - c6 * r**-6.0, 12 * c12 * r**-14.0 - 6 * c6 * r**-8.0
+
+
 @implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if is_a(law, OneKind):
-        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, r2)
+        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, law.bend, r2)
     if not is_a(law, ManyKinds):
         return None
 
     def pair(law, i, j, r2):
         at = law.kind[i] * len(law.kind) + j
-        return energy_and_force(law, load(law.c12, at), load(law.c6, at), r2)
+        return energy_and_force(law, load(law.c12, at), load(law.c6, at), (), r2)
 
     return pair
 
 
 @kernel(inline=True)
-def energy_and_force(law, c12, c6, r2):
-    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
-    inverse2, inverse1 = inverses(law.shape, r2)
+def energy_and_force(law, c12, c6, bend, r2):
+    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2; bend: see `endings.correction`."""
+    inverse2, inverse1 = inverses(law.shape, bend, r2)
     six = inverse2 * inverse2 * inverse2
     end = mixed(law.end12, law.end6, c12, c6)
     u = (c12 * six - c6) * six + end[0]
     w = (12 * c12 * six - 6 * c6) * six * inverse2
-    return ended(law.shape, end, r2 * inverse1, inverse1, u, w)
+    return ended(law.shape, end, bend, r2, inverse1, u, w)
 
 
-def inverses(shape, r2):
-    """(1/r², 1/r) at squared distances r2; without an ending 1/r is not needed, and is 0 to save the square root."""
+def inverses(shape, bend, r2):
+    """(1/r², 1/r) at squared distances r2; where 1/r is not needed it is 0, to save the square root."""
     raise TypeError("compiled code only")
 
 
 @implements(inverses, inline=True)
-def _inverses(shape, r2):
-    if is_a(shape, Plain):
-        return lambda shape, r2: (inverse(r2), 0.0)
+def _inverses(shape, bend, r2):
+    if not needs_root(shape, bend):
+        return lambda shape, bend, r2: (inverse(r2), 0.0)
 
-    def with_root(shape, r2):
+    def with_root(shape, bend, r2):
         inverse1 = inverse_root(r2)
         return inverse1 * inverse1, inverse1
 

@@ -114,7 +114,7 @@ def _energy_and_force(law, formula, end, r2):
         def with_root(law, formula, end, r2):
             inverse1 = inverse_root(r2)
             u, w = of_distance(formula, law.shared, r2, inverse1, inverse1 * inverse1)
-            return ended(law.shape, end, r2 * inverse1, inverse1, u + end[0], w)
+            return ended(law.shape, end, (), r2, inverse1, u + end[0], w)
 
         return with_root
 
