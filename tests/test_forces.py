@@ -572,7 +572,7 @@ def test_the_self_energy_of_the_reaction_field():
 @kernel(outer=True)
 def pair_forces_at(argon, charges, r2, found):
     for k in range(len(r2)):
-        found[k, 0] = energy_and_force(argon, argon.c12, argon.c6, argon.bend, r2[k])[1]
+        found[k, 0] = energy_and_force(argon, argon.c12, argon.c6, argon.correction, r2[k])[1]
         found[k, 1] = energy_and_force(argon, argon.c12, argon.c6, (), r2[k])[1]
         found[k, 2] = radial(charges, r2[k])[1]
 
@@ -583,7 +583,7 @@ def test_forces_of_a_switch_are_corrected_as_precisely_as_its_product_is_rounded
     law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start).room(1, np.float32)
     whole = reaction_field(np.zeros(1), 9.0, 78.5, name, start)
     charges = whole.room(1, np.float32)
-    assert law.bend and charges.bend and not whole.room(1, np.float64).bend
+    assert law.correction and charges.correction and not whole.room(1, np.float64).correction
     r = np.linspace(start - 1, 9.0, 2001)
     found, exact = np.empty((len(r), 3)), np.empty((len(r), 3))
     pair_forces_at(law, charges, r**2, found)
@@ -601,4 +601,4 @@ def test_forces_of_a_switch_are_corrected_as_precisely_as_its_product_is_rounded
 )
 def test_forces_of_a_wide_switch_are_the_product(name, start):
     law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start)
-    assert law.room(1, np.float32).bend == ()
+    assert law.room(1, np.float32).correction == ()

@@ -5,7 +5,7 @@
 see `noise`.
 """
 
-from math import exp, inf, sqrt
+from math import exp, expm1, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -157,8 +157,9 @@ def _stir(parcel, block):
     align_stack()
     first, end = share_of(len(state.velocity), block, TOGETHER)
     thermal = present(bath.thermal_energy, state)
-    keep, keep_turning = exp(-bath.friction_translation * h), exp(-bath.friction_rotation * h)
-    new = thermal_sizes(model, thermal * (1 - keep * keep), thermal * (1 - keep_turning * keep_turning))
+    passed, turned = bath.friction_translation * h, bath.friction_rotation * h
+    keep, keep_turning = exp(-passed), exp(-turned)
+    new = thermal_sizes(model, -thermal * expm1(-2 * passed), -thermal * expm1(-2 * turned))
     words, numbers = np.empty((2, 4, BATCH), np.uint64), np.empty(6 * BATCH)
     heat = 0.0
     for start in range(first, end, BATCH):

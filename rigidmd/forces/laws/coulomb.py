@@ -12,7 +12,7 @@ from rigidmd.forces.laws.endings import (
     Name,
     Polynomial,
     Shape,
-    correction,
+    correction_of,
     ended,
     ending,
     needs_root,
@@ -34,7 +34,7 @@ class ReactionField(NamedTuple):
     end: Polynomial  # see endings.ending
     field: float  # 1/Å³
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
-    bend: tuple[float, ...] = ()  # see endings.correction
+    correction: tuple[float, ...] = ()  # see endings.correction_of
 
     def room(self, slots: int, dtype: type) -> "ReactionField":
         """The law with room for the charges in slots, in the precision of lanes."""
@@ -42,7 +42,7 @@ class ReactionField(NamedTuple):
         def at(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return 1 / r + self.field * r**2 + self.end[0], r**-3 - 2 * self.field
 
-        return self._replace(charge=zeros(slots, dtype), bend=correction(self.shape, at, dtype))
+        return self._replace(charge=zeros(slots, dtype), correction=correction_of(self.shape, at, dtype))
 
 
 def reaction_field(
@@ -62,17 +62,17 @@ def reaction_field(
     return ReactionField(cutoff, shape, end, field, charge_e * COULOMB_CHARGE)
 
 
-def powers(shape, bend, r2):
+def powers(shape, correction, r2):
     """1/r, and two factors of 1/r³; where the force needs no 1/r they are found without it."""
     raise TypeError("compiled code only")
 
 
 @implements(powers, inline=True)
-def _powers_of(shape, bend, r2):
-    if not needs_root(shape, bend):
-        return lambda shape, bend, r2: root_and_cube(r2)
+def _powers_of(shape, correction, r2):
+    if not needs_root(shape, correction):
+        return lambda shape, correction, r2: root_and_cube(r2)
 
-    def of_inverse(shape, bend, r2):
+    def of_inverse(shape, correction, r2):
         inverse = inverse_root(r2)
         return inverse, inverse, inverse * inverse
 
@@ -82,10 +82,10 @@ def _powers_of(shape, bend, r2):
 @kernel(inline=True, outer=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
-    inverse, one, two = powers(law.shape, law.bend, r2)
+    inverse, one, two = powers(law.shape, law.correction, r2)
     u = inverse + law.field * r2 + law.end[0]
     w = one * two - 2 * law.field
-    return ended(law.shape, law.end, law.bend, r2, inverse, u, w)
+    return ended(law.shape, law.end, law.correction, r2, inverse, u, w)
 
 
 @implements(pairs.pair, inline=True)

@@ -93,7 +93,7 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
 CORRECTION_ERROR, MOST_COEFFICIENTS = 2e-7, 18
 
 
-def correction(
+def correction_of(
     shape: Shape, at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], dtype: type
 ) -> tuple[float, ...]:
     """Coefficients c0, c1, ... of what a switch adds to force/r beyond its start: y² or y⁴ (c0 + c1 y + c2 y² + ...).
@@ -136,35 +136,36 @@ CORRECTED: dict[type, tuple[int, Callable]] = {
 }
 
 
-def ended(shape, end, bend, r2, inverse, u, w):
+def ended(shape, end, correction, r2, inverse, u, w):
     """(energy, force/r) with the ending, from u, w without it at squared distances r2; scalars or vectors.
 
-    u already includes the constant of `end`. inverse : 1/r, where `needs_root` says so. bend : see `correction`
+    u already includes the constant of `end`. inverse : 1/r, where `needs_root` says so. For `correction` see
+    `correction_of`.
     """
     raise TypeError("compiled code only")
 
 
-def needs_root(shape, bend) -> bool:
+def needs_root(shape, correction) -> bool:
     """Whether a force with an ending needs 1/r, by their Numba types."""
-    return not is_a(shape, Plain) and len(bend) == 0
+    return not is_a(shape, Plain) and len(correction) == 0
 
 
 @implements(ended, inline=True)
-def _ended(shape, end, bend, r2, inverse, u, w):
+def _ended(shape, end, correction, r2, inverse, u, w):
     if is_a(shape, Plain):
-        return lambda shape, end, bend, r2, inverse, u, w: (u, w)
+        return lambda shape, end, correction, r2, inverse, u, w: (u, w)
     if is_a(shape, Bent):
 
-        def bent(shape, end, bend, r2, inverse, u, w):
+        def bent(shape, end, correction, r2, inverse, u, w):
             du, df = added(end, larger(r2 * inverse - shape.start, 0.0))
             return u + du, w + df * inverse
 
         return bent
 
     factor = quintic if is_a(shape, Switched) else nonic
-    if len(bend) == 0:
+    if len(correction) == 0:
 
-        def switched(shape, end, bend, r2, inverse, u, w):
+        def switched(shape, end, correction, r2, inverse, u, w):
             s, slope = factor(shape, r2 * inverse)
             return s * u, s * w - slope * u * inverse
 
@@ -172,13 +173,13 @@ def _ended(shape, end, bend, r2, inverse, u, w):
 
     is_nonic = factor is nonic
 
-    def corrected(shape, end, bend, r2, inverse, u, w):
+    def corrected(shape, end, correction, r2, inverse, u, w):
         first = shape.start * shape.start
         per_square = 1 / (shape.cutoff * shape.cutoff - first)
         y = larger(r2 * per_square - first * per_square, 0.0)
         power = y * y * y * y if is_nonic else y * y
         s, _ = factor(shape, r2 * inverse_root(r2))  # for the energy alone
-        return s * u, w + power * polynomial(bend, y)
+        return s * u, w + power * polynomial(correction, y)
 
     return corrected
 

@@ -16,7 +16,7 @@ from rigidmd.forces.laws.endings import (
     Polynomial,
     Shape,
     added,
-    correction,
+    correction_of,
     ended,
     ending,
     needs_root,
@@ -43,8 +43,8 @@ class LennardJones(NamedTuple):
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
             c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
-            bend = correction(self.shape, lambda r: _energy_and_force_at(c12, c6, r), dtype)
-            return OneKind(*head, c12, c6, bend)
+            correction = correction_of(self.shape, lambda r: _energy_and_force_at(c12, c6, r), dtype)
+            return OneKind(*head, c12, c6, correction)
         table = zeros((2, kinds * slots), dtype)
         return ManyKinds(*head, np.zeros(slots, np.int32), *table)
 
@@ -58,7 +58,7 @@ class OneKind(NamedTuple):
     end6: Polynomial
     c12: float
     c6: float
-    bend: tuple[float, ...]  # see endings.correction
+    correction: tuple[float, ...]  # see endings.correction_of
 
 
 class ManyKinds(NamedTuple):
@@ -117,7 +117,7 @@ def _energy_and_force_at(c12: float, c6: float, r: np.ndarray) -> tuple[np.ndarr
 @implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if is_a(law, OneKind):
-        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, law.bend, r2)
+        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, law.correction, r2)
     if not is_a(law, ManyKinds):
         return None
 
@@ -129,27 +129,27 @@ def _pair(law, i, j, r2):
 
 
 @kernel(inline=True)
-def energy_and_force(law, c12, c6, bend, r2):
-    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2; bend: see `endings.correction`."""
-    inverse2, inverse1 = inverses(law.shape, bend, r2)
+def energy_and_force(law, c12, c6, correction, r2):
+    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2; of the correction see `endings`."""
+    inverse2, inverse1 = inverses(law.shape, correction, r2)
     six = inverse2 * inverse2 * inverse2
     end = mixed(law.end12, law.end6, c12, c6)
     u = (c12 * six - c6) * six + end[0]
     w = (12 * c12 * six - 6 * c6) * six * inverse2
-    return ended(law.shape, end, bend, r2, inverse1, u, w)
+    return ended(law.shape, end, correction, r2, inverse1, u, w)
 
 
-def inverses(shape, bend, r2):
+def inverses(shape, correction, r2):
     """(1/r², 1/r) at squared distances r2; where 1/r is not needed it is 0, to save the square root."""
     raise TypeError("compiled code only")
 
 
 @implements(inverses, inline=True)
-def _inverses(shape, bend, r2):
-    if not needs_root(shape, bend):
-        return lambda shape, bend, r2: (inverse(r2), 0.0)
+def _inverses(shape, correction, r2):
+    if not needs_root(shape, correction):
+        return lambda shape, correction, r2: (inverse(r2), 0.0)
 
-    def with_root(shape, bend, r2):
+    def with_root(shape, correction, r2):
         inverse1 = inverse_root(r2)
         return inverse1 * inverse1, inverse1
 
