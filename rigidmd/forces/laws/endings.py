@@ -96,44 +96,31 @@ CORRECTION_ERROR, MOST_COEFFICIENTS = 2e-7, 18
 def correction_of(
     shape: Shape, at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], dtype: type
 ) -> tuple[float, ...]:
-    """Coefficients c0, c1, ... of what a switch adds to force/r beyond its start: y² or y⁴ (c0 + c1 y + c2 y² + ...).
+    """Coefficients c0, c1, ... of what `switch` adds to force/r beyond its start: (x + 1)² (c0 + c1 x + c2 x² + ...).
 
-    y is 0 at the start and 1 at the cut-off, evenly in r², so that forces need no root and no energy. at(r) gives
-    energy and force/r of the law without its ending. There are none, (), in double precision, which would take so many
-    that little is gained; of other endings; and of a switch that is too wide.
+    x goes from -1 at the start to 1 at the cut-off, evenly in r², so that forces need no root and no energy. In powers
+    of x + 1 the terms would be thousands of times their sum. at(r) gives energy and force/r of the law without its
+    ending. There are none, (), in double precision, which would take so many that little is gained; of other endings;
+    and of a switch that is too wide.
     """
-    if type(shape) not in CORRECTED or dtype != np.float32:
+    if not isinstance(shape, Switched) or dtype != np.float32:
         return ()
-    order, factors = CORRECTED[type(shape)]
     width, square = shape.cutoff - shape.start, shape.cutoff**2 - shape.start**2
 
-    def over_power(x: np.ndarray) -> np.ndarray:
-        y = (x + 1) / 2
-        r = np.sqrt(shape.start**2 + y * square)
-        per_y = square / ((r + shape.start) * width)  # t = (r - start)/width is per_y y
+    def over_square(x: np.ndarray) -> np.ndarray:
+        r = np.sqrt(shape.start**2 + (x + 1) / 2 * square)
+        per_x = square / (2 * (r + shape.start) * width)  # t = (r - start)/width is per_x (x + 1)
+        t = per_x * (x + 1)
         u, w = at(r)
-        fallen, slope = factors(y * per_y)
-        return per_y**order * (fallen * w + slope / width * u / r)
+        return per_x**2 * (30 * (1 - t) ** 2 / width * u / r - t * (10 - t * (15 - 6 * t)) * w)
 
     with np.errstate(all="ignore"):  # a switch from 0 on is too wide
-        found = chebyshev.chebinterpolate(over_power, 2 * MOST_COEFFICIENTS)
-        largest = np.abs(over_power(np.linspace(-1, 1, 200)) * np.linspace(0, 1, 200) ** order).max()
-    left_out = np.abs(found[::-1]).cumsum()[::-1]  # what is lost without this coefficient and those after it
+        found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
+        x = np.linspace(-1, 1, 200)
+        largest = np.abs((x + 1) ** 2 * over_square(x)).max()
+    left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]  # at most, without this coefficient and those after it
     count = int(np.argmax(left_out < CORRECTION_ERROR * largest))
-    if not 0 < count <= MOST_COEFFICIENTS:
-        return ()
-    of_y = chebyshev.Chebyshev(found[:count], domain=(0, 1)).convert(kind=np.polynomial.Polynomial, domain=(-1, 1))
-    return tuple(of_y.coef.tolist())
-
-
-#: Of each switch S(t), the power of t that S' has as a factor, and functions of t: (S - 1)/t^power, -S'/t^power.
-CORRECTED: dict[type, tuple[int, Callable]] = {
-    Switched: (2, lambda t: (-t * (10 - t * (15 - 6 * t)), 30 * (1 - t) ** 2)),
-    SmoothlySwitched: (
-        4,
-        lambda t: (-t * (126 - t * (420 - t * (540 - t * (315 - 70 * t)))), 630 * (1 - t) ** 4),
-    ),
-}
+    return tuple(chebyshev.cheb2poly(found[:count]).tolist()) if 0 < count <= MOST_COEFFICIENTS else ()
 
 
 def ended(shape, end, correction, r2, inverse, u, w):
@@ -171,15 +158,12 @@ def _ended(shape, end, correction, r2, inverse, u, w):
 
         return switched
 
-    is_nonic = factor is nonic
-
     def corrected(shape, end, correction, r2, inverse, u, w):
-        first = shape.start * shape.start
-        per_square = 1 / (shape.cutoff * shape.cutoff - first)
-        y = larger(r2 * per_square - first * per_square, 0.0)
-        power = y * y * y * y if is_nonic else y * y
-        s, _ = factor(shape, r2 * inverse_root(r2))  # for the energy alone
-        return s * u, w + power * polynomial(correction, y)
+        first, last = shape.start * shape.start, shape.cutoff * shape.cutoff
+        x = larger(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
+        beyond = x + 1.0
+        s, _ = quintic(shape, r2 * inverse_root(r2))  # for the energy alone
+        return s * u, w + beyond * beyond * polynomial(correction, x)
 
     return corrected
 
