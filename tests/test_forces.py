@@ -14,6 +14,7 @@ from rigidmd.core.state import no_load
 from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.laws.coulomb import radial, reaction_field
+from rigidmd.forces.laws.endings import Plain
 from rigidmd.forces.laws.lennard_jones import energy_and_force, lennard_jones
 from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import AHEAD, BUILDS, BUILT, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
@@ -577,19 +578,26 @@ def pair_forces_at(argon, charges, r2, found):
         found[k, 2] = radial(charges, r2[k])[1]
 
 
-@pytest.mark.parametrize(("name", "start"), [("switch", 8.1), ("switch", 7.2), ("switch", 6.8)])
-def test_forces_of_a_switch_are_corrected_as_precisely_as_its_product_is_rounded(name, start):
-    """In mixed precision: without a root, a polynomial in r² is added to the force. Here both in double precision."""
-    law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start).room(1, np.float32)
-    whole = reaction_field(np.zeros(1), 9.0, 78.5, name, start)
+@pytest.mark.parametrize("start", [8.1, 7.2, 6.8])
+def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
+    """The polynomial in r² that mixed precision adds to the force: here in double precision, and how far its terms
+    cancel, which single precision would show."""
+    kind, sigma, epsilon = np.zeros(1, np.int32), np.array([3.4]), np.array([100.0])
+    law = lennard_jones(kind, sigma, epsilon, 9.0, "switch", start).room(1, np.float32)
+    plain = lennard_jones(kind, sigma, epsilon, 9.0).room(1, np.float32)
+    whole = reaction_field(np.zeros(1), 9.0, 78.5, "switch", start)
+    bare = whole._replace(shape=Plain(9.0))
     charges = whole.room(1, np.float32)
     assert law.correction and charges.correction and not whole.room(1, np.float64).correction
     r = np.linspace(start - 1, 9.0, 2001)
-    found, exact = np.empty((len(r), 3)), np.empty((len(r), 3))
+    found, exact, without = (np.empty((len(r), 3)) for _ in range(3))
     pair_forces_at(law, charges, r**2, found)
     pair_forces_at(law, whole, r**2, exact)
+    pair_forces_at(plain, bare, r**2, without)
     before = r < start
-    for corrected, product in ((found[:, 0], exact[:, 1]), (found[:, 2], exact[:, 2])):
+    for k, product, coefficients in ((0, exact[:, 1], law.correction), (2, exact[:, 2], charges.correction)):
+        corrected = found[:, k]
+        assert 4 * np.abs(coefficients).sum() < 200 * np.abs(corrected - without[:, k]).max()
         largest = np.abs(product[~before]).max()
         assert np.abs(corrected - product).max() < 3e-7 * largest
         assert corrected[before] == pytest.approx(product[before], rel=1e-14)
@@ -599,6 +607,6 @@ def test_forces_of_a_switch_are_corrected_as_precisely_as_its_product_is_rounded
 @pytest.mark.parametrize(
     ("name", "start"), [("switch", 0.0), ("switch", 5.0), ("smooth_switch", 8.0), ("force_switch", 8.0)]
 )
-def test_forces_of_a_wide_switch_are_the_product(name, start):
+def test_a_wide_switch_and_other_endings_have_no_correction(name, start):
     law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start)
     assert law.room(1, np.float32).correction == ()

@@ -38,7 +38,10 @@ def key_of(seed: int, purpose: int, stage: int = 0) -> Key:
 
 @kernel(outer=True, inline=True)
 def philox(key, draw, molecule, step):
-    """Four 32-bit numbers, as uint64, for a counter with draw and molecule below 2^32, step below 2^63."""
+    """Four 32-bit numbers, as uint64, for a counter with draw and molecule below 2^32, step below 2^63.
+
+    It is inlined, since the loop of `fill_words` is vectorised only then.
+    """
     a, b = np.uint64(draw) & LOW, np.uint64(molecule) & LOW
     c, d = np.uint64(step) & LOW, np.uint64(step) >> HALF
     low, high = key.low, key.high

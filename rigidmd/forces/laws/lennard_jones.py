@@ -39,7 +39,7 @@ class LennardJones(NamedTuple):
     c6: np.ndarray  # (kinds, kinds) u Å⁸/ps²
 
     def room(self, slots: int, dtype: type) -> "OneKind | ManyKinds":
-        """What the loop reads: two numbers if all sites are of one kind, else a table with room for all slots."""
+        """What the loop reads: numbers if all sites are of one kind, else a table with room for all slots."""
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
             c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
