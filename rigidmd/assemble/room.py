@@ -66,8 +66,15 @@ def bytes_of(system: "System") -> int:
 
 
 def array_bytes(value: tuple) -> int:
-    """Bytes of all arrays in nested tuples; each array counts once."""
-    return sum({id(array): array.nbytes for array in _arrays(value)}.values())
+    """Bytes of all arrays in nested tuples; each array counts once, and so does memory that several have in common."""
+    return sum({id(owner): owner.nbytes for owner in map(_owner, _arrays(value))}.values())
+
+
+def _owner(array: np.ndarray) -> np.ndarray:
+    """The array that has the memory of another one."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
 
 
 def _arrays(value) -> Iterator[np.ndarray]:

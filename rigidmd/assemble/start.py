@@ -81,7 +81,7 @@ def residue_numbers(arrangement: Arrangement) -> np.ndarray:
     """Residue numbers (n,) of the file, or else 1, 2, ... within each species."""
     if arrangement.number is not None:
         return arrangement.number
-    found = np.zeros(len(arrangement.species), int)
+    found = np.zeros(len(arrangement.species), np.int32)
     for k in np.unique(arrangement.species):
         own = arrangement.species == k
         found[own] = np.arange(1, own.sum() + 1)

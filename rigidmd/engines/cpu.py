@@ -35,6 +35,7 @@ from rigidmd.forces.terms import (
     Loading,
     NoForce,
     Setup,
+    in_common,
     memory_of,
     recalled,
     tally_now,
@@ -224,7 +225,8 @@ class Engine:
         own = self._prepare(state)
         kept = {name: {key: memory[f"{name}.{key}"] for key in of} for name, of in _by_owner(memory).items()}
         pairs = zip(self.names, own, strict=False)
-        self._workspaces = tuple(recalled(workspace, kept.get(name, {})) for name, workspace in pairs) or own
+        found = tuple(recalled(workspace, kept.get(name, {})) for name, workspace in pairs)
+        self._workspaces = in_common(found) or own
         self.load, self._stale = no_load(state), LOAD not in kept
         self._loadings.pop("steps", None)  # what it knows of energies belongs to another moment
         if LOAD in kept:
@@ -245,7 +247,7 @@ class Engine:
     def room(self, state: State) -> tuple[NamedTuple, ...]:
         """New workspaces for the cell of a state, without machine code; they show the memory needed."""
         setup = self._setup._replace(cell=state.cell)
-        return tuple(workspace_of(term, setup) for term in self.terms.values()) or (NoForce(),)
+        return in_common(tuple(workspace_of(term, setup) for term in self.terms.values())) or (NoForce(),)
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         """Check the arrays for compiled code; return its workspaces, made at the first use."""
@@ -270,7 +272,8 @@ class Engine:
         """Handle a status of compiled code; return the workspaces with which to call it again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
-            workspaces = self._workspaces = tuple(with_room(workspace, state.cell) for workspace in workspaces)
+            enlarged = tuple(with_room(workspace, state.cell) for workspace in workspaces)
+            workspaces = self._workspaces = in_common(enlarged)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:

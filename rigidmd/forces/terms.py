@@ -52,6 +52,15 @@ def with_room(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
     return workspace.with_room(cell) if hasattr(workspace, "with_room") else workspace
 
 
+def in_common(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
+    """The workspaces with one array, the largest of theirs, for what each needs only while its forces are computed."""
+    passing = [workspace.passing for workspace in workspaces if hasattr(workspace, "passing")]
+    if not passing:
+        return workspaces
+    largest = max(passing, key=np.size)
+    return tuple(own.with_passing(largest) if hasattr(own, "passing") else own for own in workspaces)
+
+
 def memory_of(workspace: NamedTuple) -> dict[str, np.ndarray]:
     """Arrays on which the next forces depend besides the state, for `recalled`; none of most workspaces."""
     return workspace.memory() if hasattr(workspace, "memory") else {}

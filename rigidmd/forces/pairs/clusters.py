@@ -21,13 +21,14 @@ class Clusters(NamedTuple):
     """The sites of one law in clusters. The last cluster is padded with copies of the last site."""
 
     bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
-    order: np.ndarray  # (slots,) int32 the site in each slot
     slot: np.ndarray  # (s,) int32 the slot of each site
-    group: np.ndarray  # (slots,) int32 group of the site in each slot
     boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is moved back into the brick
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
     local: np.ndarray  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
-    half_square: np.ndarray  # (3 slots,) half the squares of `reference` as vectors, Å²; later scratch
+    scratch: np.ndarray  # (3 slots,) the memory of the next three, which only a list that is being built needs
+    order: np.ndarray  # (slots,) int32 the site in each slot
+    group: np.ndarray  # (slots,) int32 group of the site in each slot
+    half_square: np.ndarray  # (slots,) half the squares of `reference` as vectors, Å²
     reference: np.ndarray  # (3 slots,) the places for which the sites were sorted, as `local`
     moved: np.ndarray  # (slots,) distance of each site from there, Å
     farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
@@ -42,20 +43,31 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
     # number of blocks grows as the edge of the box: memory for the sums is then in proportion to the sites.
     blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > SERIAL_SITES else 1
     slots = count * width
+    scratch = zeros(3 * slots, dtype)
+    half_square, order, group = scratch.reshape(3, slots)
     return Clusters(
         bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
-        order=np.zeros(slots, np.int32),
         slot=np.zeros(sites, np.int32),
-        group=zeros(slots, np.int32),
         boxes=np.zeros((sites, 3), np.int32),
         origin=zeros(4 * count, np.float64),
         local=zeros(3 * slots, dtype),
-        half_square=zeros(3 * slots, dtype),
+        scratch=scratch,
+        order=order.view(np.int32)[:slots],
+        group=group.view(np.int32)[:slots],
+        half_square=half_square,
         reference=zeros(3 * slots, dtype),
         moved=zeros(slots, dtype),
         extent=np.zeros((blocks, 6)),
         farthest=np.zeros(blocks),
     )
+
+
+def order_of(clusters: Clusters) -> np.ndarray:
+    """`Clusters.order` after the build, when its memory serves something else."""
+    order = np.empty_like(clusters.order)
+    order[clusters.slot] = np.arange(len(clusters.slot))
+    order[len(clusters.slot) :] = order[len(clusters.slot) - 1]
+    return order
 
 
 @kernel(inline=True)

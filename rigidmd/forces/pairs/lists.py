@@ -26,7 +26,7 @@ from rigidmd.compile import kernel
 from rigidmd.compile.lanes import lane_count, zeros
 from rigidmd.core.state import CELL_CHANGED
 from rigidmd.errors import SimulationError
-from rigidmd.forces.pairs.clusters import Clusters, clusters_of
+from rigidmd.forces.pairs.clusters import Clusters, clusters_of, order_of
 from rigidmd.forces.pairs.tree import BoxTree, box_tree
 
 IMAGE_BITS = 6
@@ -169,8 +169,8 @@ def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) ->
     return min(count, ceil(count * (min(layers, 0.5) + 1 / blocks)))
 
 
-#: Arrays of `Clusters` from which a list is built again as it was.
-REMEMBERED = ("order", "boxes", "origin", "reference")
+#: Arrays of `Clusters` from which a list is built again as it was, besides the order of the sites.
+REMEMBERED = ("boxes", "origin", "reference")
 
 
 def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
@@ -178,7 +178,7 @@ def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
     found = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
         found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED}
-        found |= {"built": pairs.built, "times": pairs.times}
+        found |= {"order": order_of(pairs.clusters), "built": pairs.built, "times": pairs.times}
     return found
 
 
@@ -190,7 +190,7 @@ def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
     skin = float(memory["skin"])
     pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     clusters = pairs.clusters
-    for name in REMEMBERED:
+    for name in (*REMEMBERED, "order"):
         array = getattr(clusters, name)
         if name in memory:
             if (memory[name].shape, memory[name].dtype) != (array.shape, array.dtype):
@@ -201,7 +201,7 @@ def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
         if not np.array_equal(np.sort(clusters.order[:sites]), np.arange(sites)):
             raise ValueError("order of a list is none of its sites")
         clusters.slot[clusters.order[:sites]] = np.arange(sites)
-        clusters.group[: len(clusters.order)] = pairs.group[clusters.order]
+        clusters.group[:] = pairs.group[clusters.order]
     if "built" in memory:  # the update of the list then follows the cell of the state
         pairs.cell[:] = memory["built"]
     if "times" in memory:

@@ -87,7 +87,7 @@ class PairForces(NamedTuple):
         pairs = empty_list(setup.cell, self.group, reach, law.cutoff, setup.skin, setup.dtype)
         blocks, slots = len(pairs.needed), len(pairs.clusters.order)
         sums = Sums(
-            own=pairs.clusters.half_square,  # no list is built while forces are summed
+            own=pairs.clusters.scratch,  # no list is built while forces are summed
             others=_room_for_others(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
             before=zeros((blocks, 3 * lane_count(setup.dtype)), setup.dtype),
             tallies=np.zeros((blocks, TALLY_SIZE)),
@@ -108,6 +108,16 @@ class PairWorkspace(NamedTuple):
     with_energies: np.ndarray | None  # (1,) of the loader; None where virials are never asked for without them
     list_code: Code | None = None
     code: Code | None = None
+
+    @property
+    def passing(self) -> np.ndarray:
+        """The array that it needs only while its forces are computed."""
+        return self.sums.others
+
+    def with_passing(self, memory: np.ndarray) -> "PairWorkspace":
+        """With that array in memory of the same type, which may be larger."""
+        others = self.sums.others
+        return self._replace(sums=self.sums._replace(others=memory.reshape(-1)[: others.size].reshape(others.shape)))
 
     @property
     def site_force(self) -> np.ndarray:

@@ -69,10 +69,14 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np
     counts = np.array([len(own) for own in offsets])
     first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
     molecule = np.repeat(np.arange(len(species), dtype=np.int32), counts[species])
+    if np.array_equal(molecule, first[:-1]):
+        molecule = first[:-1]  # a site of each: one array will do
     offset = np.concatenate(offsets)
     if not offset.any():
         return CentralSites(first, molecule)
     kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
+    if np.array_equal(kind, species):
+        kind = species  # as of one species
     return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
 
 
