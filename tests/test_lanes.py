@@ -72,16 +72,17 @@ def sums_of_six(x, out):
     width = lanes.width_of(x)
     one = lanes.load(x, 0), lanes.load(x, width), lanes.load(x, 2 * width)
     two = lanes.load(x, 3 * width), lanes.load(x, 4 * width), lanes.load(x, 5 * width)
-    lanes.store_totals(out, 1, 3, one, two)
+    lanes.add_totals(out, 1, 3, one, two)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
-def test_six_sums_over_lanes_are_stored_in_pairs(dtype):
+def test_six_sums_over_lanes_are_added_in_pairs(dtype):
     x = np.random.default_rng(2).uniform(-1, 1, (6, lanes.lane_count(dtype))).astype(dtype)
-    out = np.zeros(10, dtype)
+    out = np.arange(10).astype(dtype)
     sums_of_six(x.ravel(), out)
-    expected = np.zeros(10)
-    expected[[1, 4, 7]], expected[[2, 5, 8]] = x[:3].sum(axis=1, dtype=float), x[3:].sum(axis=1, dtype=float)
+    expected = np.arange(10.0)
+    expected[[1, 4, 7]] += x[:3].sum(axis=1, dtype=float)
+    expected[[2, 5, 8]] += x[3:].sum(axis=1, dtype=float)
     assert out == pytest.approx(expected, rel=0, abs=16 * float(np.finfo(dtype).eps))
 
 

@@ -523,8 +523,8 @@ def _in_halves(builder, value, count):
 
 
 @intrinsic
-def store_totals(typing, array, index, step, x, y):
-    """Write the sums of all lanes of vectors x[k] and y[k] to array[index + k step] and array[index + k step + 1].
+def add_totals(typing, array, index, step, x, y):
+    """Add the sums of all lanes of vectors x[k] and y[k] to array[index + k step] and array[index + k step + 1].
 
     x, y : tuples of three vectors. All six are summed together, in the precision of the array, which takes fewer
     instructions than six times `total`.
@@ -554,7 +554,8 @@ def store_totals(typing, array, index, step, x, y):
         data = context.make_array(array)(context, builder, into).data
         for own in sums:
             there = builder.bitcast(builder.gep(data, [index]), own.type.as_pointer())
-            builder.store(own, there, align=array.dtype.bitwidth // 8)
+            align = array.dtype.bitwidth // 8
+            builder.store(builder.fadd(builder.load(there, align=align), own), there, align=align)
             index = builder.add(index, step)
         return context.get_dummy_value()
 

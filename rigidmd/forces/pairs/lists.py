@@ -40,6 +40,7 @@ ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
 
 # Columns of PairList.needed and PairList.counters.
+# WINDOW: clusters behind those of the block, of which its rows reach the last.
 ENTRIES, MASKED, MET, WINDOW, MET_BY_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 BUILT, AHEAD = 0, 1  # of PairList.times
@@ -73,7 +74,7 @@ class PairList(NamedTuple):
     near: np.ndarray  # (clusters,) int32
     met: np.ndarray  # (blocks, capacity) int32
     apart: np.ndarray  # (blocks, 3 capacity) from the origins of what is met to that of c, Å; (blocks, 0) in float64
-    needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters from the first, met by one
+    needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters behind the block, met by one
     counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
     times: np.ndarray  # (2,) when the list was built, NaN before; how far ahead the places are for which it was; ps
 
@@ -88,6 +89,15 @@ def cluster_of(image):
 def number_of(image):
     """The number of an image."""
     return image & (IMAGES - 1)
+
+
+@kernel(inline=True)
+def behind_block(bounds, block, cluster):
+    """How many clusters there are on the ring from the end of a block to a cluster; -1 for a cluster of the block."""
+    first, end = bounds[block], bounds[block + 1]
+    if first <= cluster < end:
+        return -1
+    return cluster - end + (bounds[len(bounds) - 1] if cluster < end else 0)
 
 
 def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
@@ -161,12 +171,12 @@ def _clusters_met(cell: np.ndarray, count: int, radius: float, size: float) -> f
 
 
 def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
-    """Expected number of clusters from the first of a block to the last in its rows."""
+    """Expected number of clusters behind a block of which its rows reach the last."""
     volume = cell.diagonal().prod()
     if volume == inf or radius == inf:
         return 0
     layers = (radius + 2 * np.cbrt(volume / count)) / cell[0, 0]  # clusters are sorted along x first
-    return min(count, ceil(count * (min(layers, 0.5) + 1 / blocks)))
+    return min(count - count // blocks, ceil(count * min(layers, 0.5)))
 
 
 #: Arrays of `Clusters` from which a list is built again as it was, besides the order of the sites.

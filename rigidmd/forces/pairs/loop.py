@@ -13,6 +13,7 @@ from numba import types
 
 from rigidmd.compile import Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.compile.lanes import (
+    add_totals,
     align_stack,
     double,
     fill,
@@ -26,7 +27,6 @@ from rigidmd.compile.lanes import (
     select,
     spread,
     store,
-    store_totals,
     total,
     width_of,
     zeros,
@@ -40,6 +40,7 @@ from rigidmd.forces.pairs.lists import (
     USABLE,
     WINDOW,
     PairList,
+    behind_block,
     cluster_of,
     empty_list,
     end_of_row,
@@ -66,8 +67,8 @@ from rigidmd.forces.terms import Setup
 class Sums(NamedTuple):
     """Sums of forces and energies."""
 
-    own: np.ndarray  # (3 slots,) force on each site from its own row, then from all rows; stored as Clusters.local
-    others: np.ndarray  # (blocks, room) forces of a block's rows on the clusters from its first one on
+    own: np.ndarray  # (3 slots,) force on each site from the rows of its block, then from all; as Clusters.local
+    others: np.ndarray  # (blocks, room) forces of a block's rows on the clusters behind the block
     before: np.ndarray  # (blocks, 3 lanes) force on a row when the image of its entries changed last, see `_cross`
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `room_for_virial`
@@ -319,7 +320,7 @@ def _gather_and_count(parcel, block):
 
 @kernel(inline=True, counted=False)
 def block_forces(law, pairs, into, tallies, energies, block):
-    """Forces from the rows of one block: on their own sites into `own`, on the sites of their entries into `others`.
+    """Forces from the rows of one block: on the sites of the block into `own`, on those behind it into `others`.
 
     into : `Sums`. tallies : (blocks, 10) for a part of the virial, or None. energies : the same array, or None
 
@@ -331,17 +332,18 @@ def block_forces(law, pairs, into, tallies, energies, block):
     align_stack()
     clusters = pairs.clusters
     width = width_of(clusters.local)
-    others, before = into.others[block], into.before[block]
+    own, others, before = into.own, into.others[block], into.before[block]
+    bounds = (clusters.bounds[block], clusters.bounds[block + 1])
+    own[3 * width * bounds[0] : 3 * width * bounds[1]] = 0.0
     others[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
     if tallies is not None:
         tallies[block] = 0.0
     entries = pairs.entries[block]
     masked = pairs.masked[block]
-    first = clusters.bounds[block]
     zero = fill(0.0, clusters.local)
     moved = farthest(pairs)
     first_met = first_entry = first_special = 0
-    for c in range(first, clusters.bounds[block + 1]):
+    for c in range(bounds[0], bounds[1]):
         met, apart = pairs.met[block, first_met:], pairs.apart[block, 3 * first_met :]
         for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
@@ -356,7 +358,7 @@ def block_forces(law, pairs, into, tallies, energies, block):
                 if tallies is not None:
                     number = _cross(pairs, number, number_of(image), sums, before, tallies[block])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
-                sums = _meet(law, pairs, first, i, other, between, masks, others, sums, energies)
+                sums = _meet(law, pairs, bounds, i, other, between, masks, own, others, sums, energies)
             # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
             # processor's queues before those of the next entry could enter.
             last = end_of_row(pairs, i // 2, moved) - 1
@@ -368,13 +370,13 @@ def block_forces(law, pairs, into, tallies, energies, block):
                 ahead, its_image, after = _displacements(pairs, c, here, met, apart, item(entries, min(n + 1, last)))
                 if tallies is not None:
                     number = _cross(pairs, number, number_of(image), sums, before, tallies[block])
-                sums = _meet(law, pairs, first, i, other, between, (None, None), others, sums, energies)
+                sums = _meet(law, pairs, bounds, i, other, between, (None, None), own, others, sums, energies)
                 other, image, between = ahead, its_image, after
             if tallies is not None:
                 _cross(pairs, number, 0, sums, before, tallies[block])
             first_entry, first_special = pairs.row[i // 2], pairs.special[i // 2]
             on_one, on_two, energy = sums
-            store_totals(into.own, at, width, on_one, on_two)
+            add_totals(own, at, width, on_one, on_two)
             if energies is not None:
                 energies[block, 0] += total(energy)
         first_met = pairs.near[c]
@@ -463,10 +465,11 @@ def _separation(here, x, y, z):
 
 
 @kernel(inline=True)
-def _meet(law, pairs, first, i, other, between, masks, others, sums, energies):
-    """Forces between the sites in slots i, i + 1 and those of a cluster, added to `others` and `sums`; energies too.
+def _meet(law, pairs, bounds, i, other, between, masks, own, others, sums, energies):
+    """Forces between the sites in slots i, i + 1 and those of a cluster, added to `sums` and, if the cluster is of the
+    block, to `own`, else to `others`; energies too.
 
-    energies : None if they are not wanted. first : the first cluster of the block
+    energies : None if they are not wanted. bounds : of the block, see `Clusters`
     """
     width = width_of(pairs.clusters.local)
     on_one, on_two, energy = sums
@@ -474,12 +477,16 @@ def _meet(law, pairs, first, i, other, between, masks, others, sums, energies):
     bx, by, bz, _ = between[1]
     one, of_one = _act(law, i, width * other, between[0][3], masks[0])
     two, of_two = _act(law, i + 1, width * other, between[1][3], masks[1])
-    turn = len(pairs.clusters.origin) // 4 if other < first else 0
-    at = 3 * width * (other - first + turn)
+    first, end = bounds
+    turn = len(pairs.clusters.origin) // 4 if other < end else 0
+    at, there = other - end + turn, others
+    if (other >= first) & (other < end):
+        at, there = other, own
+    at = 3 * width * at
     # Each product is in one expression with the sum to which it is added, so that the two are one multiply-add.
-    store(others, at, load(others, at) - one * ax - two * bx)
-    store(others, at + width, load(others, at + width) - one * ay - two * by)
-    store(others, at + 2 * width, load(others, at + 2 * width) - one * az - two * bz)
+    store(there, at, load(there, at) - one * ax - two * bx)
+    store(there, at + width, load(there, at + width) - one * ay - two * by)
+    store(there, at + 2 * width, load(there, at + 2 * width) - one * az - two * bz)
     on_one = (on_one[0] + one * ax, on_one[1] + one * ay, on_one[2] + one * az)
     on_two = (on_two[0] + two * bx, on_two[1] + two * by, on_two[2] + two * bz)
     if energies is None:
@@ -513,7 +520,7 @@ def _act(law, i, j, r2, mask):
 
 @kernel(inline=True, counted=False)
 def gather_block(pairs, own, others, tallies, block):
-    """Forces on the sites of a block from their own rows and from all blocks, added in a fixed order.
+    """Forces on the sites of a block from its own rows and from those of other blocks, added in a fixed order.
 
     With tallies, the rest of the virial is added: the sum over sites of f (x) place. All forces add up to zero, so that
     places may be relative to a cluster of the system: where they are small, so is what rounding of forces does.
@@ -545,15 +552,13 @@ def gather_block(pairs, own, others, tallies, block):
 @kernel(inline=True)
 def _gathered(pairs, own, others, c):
     """The forces on the sites of a cluster, in double precision."""
-    width, count = width_of(pairs.clusters.local), len(pairs.clusters.origin) // 4
+    width, bounds = width_of(pairs.clusters.local), pairs.clusters.bounds
     at = 3 * width * c
     x, y, z = double(load(own, at)), double(load(own, at + width)), double(load(own, at + 2 * width))
     for b in range(len(others)):
-        ahead = c - pairs.clusters.bounds[b]
-        if ahead < 0:
-            ahead += count
-        if ahead < pairs.needed[b, WINDOW]:
-            there, at = others[b], 3 * width * ahead
+        behind = behind_block(bounds, b, c)
+        if 0 <= behind < pairs.needed[b, WINDOW]:
+            there, at = others[b], 3 * width * behind
             x, y = x + double(load(there, at)), y + double(load(there, at + width))
             z = z + double(load(there, at + 2 * width))
     return x, y, z

@@ -32,6 +32,7 @@ from rigidmd.forces.pairs.lists import (
     ROUNDING,
     SHELLS,
     WINDOW,
+    behind_block,
     cluster_of,
     number_of,
 )  # fmt: skip
@@ -192,7 +193,6 @@ def _fill_rows(pairs, block, c, scratch, candidates):
 @kernel(inline=True)
 def _meet(pairs, block, c, scratch, met):
     """List what the rows of a cluster meet: the first of the candidates."""
-    count = len(pairs.clusters.origin) // 4
     there, apart, filled = pairs.met[block], pairs.apart[block], scratch.filled
     first = filled[MET]
     for n in range(met):
@@ -202,10 +202,7 @@ def _meet(pairs, block, c, scratch, met):
             if len(apart) > 0:
                 for k in range(3):
                     apart[3 * (first + n) + k] = _apart(pairs, c, other, image, k)
-        ahead = other - c
-        if ahead < 0:
-            ahead += count
-        filled[WINDOW] = max(filled[WINDOW], min(ahead + c - pairs.clusters.bounds[block] + 1, count))
+        filled[WINDOW] = max(filled[WINDOW], behind_block(pairs.clusters.bounds, block, other) + 1)
     filled[MET] += met
     filled[MET_BY_ONE] = max(filled[MET_BY_ONE], met)
     pairs.near[c] = min(filled[MET], len(there))
