@@ -14,7 +14,7 @@ from rigidmd.core.state import no_load
 from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.laws.coulomb import radial, reaction_field
-from rigidmd.forces.laws.endings import Plain
+from rigidmd.forces.laws.endings import NAMES, POLYNOMIALS, Addend, Correction, Plain
 from rigidmd.forces.laws.lennard_jones import energy_and_force, lennard_jones
 from rigidmd.forces.pairs.clusters import clusters_of
 from rigidmd.forces.pairs.lists import AHEAD, BUILDS, BUILT, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
@@ -573,40 +573,71 @@ def test_the_self_energy_of_the_reaction_field():
 @kernel(outer=True)
 def pair_forces_at(argon, charges, r2, found):
     for k in range(len(r2)):
-        found[k, 0] = energy_and_force(argon, argon.c12, argon.c6, argon.correction, r2[k])[1]
-        found[k, 1] = energy_and_force(argon, argon.c12, argon.c6, (), r2[k])[1]
-        found[k, 2] = radial(charges, r2[k])[1]
+        found[k, 0] = energy_and_force(argon, 2e9, 3e6, r2[k])[1]
+        found[k, 1] = radial(charges, r2[k])[1]
+
+
+def switched_laws(name, start):
+    """Lennard-Jones of one and of two kinds, and charges, between the same sites."""
+    laws = [
+        lennard_jones(np.zeros(1, np.int32), np.full(kinds, 3.4), np.full(kinds, 100.0), 9.0, name, start)
+        for kinds in (1, 2)
+    ]
+    laws = [law._replace(c12=np.full_like(law.c12, 2e9), c6=np.full_like(law.c6, 3e6)) for law in laws]
+    return *laws, reaction_field(np.zeros(1), 9.0, 78.5, name, start)
+
+
+def forces_of_products(argon, charges, r):
+    """force/r of energies that a switch multiplies, in NumPy."""
+    s, slope = np.array([POLYNOMIALS[type(argon.shape)](argon.shape, x) for x in r]).T
+    of_argon = 2e9 * r**-12 - 3e6 * r**-6, 24e9 * r**-14 - 18e6 * r**-8
+    of_charges = 1 / r + charges.field * r**2 + charges.end[0], r**-3 - 2 * charges.field
+    return np.stack([s * w - slope * u / r for u, w in (of_argon, of_charges)], axis=1)
+
+
+@pytest.mark.parametrize("start", [8.1, 5.0, 0.0])
+@pytest.mark.parametrize("name", ["switch", "smooth_switch"])
+def test_a_switched_force_is_that_of_the_product(name, start):
+    """The laws add a polynomial in r to the coefficients of their forces; it is exact."""
+    one, two, charges = switched_laws(name, start)
+    r = np.linspace(max(start - 1, 3.0), 9.0, 2001)
+    expected = forces_of_products(one, charges, r)
+    for law in (one, two):
+        found = np.empty((len(r), 2))
+        pair_forces_at(law.room(1, np.float64), charges.room(1, np.float64), r**2, found)
+        assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < 1e-13
 
 
 @pytest.mark.parametrize("start", [8.1, 7.2, 6.8])
 def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
     """The polynomial in r² that mixed precision adds to the force: here in double precision, and how far its terms
     cancel, which single precision would show."""
-    kind, sigma, epsilon = np.zeros(1, np.int32), np.array([3.4]), np.array([100.0])
-    law = lennard_jones(kind, sigma, epsilon, 9.0, "switch", start).room(1, np.float32)
-    plain = lennard_jones(kind, sigma, epsilon, 9.0).room(1, np.float32)
-    whole = reaction_field(np.zeros(1), 9.0, 78.5, "switch", start)
-    bare = whole._replace(shape=Plain(9.0))
-    charges = whole.room(1, np.float32)
-    assert law.correction and charges.correction and not whole.room(1, np.float64).correction
+    one, _, charges = switched_laws("switch", start)
+    laws = one.room(1, np.float32), charges.room(1, np.float32)
+    corrections = laws[0].correction, laws[1].switched
+    assert all(isinstance(correction, Correction) for correction in corrections)
+    shape = Plain(9.0)
+    plain = (one._replace(shape=shape).room(1, np.float32), charges._replace(shape=shape).room(1, np.float32))
     r = np.linspace(start - 1, 9.0, 2001)
-    found, exact, without = (np.empty((len(r), 3)) for _ in range(3))
-    pair_forces_at(law, charges, r**2, found)
-    pair_forces_at(law, whole, r**2, exact)
-    pair_forces_at(plain, bare, r**2, without)
+    found, without = np.empty((2, len(r), 2))
+    pair_forces_at(*laws, r**2, found)
+    pair_forces_at(*plain, r**2, without)
+    expected = forces_of_products(one, charges, r)
     before = r < start
-    for k, product, coefficients in ((0, exact[:, 1], law.correction), (2, exact[:, 2], charges.correction)):
-        corrected = found[:, k]
-        assert 4 * np.abs(coefficients).sum() < 200 * np.abs(corrected - without[:, k]).max()
-        largest = np.abs(product[~before]).max()
-        assert np.abs(corrected - product).max() < 3e-7 * largest
-        assert corrected[before] == pytest.approx(product[before], rel=1e-14)
-    assert (found[:, 0] != found[:, 1])[~before].mean() > 0.9  # the correction was used
+    for k, correction in enumerate(corrections):
+        largest = np.abs(found[:, k] - without[:, k]).max()
+        assert 4 * np.abs(correction.coefficients).sum() < 200 * largest
+        assert np.abs(found[:, k] - expected[:, k]).max() < 3e-7 * np.abs(expected[~before, k]).max()
+        assert found[before, k] == pytest.approx(expected[before, k], rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("name", "start"), [("switch", 0.0), ("switch", 5.0), ("smooth_switch", 8.0), ("force_switch", 8.0)]
-)
-def test_a_wide_switch_and_other_endings_have_no_correction(name, start):
-    law = lennard_jones(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, start)
-    assert law.room(1, np.float32).correction == ()
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_law_does_for_its_ending_is_decided_by_the_ending(name):
+    """A wide switch is exact in mixed precision too, and so is a smooth one; what is no switch has nothing to add."""
+    start_and_precision = [(0.0, np.float32), (8.0, np.float64)]
+    for start, dtype in start_and_precision + [(8.0, np.float32)] * (name != "switch"):
+        one, two, charges = switched_laws(name, start)
+        one, two, charges = one.room(1, dtype), two.room(1, dtype), charges.room(1, dtype)
+        kind = Addend if "switch" in name and name != "force_switch" else tuple
+        assert one.correction == ()
+        assert {type(x) for x in (one.addend12, one.addend6, two.addend12, two.addend6, charges.switched)} == {kind}

@@ -8,10 +8,16 @@ import numpy as np
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import inverse_root, load, root_and_cube, zeros
 from rigidmd.forces.laws.endings import (
+    NO_SWITCH,
     SWITCHES,
+    Addend,
+    Correction,
     Name,
     Polynomial,
     Shape,
+    addend,
+    addend_of,
+    correction,
     correction_of,
     ended,
     ending,
@@ -34,15 +40,13 @@ class ReactionField(NamedTuple):
     end: Polynomial  # see endings.ending
     field: float  # 1/Å³
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
-    correction: tuple[float, ...] = ()  # see endings.correction_of
+    switched: Addend | Correction | tuple[()] = NO_SWITCH
 
     def room(self, slots: int, dtype: type) -> "ReactionField":
         """The law with room for the charges in slots, in the precision of lanes."""
-
-        def at(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return 1 / r + self.field * r**2 + self.end[0], r**-3 - 2 * self.field
-
-        return self._replace(charge=zeros(slots, dtype), correction=correction_of(self.shape, at, dtype))
+        powers = {1: 1.0, 0: self.end[0], -2: self.field}
+        switched = correction_of(self.shape, powers, dtype) or addend_of(self.shape, powers)
+        return self._replace(charge=zeros(slots, dtype), switched=switched)
 
 
 def reaction_field(
@@ -62,17 +66,17 @@ def reaction_field(
     return ReactionField(cutoff, shape, end, field, charge_e * COULOMB_CHARGE)
 
 
-def powers(shape, correction, r2):
+def powers(shape, switched, r2):
     """1/r, and two factors of 1/r³; where the force needs no 1/r they are found without it."""
     raise TypeError("compiled code only")
 
 
 @implements(powers, inline=True)
-def _powers_of(shape, correction, r2):
-    if not needs_root(shape, correction):
-        return lambda shape, correction, r2: root_and_cube(r2)
+def _powers_of(shape, switched, r2):
+    if not needs_root(shape, switched):
+        return lambda shape, switched, r2: root_and_cube(r2)
 
-    def of_inverse(shape, correction, r2):
+    def of_inverse(shape, switched, r2):
         inverse = inverse_root(r2)
         return inverse, inverse, inverse * inverse
 
@@ -82,10 +86,11 @@ def _powers_of(shape, correction, r2):
 @kernel(inline=True, outer=True)
 def radial(law, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
-    inverse, one, two = powers(law.shape, law.correction, r2)
+    inverse, one, two = powers(law.shape, law.switched, r2)
     u = inverse + law.field * r2 + law.end[0]
-    w = one * two - 2 * law.field
-    return ended(law.shape, law.end, law.correction, r2, inverse, u, w)
+    w = (1 + addend(law.shape, law.switched, r2 * inverse)) * one * two - 2 * law.field
+    w = w + correction(law.shape, law.switched, r2)
+    return ended(law.shape, law.end, law.switched, r2, inverse, u, w)
 
 
 @implements(pairs.pair, inline=True)

@@ -20,10 +20,12 @@ An integrator reaches its order only if the forces have enough derivatives. In l
 """
 
 from collections.abc import Callable
+from fractions import Fraction
 from math import inf
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.polynomial import Polynomial as Polynomials
 from numpy.polynomial import chebyshev
 
 from rigidmd.compile import implements, is_a, kernel
@@ -89,83 +91,169 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
     return (quadratic * d**3 / 3 + cubic * d**4 / 4 - v, 0.0, quadratic, cubic)
 
 
-#: The error of a correction, relative to its largest value, and the most coefficients that it may take.
+#: k and c of a switch S = 1 + t^(k+1) (c0 + c1 t + c2 t² + ...), t = (r - start)/(cutoff - start). Its derivative by t
+#: is (k + 1) c0 t^k (1 - t)^k.
+SERIES = {Switched: (2, (-10, 15, -6)), SmoothlySwitched: (4, (-126, 420, -540, 315, -70))}
+
+
+# Of both, x goes from -1 at the start to 1 at the cut-off. In powers of x + 1 the terms would be thousands of times
+# their sum.
+class Addend(NamedTuple):
+    """(x + 1)^k (b0 + b1 x + b2 x² + ...), x even in r: what a switch adds to p in the force/r p/r^(p+2) of 1/r^p."""
+
+    coefficients: tuple[float, ...]
+
+
+class Correction(NamedTuple):
+    """(x + 1)² (b0 + b1 x + b2 x² + ...), x even in r²: what `switch` adds to force/r. It needs no root."""
+
+    coefficients: tuple[float, ...]
+
+
+#: Of endings that are no switch.
+NO_SWITCH = ()
+#: The error of a `Correction`, relative to its largest value, and the most coefficients that it may have.
 CORRECTION_ERROR, MOST_COEFFICIENTS = 2e-7, 18
 
 
-def correction_of(
-    shape: Shape, at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], dtype: type
-) -> tuple[float, ...]:
-    """Coefficients c0, c1, ... of what `switch` adds to force/r beyond its start: (x + 1)² (c0 + c1 x + c2 x² + ...).
+def addend_of(shape: Shape, powers: dict[int, float]) -> Addend | tuple[()]:
+    """The addend of a power c/r^p, given as {p: c}, or of a sum of powers, to the coefficient of the highest of them.
 
-    x goes from -1 at the start to 1 at the cut-off, evenly in r², so that forces need no root and no energy. In powers
-    of x + 1 the terms would be thousands of times their sum. at(r) gives energy and force/r of the law without its
-    ending. There are none, (), in double precision, which would take so many that little is gained; of other endings;
-    and of a switch that is too wide.
+    It is exact: of r^-p, force/r becomes r^-(p+2) (p S - r S'), and S is a polynomial in t, as r is. Fractions keep all
+    digits where powers cancel, as those of a reaction field do.
     """
-    if not isinstance(shape, Switched) or dtype != np.float32:
-        return ()
-    width, square = shape.cutoff - shape.start, shape.cutoff**2 - shape.start**2
+    if type(shape) not in SERIES:
+        return NO_SWITCH
+    k, series = SERIES[type(shape)]
+    start, width = Fraction(shape.start), Fraction(shape.cutoff) - Fraction(shape.start)
+    t, left = Polynomials([Fraction(1, 2), Fraction(1, 2)]), Polynomials([Fraction(1, 2), Fraction(-1, 2)])  # of x
+    r = start + width * t
+    fall = sum((c * t ** (n + 1) for n, c in enumerate(series)), t * 0)  # of S, less 1, over t^k
+    slope = (k + 1) * series[0] * left**k / width
+    of_powers = [Fraction(c) * r ** (max(powers) - p) * (p * fall - r * slope) for p, c in powers.items()]
+    return Addend(tuple(float(b / 2**k) for b in sum(of_powers).coef))
+
+
+def correction_of(shape: Shape, powers: dict[int, float], dtype: type) -> Correction | tuple[()]:
+    """The correction of a sum of powers, given as for `addend_of`, in single precision.
+
+    None in double precision, where it would have too many coefficients; nor of a switch that is too wide; nor of
+    `smooth_switch`, whose terms would be a thousand times their sum.
+    """
+    if not isinstance(shape, Switched) or dtype != np.float32 or shape.start == 0:
+        return NO_SWITCH
+    of_highest = Polynomials(addend_of(shape, powers).coefficients)
 
     def over_square(x: np.ndarray) -> np.ndarray:
+        square = shape.cutoff**2 - shape.start**2
         r = np.sqrt(shape.start**2 + (x + 1) / 2 * square)
-        per_x = square / (2 * (r + shape.start) * width)  # t = (r - start)/width is per_x (x + 1)
-        t = per_x * (x + 1)
-        u, w = at(r)
-        return per_x**2 * (30 * (1 - t) ** 2 / width * u / r - t * (10 - t * (15 - 6 * t)) * w)
+        more = square / ((r + shape.start) * (shape.cutoff - shape.start))  # the x of r, less -1, over that of r²
+        return more**2 * of_highest(more * (x + 1) - 1) * r ** -(max(powers) + 2.0)
 
-    with np.errstate(all="ignore"):  # a switch from 0 on is too wide
-        found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
-        x = np.linspace(-1, 1, 200)
-        largest = np.abs((x + 1) ** 2 * over_square(x)).max()
+    found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
+    x = np.linspace(-1, 1, 200)
+    largest = np.abs((x + 1) ** 2 * over_square(x)).max()
     left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]  # at most, without this coefficient and those after it
     count = int(np.argmax(left_out < CORRECTION_ERROR * largest))
-    return tuple(chebyshev.cheb2poly(found[:count]).tolist()) if 0 < count <= MOST_COEFFICIENTS else ()
+    if not 0 < count <= MOST_COEFFICIENTS:
+        return NO_SWITCH
+    return Correction(tuple(chebyshev.cheb2poly(found[:count]).tolist()))
 
 
-def ended(shape, end, correction, r2, inverse, u, w):
+def addend(shape, switched, r):
+    """An `Addend` at distances r; 0 below the start, and of anything else."""
+    raise TypeError("compiled code only")
+
+
+@implements(addend, inline=True)
+def _addend(shape, switched, r):
+    if not is_a(switched, Addend):
+        return lambda shape, switched, r: 0.0
+    power = squared if is_a(shape, Switched) else to_the_fourth
+
+    def addend(shape, switched, r):
+        x = between(shape.start, shape.cutoff, r)
+        return power(x + 1.0) * polynomial(switched.coefficients, x)
+
+    return addend
+
+
+def correction(shape, switched, r2):
+    """A `Correction` at squared distances r2; 0 below the start, and of anything else."""
+    raise TypeError("compiled code only")
+
+
+@implements(correction, inline=True)
+def _correction(shape, switched, r2):
+    if not is_a(switched, Correction):
+        return lambda shape, switched, r2: 0.0
+
+    def correction(shape, switched, r2):
+        x = between(shape.start * shape.start, shape.cutoff * shape.cutoff, r2)
+        return squared(x + 1.0) * polynomial(switched.coefficients, x)
+
+    return correction
+
+
+@kernel(inline=True, outer=True)
+def squared(x):
+    """x²"""
+    return x * x
+
+
+@kernel(inline=True, outer=True)
+def to_the_fourth(x):
+    """x⁴"""
+    return x * x * (x * x)
+
+
+@kernel(inline=True)
+def between(first, last, y):
+    """-1 where y is `first` or less, 1 where it is `last`."""
+    return larger(y * (2 / (last - first)) - (last + first) / (last - first), -1.0)
+
+
+@kernel(inline=True, outer=True)
+def beyond(shape, r):
+    """t of a switch: 0 up to the start, 1 at the cut-off."""
+    return larger((r - shape.start) * (1 / (shape.cutoff - shape.start)), 0.0)
+
+
+def ended(shape, end, switched, r2, inverse, u, w):
     """(energy, force/r) with the ending, from u, w without it at squared distances r2; scalars or vectors.
 
-    u already includes the constant of `end`. inverse : 1/r, where `needs_root` says so. For `correction` see
-    `correction_of`.
+    u already includes the constant of `end`. inverse : 1/r, where `needs_root` says so. switched : the addend or
+    correction that w already has; without one, a switch multiplies the energy here, whatever the law
     """
     raise TypeError("compiled code only")
 
 
-def needs_root(shape, correction) -> bool:
+def needs_root(shape, switched) -> bool:
     """Whether a force with an ending needs 1/r, by their Numba types."""
-    return not is_a(shape, Plain) and len(correction) == 0
+    return not is_a(shape, Plain) and not is_a(switched, Correction)
 
 
 @implements(ended, inline=True)
-def _ended(shape, end, correction, r2, inverse, u, w):
+def _ended(shape, end, switched, r2, inverse, u, w):
     if is_a(shape, Plain):
-        return lambda shape, end, correction, r2, inverse, u, w: (u, w)
+        return lambda shape, end, switched, r2, inverse, u, w: (u, w)
     if is_a(shape, Bent):
 
-        def bent(shape, end, correction, r2, inverse, u, w):
+        def bent(shape, end, switched, r2, inverse, u, w):
             du, df = added(end, larger(r2 * inverse - shape.start, 0.0))
             return u + du, w + df * inverse
 
         return bent
 
     factor = quintic if is_a(shape, Switched) else nonic
-    if len(correction) == 0:
+    if len(switched) > 0:  # the root is for the energy alone
+        return lambda shape, end, switched, r2, inverse, u, w: (factor(shape, r2 * inverse_root(r2))[0] * u, w)
 
-        def switched(shape, end, correction, r2, inverse, u, w):
-            s, slope = factor(shape, r2 * inverse)
-            return s * u, s * w - slope * u * inverse
+    def multiplied(shape, end, switched, r2, inverse, u, w):
+        s, slope = factor(shape, r2 * inverse)
+        return s * u, s * w - slope * u * inverse
 
-        return switched
-
-    def corrected(shape, end, correction, r2, inverse, u, w):
-        first, last = shape.start * shape.start, shape.cutoff * shape.cutoff
-        x = larger(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
-        beyond = x + 1.0
-        s, _ = quintic(shape, r2 * inverse_root(r2))  # for the energy alone
-        return s * u, w + beyond * beyond * polynomial(correction, x)
-
-    return corrected
+    return multiplied
 
 
 @kernel(inline=True, outer=True)
@@ -180,22 +268,21 @@ def added(end, x):
 
 @kernel(inline=True, outer=True)
 def quintic(shape, r):
-    """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, t = (r - start)/(cutoff - start); S = 1 below the start."""
-    per_width = 1 / (shape.cutoff - shape.start)
-    t = larger((r - shape.start) * per_width, 0.0)
+    """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, with t of `beyond`."""
+    t = beyond(shape, r)
     left = 1.0 - t
-    return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), t * t * left * left * (-30.0 * per_width)
+    slope = t * t * left * left * (-30.0 / (shape.cutoff - shape.start))
+    return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), slope
 
 
 @kernel(inline=True, outer=True)
 def nonic(shape, r):
-    """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t as in `quintic`."""
-    per_width = 1 / (shape.cutoff - shape.start)
-    t = larger((r - shape.start) * per_width, 0.0)
+    """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t of `beyond`."""
+    t = beyond(shape, r)
     four = t * t * t * t
     left2 = (1.0 - t) * (1.0 - t)
     s = 1.0 - four * t * (126.0 - t * (420.0 - t * (540.0 - t * (315.0 - 70.0 * t))))
-    return s, four * left2 * left2 * (-630.0 * per_width)
+    return s, four * left2 * left2 * (-630.0 / (shape.cutoff - shape.start))
 
 
 POLYNOMIALS = {Switched: quintic, SmoothlySwitched: nonic}

@@ -9,13 +9,19 @@ from scipy.integrate import quad
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.lanes import inverse, inverse_root, load, zeros
 from rigidmd.forces.laws.endings import (
+    NO_SWITCH,
     POLYNOMIALS,
+    Addend,
     Bent,
+    Correction,
     Name,
     Plain,
     Polynomial,
     Shape,
     added,
+    addend,
+    addend_of,
+    correction,
     correction_of,
     ended,
     ending,
@@ -43,10 +49,12 @@ class LennardJones(NamedTuple):
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
             c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
-            correction = correction_of(self.shape, lambda r: _energy_and_force_at(c12, c6, r), dtype)
-            return OneKind(*head, c12, c6, correction)
+            if found := correction_of(self.shape, {12: c12, 6: -c6}, dtype):
+                return OneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found)
+            return OneKind(*head, c12, c6, addend_of(self.shape, {12: c12}), addend_of(self.shape, {6: c6}), NO_SWITCH)
         table = zeros((2, kinds * slots), dtype)
-        return ManyKinds(*head, np.zeros(slots, np.int32), *table)
+        addends = addend_of(self.shape, {12: 1.0}), addend_of(self.shape, {6: 1.0})
+        return ManyKinds(*head, np.zeros(slots, np.int32), *table, *addends)
 
 
 class OneKind(NamedTuple):
@@ -58,7 +66,9 @@ class OneKind(NamedTuple):
     end6: Polynomial
     c12: float
     c6: float
-    correction: tuple[float, ...]  # see endings.correction_of
+    addend12: Addend | tuple[()]  # of c12/r¹² and c6/r⁶
+    addend6: Addend | tuple[()]
+    correction: Correction | tuple[()]  # in their place
 
 
 class ManyKinds(NamedTuple):
@@ -71,6 +81,8 @@ class ManyKinds(NamedTuple):
     kind: np.ndarray  # (slots,)
     c12: np.ndarray  # (kinds slots,)
     c6: np.ndarray  # (kinds slots,)
+    addend12: Addend | tuple[()]  # of 1/r¹² and 1/r⁶
+    addend6: Addend | tuple[()]
 
 
 def lennard_jones(
@@ -109,47 +121,72 @@ def _inverse_power(p: int):
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
 
 
-def _energy_and_force_at(c12: float, c6: float, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(energy, force/r) without an ending, in NumPy."""
-    return c12 * r**-12.0 - c6 * r**-6.0, 12 * c12 * r**-14.0 - 6 * c6 * r**-8.0
-
-
 @implements(pairs.pair, inline=True)
 def _pair(law, i, j, r2):
     if is_a(law, OneKind):
-        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, law.correction, r2)
+        return lambda law, i, j, r2: energy_and_force(law, law.c12, law.c6, r2)
     if not is_a(law, ManyKinds):
         return None
 
     def pair(law, i, j, r2):
         at = law.kind[i] * len(law.kind) + j
-        return energy_and_force(law, load(law.c12, at), load(law.c6, at), (), r2)
+        return energy_and_force(law, load(law.c12, at), load(law.c6, at), r2)
 
     return pair
 
 
-@kernel(inline=True)
-def energy_and_force(law, c12, c6, correction, r2):
-    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2; of the correction see `endings`."""
-    inverse2, inverse1 = inverses(law.shape, correction, r2)
-    six = inverse2 * inverse2 * inverse2
-    end = mixed(law.end12, law.end6, c12, c6)
-    u = (c12 * six - c6) * six + end[0]
-    w = (12 * c12 * six - 6 * c6) * six * inverse2
-    return ended(law.shape, end, correction, r2, inverse1, u, w)
+def energy_and_force(law, c12, c6, r2):
+    """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
+    raise TypeError("compiled code only")
 
 
-def inverses(shape, correction, r2):
+@implements(energy_and_force, inline=True)
+def _energy_and_force(law, c12, c6, r2):
+    if is_a(law, ManyKinds):
+
+        def of_many(law, c12, c6, r2):
+            inverse2, inverse1 = inverses(law.shape, law.addend12, r2)
+            six, end = inverse2 * inverse2 * inverse2, mixed(law.end12, law.end6, c12, c6)
+            of12 = c12 * (12 + addend(law.shape, law.addend12, r2 * inverse1))
+            of6 = c6 * (6 + addend(law.shape, law.addend6, r2 * inverse1))
+            u, w = (c12 * six - c6) * six + end[0], (of12 * six - of6) * six * inverse2
+            return ended(law.shape, end, law.addend12, r2, inverse1, u, w)
+
+        return of_many
+
+    if is_a(law.types[law.fields.index("correction")], Correction):
+
+        def with_correction(law, c12, c6, r2):
+            inverse2 = inverse(r2)
+            six, end = inverse2 * inverse2 * inverse2, mixed(law.end12, law.end6, c12, c6)
+            u, w = (c12 * six - c6) * six + end[0], (12 * c12 * six - 6 * c6) * six * inverse2
+            w = w + correction(law.shape, law.correction, r2)
+            return ended(law.shape, end, law.correction, r2, 0.0, u, w)
+
+        return with_correction
+
+    def of_one(law, c12, c6, r2):
+        inverse2, inverse1 = inverses(law.shape, law.addend12, r2)
+        six, end = inverse2 * inverse2 * inverse2, mixed(law.end12, law.end6, c12, c6)
+        of12 = 12 * c12 + addend(law.shape, law.addend12, r2 * inverse1)
+        of6 = 6 * c6 + addend(law.shape, law.addend6, r2 * inverse1)
+        u, w = (c12 * six - c6) * six + end[0], (of12 * six - of6) * six * inverse2
+        return ended(law.shape, end, law.addend12, r2, inverse1, u, w)
+
+    return of_one
+
+
+def inverses(shape, switched, r2):
     """(1/r², 1/r) at squared distances r2; where 1/r is not needed it is 0, to save the square root."""
     raise TypeError("compiled code only")
 
 
 @implements(inverses, inline=True)
-def _inverses(shape, correction, r2):
-    if not needs_root(shape, correction):
-        return lambda shape, correction, r2: (inverse(r2), 0.0)
+def _inverses(shape, switched, r2):
+    if not needs_root(shape, switched):
+        return lambda shape, switched, r2: (inverse(r2), 0.0)
 
-    def with_root(shape, correction, r2):
+    def with_root(shape, switched, r2):
         inverse1 = inverse_root(r2)
         return inverse1 * inverse1, inverse1
 

@@ -74,7 +74,7 @@ class PairList(NamedTuple):
     near: np.ndarray  # (clusters,) int32
     met: np.ndarray  # (blocks, capacity) int32
     apart: np.ndarray  # (blocks, 3 capacity) from the origins of what is met to that of c, Å; (blocks, 0) in float64
-    needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters behind the block, met by one
+    needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters behind, met by one
     counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
     times: np.ndarray  # (2,) when the list was built, NaN before; how far ahead the places are for which it was; ps
 
