@@ -104,7 +104,7 @@ def at_distance(law, formula, end, r2):
 
 @numba.njit(error_model="numpy")
 def in_numbers(law, r2):
-    return of_built_in(law, law.c12, law.c6, (), r2)
+    return of_built_in(law, law.c12, law.c6, r2)
 
 
 @pytest.mark.parametrize("energy", FORMULAS)
