@@ -605,7 +605,7 @@ def test_a_switched_force_is_that_of_the_product(name, start):
     for law in (one, two):
         found = np.empty((len(r), 2))
         pair_forces_at(law.room(1, np.float64), charges.room(1, np.float64), r**2, found)
-        assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < 1e-13
+        assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < 2e-12
 
 
 @pytest.mark.parametrize("start", [8.1, 7.2, 6.8])
@@ -633,11 +633,11 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_a_law_does_for_its_ending_is_decided_by_the_ending(name):
-    """A wide switch is exact in mixed precision too, and so is a smooth one; what is no switch has nothing to add."""
-    start_and_precision = [(0.0, np.float32), (8.0, np.float64)]
-    for start, dtype in start_and_precision + [(8.0, np.float32)] * (name != "switch"):
+    """A wide switch has an addend in mixed precision too; a smooth one multiplies the energy there; what is no switch
+    has nothing to add."""
+    for start, dtype in ((0.0, np.float32), (8.0, np.float64)):
         one, two, charges = switched_laws(name, start)
         one, two, charges = one.room(1, dtype), two.room(1, dtype), charges.room(1, dtype)
-        kind = Addend if "switch" in name and name != "force_switch" else tuple
+        kind = Addend if name == "switch" or (name == "smooth_switch" and dtype == np.float64) else tuple
         assert one.correction == ()
         assert {type(x) for x in (one.addend12, one.addend6, two.addend12, two.addend6, charges.switched)} == {kind}

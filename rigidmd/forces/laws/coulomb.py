@@ -45,7 +45,7 @@ class ReactionField(NamedTuple):
     def room(self, slots: int, dtype: type) -> "ReactionField":
         """The law with room for the charges in slots, in the precision of lanes."""
         powers = {1: 1.0, 0: self.end[0], -2: self.field}
-        switched = correction_of(self.shape, powers, dtype) or addend_of(self.shape, powers)
+        switched = correction_of(self.shape, powers, dtype) or addend_of(self.shape, powers, dtype)
         return self._replace(charge=zeros(slots, dtype), switched=switched)
 
 

@@ -96,16 +96,18 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
 SERIES = {Switched: (2, (-10, 15, -6)), SmoothlySwitched: (4, (-126, 420, -540, 315, -70))}
 
 
-# Of both, x goes from -1 at the start to 1 at the cut-off. In powers of x + 1 the terms would be thousands of times
-# their sum.
 class Addend(NamedTuple):
-    """(x + 1)^k (b0 + b1 x + b2 x² + ...), x even in r: what a switch adds to p in the force/r p/r^(p+2) of 1/r^p."""
+    """t^k (b0 + b1 t + b2 t² + ...): what a switch adds to p in the force/r p/r^(p+2) of 1/r^p."""
 
     coefficients: tuple[float, ...]
 
 
 class Correction(NamedTuple):
-    """(x + 1)² (b0 + b1 x + b2 x² + ...), x even in r²: what `switch` adds to force/r. It needs no root."""
+    """(x + 1)² (b0 + b1 x + b2 x² + ...): what `switch` adds to force/r. It needs no root.
+
+    x goes from -1 at the start to 1 at the cut-off, evenly in r². In powers of x + 1 the terms would be thousands of
+    times their sum.
+    """
 
     coefficients: tuple[float, ...]
 
@@ -116,22 +118,23 @@ NO_SWITCH = ()
 CORRECTION_ERROR, MOST_COEFFICIENTS = 2e-7, 18
 
 
-def addend_of(shape: Shape, powers: dict[int, float]) -> Addend | tuple[()]:
+def addend_of(shape: Shape, powers: dict[int, float], dtype: type) -> Addend | tuple[()]:
     """The addend of a power c/r^p, given as {p: c}, or of a sum of powers, to the coefficient of the highest of them.
 
     It is exact: of r^-p, force/r becomes r^-(p+2) (p S - r S'), and S is a polynomial in t, as r is. Fractions keep all
-    digits where powers cancel, as those of a reaction field do.
+    digits where powers cancel, as those of a reaction field do. None of `smooth_switch` in single precision: its terms
+    are up to 1e4 times their sum.
     """
-    if type(shape) not in SERIES:
+    if type(shape) not in SERIES or (isinstance(shape, SmoothlySwitched) and dtype == np.float32):
         return NO_SWITCH
     k, series = SERIES[type(shape)]
     start, width = Fraction(shape.start), Fraction(shape.cutoff) - Fraction(shape.start)
-    t, left = Polynomials([Fraction(1, 2), Fraction(1, 2)]), Polynomials([Fraction(1, 2), Fraction(-1, 2)])  # of x
+    t, left = Polynomials([Fraction(0), Fraction(1)]), Polynomials([Fraction(1), Fraction(-1)])
     r = start + width * t
     fall = sum((c * t ** (n + 1) for n, c in enumerate(series)), t * 0)  # of S, less 1, over t^k
     slope = (k + 1) * series[0] * left**k / width
     of_powers = [Fraction(c) * r ** (max(powers) - p) * (p * fall - r * slope) for p, c in powers.items()]
-    return Addend(tuple(float(b / 2**k) for b in sum(of_powers).coef))
+    return Addend(tuple(float(b) for b in sum(of_powers).coef))
 
 
 def correction_of(shape: Shape, powers: dict[int, float], dtype: type) -> Correction | tuple[()]:
@@ -142,13 +145,13 @@ def correction_of(shape: Shape, powers: dict[int, float], dtype: type) -> Correc
     """
     if not isinstance(shape, Switched) or dtype != np.float32 or shape.start == 0:
         return NO_SWITCH
-    of_highest = Polynomials(addend_of(shape, powers).coefficients)
+    of_highest = Polynomials(addend_of(shape, powers, np.float64).coefficients)
 
     def over_square(x: np.ndarray) -> np.ndarray:
         square = shape.cutoff**2 - shape.start**2
         r = np.sqrt(shape.start**2 + (x + 1) / 2 * square)
-        more = square / ((r + shape.start) * (shape.cutoff - shape.start))  # the x of r, less -1, over that of r²
-        return more**2 * of_highest(more * (x + 1) - 1) * r ** -(max(powers) + 2.0)
+        per_x = square / (2 * (r + shape.start) * (shape.cutoff - shape.start))  # t is per_x (x + 1)
+        return per_x**2 * of_highest(per_x * (x + 1)) * r ** -(max(powers) + 2.0)
 
     found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
     x = np.linspace(-1, 1, 200)
@@ -172,8 +175,8 @@ def _addend(shape, switched, r):
     power = squared if is_a(shape, Switched) else to_the_fourth
 
     def addend(shape, switched, r):
-        x = between(shape.start, shape.cutoff, r)
-        return power(x + 1.0) * polynomial(switched.coefficients, x)
+        t = beyond(shape, r)
+        return power(t) * polynomial(switched.coefficients, t)
 
     return addend
 
@@ -189,7 +192,8 @@ def _correction(shape, switched, r2):
         return lambda shape, switched, r2: 0.0
 
     def correction(shape, switched, r2):
-        x = between(shape.start * shape.start, shape.cutoff * shape.cutoff, r2)
+        first, last = shape.start * shape.start, shape.cutoff * shape.cutoff
+        x = larger(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
         return squared(x + 1.0) * polynomial(switched.coefficients, x)
 
     return correction
@@ -205,12 +209,6 @@ def squared(x):
 def to_the_fourth(x):
     """x⁴"""
     return x * x * (x * x)
-
-
-@kernel(inline=True)
-def between(first, last, y):
-    """-1 where y is `first` or less, 1 where it is `last`."""
-    return larger(y * (2 / (last - first)) - (last + first) / (last - first), -1.0)
 
 
 @kernel(inline=True, outer=True)

@@ -51,10 +51,14 @@ class LennardJones(NamedTuple):
             c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
             if found := correction_of(self.shape, {12: c12, 6: -c6}, dtype):
                 return OneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found)
-            return OneKind(*head, c12, c6, addend_of(self.shape, {12: c12}), addend_of(self.shape, {6: c6}), NO_SWITCH)
+            return OneKind(*head, c12, c6, *_addends(self.shape, c12, c6, dtype), NO_SWITCH)
         table = zeros((2, kinds * slots), dtype)
-        addends = addend_of(self.shape, {12: 1.0}), addend_of(self.shape, {6: 1.0})
-        return ManyKinds(*head, np.zeros(slots, np.int32), *table, *addends)
+        return ManyKinds(*head, np.zeros(slots, np.int32), *table, *_addends(self.shape, 1.0, 1.0, dtype))
+
+
+def _addends(shape: Shape, c12: float, c6: float, dtype: type) -> tuple[Addend | tuple[()], Addend | tuple[()]]:
+    """What a switch adds to the forces of c12/r¹² and c6/r⁶."""
+    return addend_of(shape, {12: c12}, dtype), addend_of(shape, {6: c6}, dtype)
 
 
 class OneKind(NamedTuple):
