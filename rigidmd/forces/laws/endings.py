@@ -153,9 +153,10 @@ def correction_of(shape: Shape, powers: dict[int, float], dtype: type) -> Correc
         per_x = square / (2 * (r + shape.start) * (shape.cutoff - shape.start))  # t is per_x (x + 1)
         return per_x**2 * of_highest(per_x * (x + 1)) * r ** -(max(powers) + 2.0)
 
-    found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
     x = np.linspace(-1, 1, 200)
-    largest = np.abs((x + 1) ** 2 * over_square(x)).max()
+    with np.errstate(all="ignore"):  # a switch from almost 0 on is too wide
+        found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
+        largest = np.abs((x + 1) ** 2 * over_square(x)).max()
     left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]  # at most, without this coefficient and those after it
     count = int(np.argmax(left_out < CORRECTION_ERROR * largest))
     if not 0 < count <= MOST_COEFFICIENTS:
