@@ -263,6 +263,15 @@ def test_a_list_with_little_room_grows_and_misses_nothing(precision):
     assert energies(engine, state) == expected
 
 
+def test_sums_that_only_a_passing_moment_needs_are_in_common():
+    _, engine, state = built({"spce": 200}, 18.5, 4, forces={"cutoff_A": 8.0})  # so many that there are blocks
+    engine.evaluate(state)
+    one, two = engine.workspaces.values()
+    assert one.sums.others.size != two.sums.others.size
+    assert np.shares_memory(one.sums.others, two.sums.others)
+    assert not np.shares_memory(one.sums.own, two.sums.own)
+
+
 @pytest.mark.parametrize("edge", [31.1, None])
 def test_lists_begin_with_about_the_room_they_need(edge):
     _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)

@@ -76,7 +76,7 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np
         return CentralSites(first, molecule)
     kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
     if np.array_equal(kind, species):
-        kind = species  # as of one species
+        kind = species.astype(np.int32, copy=False)  # as of one species
     return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
 
 
