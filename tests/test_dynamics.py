@@ -13,7 +13,7 @@ from rigidmd.core.state import HEAT, State, no_load, state_of
 from rigidmd.dynamics.baths import VelocityRescaling
 from rigidmd.dynamics.noise import BATH, key_of
 from rigidmd.dynamics.ramps import steady
-from rigidmd.dynamics.sums import sums_over
+from rigidmd.dynamics.sums import extent_of, sums_over
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.pairs.sites import blocks_of
@@ -155,6 +155,21 @@ def test_sums_are_those_of_numpy(molecules):
     if len(state.rotation):
         state.rotation[0, 1, 1] = np.nan
         assert np.isnan(sums_over(model, state).orthogonality)
+
+
+@pytest.mark.parametrize("molecules", [{"spce": 5, "argon": 4}, {"argon": 6}])
+def test_an_extent_has_the_largest_of_every_array(molecules):
+    _, _, state = built(molecules, 30.0, 3)
+    load = no_load(state)
+    load.force[:] = np.random.default_rng(2).normal(size=load.force.shape)
+    arrays = [*state[:4], *load]
+    assert extent_of(state, load) == tuple(np.abs(array).max(initial=0.0) for array in arrays)
+    for k, array in enumerate(arrays):
+        if len(array):
+            for worst in (-1e300, np.inf, -np.inf, np.nan, -np.nan):  # each is larger than the one before
+                array.flat[7] = worst
+                np.testing.assert_equal(extent_of(state, load)[k], abs(worst))
+    assert extent_of(state)[4:] == (0.0, 0.0)
 
 
 def test_time_can_be_reversed(liquid):

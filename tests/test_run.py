@@ -12,6 +12,7 @@ import MDAnalysis as mda
 import numpy as np
 import pytest
 from conftest import MOLECULES, ROOT, built, small_scene
+from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 
 import rigidmd
 from rigidmd.assemble.describe import describe
@@ -24,7 +25,7 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.forces.pairs.lists import BUILDS
 from rigidmd.measure.observables import observe
-from rigidmd.output import progress
+from rigidmd.output import log, progress
 from rigidmd.output.log import columns
 from rigidmd.output.report import summary_text
 from rigidmd.run import Every, Simulation
@@ -432,6 +433,41 @@ def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
     )
     Simulation(scene, tmp_path / "out", observers=[Every(0.008, look)]).run()
     assert seen == [2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("box", [{"lengths_A": [20, 21, 22], "angles_deg": [80, 75, 70]}, None])
+def test_frames_of_xtc_are_those_that_mdanalysis_writes(box, tmp_path):
+    scene = {"molecules": [{"model": "spce", "count": 30 if box else 1}], "stages": [{"duration_ps": 0.04}]}
+    structure = {"box": {"periodic": False}, "structure": {"file": "one.xyz"}}
+    scene |= {"box": box, "forces": {"cutoff_A": 7.0}} if box else structure
+    (tmp_path / "one.xyz").write_text("3\n\nO 0 0 0\nH 0.8 0.6 0\nH -0.8 0.6 0\n")
+    scene |= {"name": "cell", "output": {"trajectory_interval_ps": 0.008}, "start": {"temperature_K": 300}}
+    scene = Scene.from_dict(scene, tmp_path)
+    Simulation(scene, tmp_path / "out").run()
+    own, other = tmp_path / "out" / "trajectory.xtc", tmp_path / "other.xtc"
+    Simulation(scene).run().universe().atoms.write(str(other), frames="all")
+    with XTCFile(str(own)) as found, XTCFile(str(other)) as expected:
+        frames = list(zip(found, expected, strict=True))
+        assert len(frames) == 6
+        for frame, its in frames:
+            assert (frame.x == its.x).all() and frame.prec == its.prec
+            assert frame.time == its.time
+            assert frame.box == pytest.approx(its.box, abs=1e-6)
+
+
+def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(log.clock, "monotonic", lambda: now)
+    path, samples = tmp_path / "log.csv", Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows
+    file = log.Log(path, False)
+    for now, lines in ((0.1, 1), (0.4, 1), (0.6, 4), (0.7, 4), (5.0, 6), (5.1, 6)):
+        file.write(samples[0])
+        assert len(path.read_text().splitlines()) == lines, now
+    assert file.kept[0] == path.stat().st_size
+    assert len(path.read_text().splitlines()) == 7
+    file.write(samples[0])
+    file.close()
+    assert len(path.read_text().splitlines()) == 8
 
 
 def test_from_python_in_five_lines():

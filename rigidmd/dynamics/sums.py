@@ -1,4 +1,5 @@
-"""Sums over the molecules of a state, for a look at a run: one pass, where NumPy takes a dozen with arrays between."""
+"""Sums over the molecules of a state and its largest numbers, for a look at a run: one pass over each array, where
+NumPy takes a dozen with arrays between."""
 
 from typing import NamedTuple
 
@@ -19,6 +20,48 @@ class Sums(NamedTuple):
     momentum: np.ndarray  # (3,) sum m V
     flow: np.ndarray  # (3, 3) sum m V (x) V
     orthogonality: float  # largest entry of |Q^T Q - 1|; NaN if one is
+
+
+class Extent(NamedTuple):
+    """The largest size of a number in each array of a state and a load; NaN if one is, 0 of an empty array."""
+
+    position: float
+    velocity: float
+    rotation: float
+    angular_momentum: float
+    force: float
+    torque: float
+
+
+#: All bits of a float64 but its sign. As integers the rest are in the order of sizes, NaN after infinity.
+SIZE = np.int64(2**63 - 1)
+
+
+def extent_of(state: State, load: Load = EXAMPLE[1]) -> Extent:
+    """The extent of a state and of the load on it."""
+    found = np.empty(len(Extent._fields))
+    _find_largest(
+        state.position, state.velocity, state.rotation, state.angular_momentum_body, load.force, load.torque_body, found
+    )
+    return Extent(*found.tolist())
+
+
+@kernel(outer=True)
+def _find_largest(position, velocity, rotation, angular, force, torque, found):
+    bits = found.view(np.int64)
+    bits[0], bits[1], bits[2] = _largest(position), _largest(velocity), _largest(rotation)
+    bits[3], bits[4], bits[5] = _largest(angular), _largest(force), _largest(torque)
+
+
+@kernel
+def _largest(values):
+    """The bits of the largest size in a contiguous array. Integers are compared several at a time; floats, of which NaN
+    has no order, one by one."""
+    bits = values.reshape(values.size).view(np.int64)
+    most = np.int64(0)
+    for k in range(len(bits)):
+        most = max(most, bits[k] & SIZE)
+    return most
 
 
 def sums_over(model: Model, state: State, load: Load = EXAMPLE[1]) -> Sums:

@@ -103,6 +103,7 @@ class Engine:
         self._room: BoxRoom | None = None
         self._stale = True
         self._first = True
+        self._checked: State | None = None
         self._moved: State | None = None
         self._row: tuple[Scheme, Row] | None = None
 
@@ -201,8 +202,9 @@ class Engine:
 
     def _told(self, load: Load, loading: Loading) -> tuple[Load, dict[str, Tally]]:
         """Copies of a load and of the tallies of its terms."""
-        tallies = loading.loader.tallies.copy()
-        told = [Tally(float(own[0]), own[1:].reshape(3, 3)) for own in tallies]
+        tallies = loading.loader.tallies
+        virials = tallies[:, 1:].copy().reshape(-1, 3, 3)
+        told = [Tally(energy, virial) for energy, virial in zip(tallies[:, 0].tolist(), virials, strict=True)]
         return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, told, strict=False))
 
     def snapshot(self) -> State:
@@ -251,7 +253,9 @@ class Engine:
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         """Check the arrays for compiled code; return its workspaces, made at the first use."""
-        _check_arrays(state)
+        if state is not self._checked:
+            _check_arrays(state)
+            self._checked = state
         if isinstance(self.model, Model):
             set_threads(threads_for(self.threads))
         if self._workspaces is None:
@@ -295,7 +299,8 @@ def _scheme_of(row: Scheme | Solver) -> Scheme:
 
 def keep_time(state: State, dt: float) -> None:
     """Begin a new stretch of equal steps, in place, if the step has changed or time was set from outside."""
-    if state.time[NOW] != state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt:
+    time, step = state.time.tolist(), state.step.tolist()
+    if time[NOW] != time[ORIGIN] + (step[NOW] - step[ORIGIN]) * dt:
         state.begin_stretch()
 
 

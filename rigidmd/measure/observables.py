@@ -12,6 +12,8 @@ from rigidmd.dynamics.sums import sums_over
 from rigidmd.engines import Engine
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
+UNIT, UNKNOWN = np.eye(3), np.full((3, 3), nan)
+
 
 class Reading(NamedTuple):
     """Observables of molecules at one moment, in the units of the log. NaN if one does not exist."""
@@ -135,9 +137,9 @@ def observe(
     translation_unbiased = translation + slant * sums.force
     rotation_unbiased = rotation + slant * sums.torque
     freedom = freedom or system.freedom
-    pressure = np.full((3, 3), nan)
+    pressure = UNKNOWN
     if volume < inf:
-        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * np.eye(3)
+        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * UNIT
     return Observation(
         components=components,
         virial=virial,

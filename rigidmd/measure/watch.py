@@ -15,6 +15,7 @@ from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
+from rigidmd.dynamics.sums import extent_of
 from rigidmd.engines.cpu import BehindWallError, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import SteadyForce
@@ -85,12 +86,6 @@ def steps_between(system: System) -> int | None:
     return patience(system) if max(steps, default=0.0) > patience(system) else None
 
 
-def thermal_energy(system: System, kinetic: float) -> float:
-    """kT of this kinetic energy, or the deepest well if that is larger: sets the scale of momenta; u Å²/ps²."""
-    wells = max((m.epsilon.max() for m in system.species), default=0.0)
-    return max(2 * kinetic / max(system.freedom.total, 1), wells)
-
-
 class StepCheck:
     """Checks of the next step of a run of molecules.
 
@@ -104,13 +99,15 @@ class StepCheck:
         # Distances of sites from the axes, in radii: of a spin, what counts is the move of the sites.
         arms = [axis_distances(m) / (m.radius or 1.0) for m in system.species]
         self._per_momentum = model.inverse_inertia * np.array(arms)  # (species, 3)
+        self._most_per_momentum = float(self._per_momentum.max())
         self._diameter = system.smallest_diameter
-        self._mass_root = np.sqrt(model.inverse_mass.max())  # of the lightest, inverse; 0 if all are frozen
-        self._inertia_root = np.sqrt(model.inertia[model.inertia > 0].min(initial=inf))
+        self._mass_root = sqrt(model.inverse_mass.max())  # of the lightest, inverse; 0 if all are frozen
+        self._inertia_root = sqrt(model.inertia[model.inertia > 0].min(initial=inf))
+        self._deepest_well = max((m.epsilon.max() for m in system.species), default=0.0)
 
     def rescale(self, kinetic: float) -> None:
-        """Take the scale of momenta from a kinetic energy, u Å²/ps²."""
-        self.thermal = thermal_energy(self._system, kinetic)
+        """Take the scale of momenta from a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
+        self.thermal = max(2 * kinetic / max(self._system.freedom.total, 1), self._deepest_well)
 
     def finding(self, state: State, load: Load, stage: Stage) -> Finding | None:
         """`next_step` of a stage, if it has steps."""
@@ -118,15 +115,17 @@ class StepCheck:
             return None
         return self.next_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND)
 
-    @np.errstate(over="ignore", invalid="ignore")
     def next_step(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
         """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
 
         load : at this state or at the last kick
         """
+        return None if self._is_mild(state, load, scheme, dt) else self._looked_at(state, load, scheme, dt)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _looked_at(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
+        """The finding of `next_step`, from every molecule."""
         system, limits, model = self._system, self._limits, self._system.model
-        if self._is_mild(state, load, scheme, dt):
-            return None
         for what, values in (("force", load.force), ("torque", load.torque_body)):
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
@@ -156,26 +155,19 @@ class StepCheck:
 
     def _is_mild(self, state: State, load: Load, scheme: Scheme, dt: float) -> bool:
         """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces, velocities and
-        so on: nearly always, and five times as fast as to look at each of 4096 waters."""
-        limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
-        force, torque = _largest(load.force), _largest(load.torque_body)
-        if not force + torque < inf:
+        so on: nearly always, and many times as fast as to look at each of them."""
+        limits, stride, largest = self._limits, dt * max(map(abs, scheme.drifts)), extent_of(state, load)
+        if not largest.force + largest.torque < inf:
             return False
         if limits.kick and self.thermal > 0:
-            kick = dt * max(map(abs, scheme.kicks)) / np.sqrt(self.thermal)
-            if not kick * max(force * self._mass_root, torque / self._inertia_root) <= limits.kick:
+            kick = dt * max(map(abs, scheme.kicks)) / sqrt(self.thermal)
+            if not kick * max(largest.force * self._mass_root, largest.torque / self._inertia_root) <= limits.kick:
                 return False
-        if limits.move and not np.sqrt(3) * stride * _largest(state.velocity) <= limits.move * self._diameter:
+        if limits.move and not sqrt(3) * stride * largest.velocity <= limits.move * self._diameter:
             return False
         if not (limits.turn_rad and len(state.rotation)):
             return True
-        spin = _largest(state.angular_momentum_body) * self._per_momentum.max()
-        return bool(np.sqrt(3) * stride * spin <= limits.turn_rad)
-
-
-def _largest(values: np.ndarray) -> float:
-    """The largest size of a number in an array, NaN if one is; 0 of an empty one."""
-    return float(max(values.max(initial=0.0), -values.min(initial=0.0)))
+        return sqrt(3) * stride * largest.angular_momentum * self._most_per_momentum <= limits.turn_rad
 
 
 def axis_distances(molecule: Molecule) -> np.ndarray:

@@ -40,7 +40,7 @@ from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.results import Results
 from rigidmd.run.resuming import changed_since, fitting
 from rigidmd.run.signals import ending_signals, handled, interruptible
-from rigidmd.run.stretches import Costs, Place, Stretch
+from rigidmd.run.stretches import Agenda, Costs, Place, Stretch
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
@@ -288,6 +288,10 @@ class Simulation(Base):
     def _recall(self, kept: Checkpoint) -> None:
         """Return to a checkpoint, in place of `_prepare`. Raises CheckpointError if it is of another scene."""
 
+    def _is_finite(self) -> bool:
+        """Whether all variables of the state are finite."""
+        return self.state.is_finite
+
     @abstractmethod
     def _look(self, moment: Moment) -> Any:
         """The observation at a moment, in internal units; observers see its `reading` if it has one."""
@@ -391,7 +395,7 @@ class Simulation(Base):
                 if k == 0 and not resumed:
                     self._show(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
                     self._checkpoint(observers, place)
-                every = [self._every(observer, stretch.dt) for observer in observers]
+                agenda = Agenda(observers, stretch)
                 if stretch.act is not None and not resumed:
                     began = clock.perf_counter()
                     stretch.act(progress)
@@ -400,22 +404,17 @@ class Simulation(Base):
                     self._show(observers, Moment(self, place.first, place.time, k), due)
                 shown, pace = None, 0.0
                 while done < stretch.steps and not self._interrupted:
-                    counts = [self._counted(observer, stretch) + done for observer in observers]
-                    ahead = [n - count % n for count, n in zip(counts, every, strict=True) if n]
-                    ahead += [max(1, int(PIECE / pace))] if pace > 0 else []
-                    to = min([stretch.steps, *(done + steps for steps in ahead)])
-                    shown = [
-                        self._is_due(observer, n, stretch, to) for observer, n in zip(observers, every, strict=True)
-                    ]
-                    looked = any(
-                        due and observer.reads_energies for observer, due in zip(observers, shown, strict=True)
-                    )
+                    to = agenda.next_look(done)
+                    if pace > 0:
+                        to = min(to, done + max(1, int(PIECE / pace)))
+                    shown = agenda.due(to)
+                    looked = agenda.reads_energies(shown)
                     began = clock.perf_counter()
                     self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
                     place = place._replace(seconds=place.seconds + seconds)
-                    if not self.state.is_finite:
+                    if not self._is_finite():
                         raise NotFiniteError(self.state)
                     advanced(stretch.dt * (to - done))
                     done = to
@@ -437,24 +436,6 @@ class Simulation(Base):
     def _moment(self, place: Place, done: int) -> Moment:
         """The moment after so many steps of the present stretch."""
         return Moment(self, place.first + done, place.time + done * self.stretch.dt, place.stretch)
-
-    @staticmethod
-    def _every(observer: Observer, dt: float) -> int:
-        """Steps between two looks of an observer; 0 for the last look only."""
-        if observer.interval is not None:
-            return max(1, round(observer.interval / dt))
-        return observer.steps or 0
-
-    @staticmethod
-    def _counted(observer: Observer, stretch: Stretch) -> int:
-        """Steps before a stretch that an observer counts: intervals of time may continue from the previous stretch."""
-        return stretch.counted if observer.interval is not None else 0
-
-    @classmethod
-    def _is_due(cls, observer: Observer, every: int, stretch: Stretch, done: int) -> bool:
-        """Whether an observer looks after so many steps of a stretch."""
-        last = done == stretch.steps and observer.ends
-        return last or (every > 0 and (cls._counted(observer, stretch) + done) % every == 0)
 
     @staticmethod
     def _show(observers: list[Observer], moment: Moment, due: list[bool]) -> None:

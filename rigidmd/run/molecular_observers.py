@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class LogFile(Observer):
-    """log.csv: a line for each sample, written to disk at once."""
+    """log.csv: a line for each sample."""
 
     ends = reads_energies = True
 
@@ -55,7 +55,9 @@ class LogFile(Observer):
             self._log.write(moment.sample)
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
-        """Name it."""
+        """Complete and name it."""
+        if self._log is not None:
+            self._log.flush()
         results.files.append(run.path(LOG))
 
     def close(self) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import hypot, nan
+from math import hypot, isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -16,6 +16,7 @@ from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.compile.machine import threads_for
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
+from rigidmd.dynamics.sums import extent_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.measure import watch
@@ -352,6 +353,10 @@ class MolecularSimulation(Simulation):
         self.system = replace(self.system, scene=self.scene)
         if self.folder is not None:
             self.write_scene(self.folder)
+
+    def _is_finite(self) -> bool:
+        rest = self.state.books.tolist() + self.state.bath.tolist()
+        return all(map(isfinite, [*extent_of(self.state), *rest]))
 
     def _look(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]

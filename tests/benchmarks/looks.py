@@ -3,9 +3,9 @@
     python tests/benchmarks/looks.py --workloads 216,W1,W2,W3 --rounds 5
 
 Both move the same start at constant energy in steps of 2 fs, in turns in one process. The run is that of `rigidmd run`: a
-log, a trajectory, a checkpoint, the estimate of the longest stable step. Its time is that from the first step to the last
-file. The engine takes its steps in one piece, as in peers.py. 216: the smallest box of scaling.py; the others are those of
-peers.py.
+log, a trajectory, a checkpoint, the estimate of the longest stable step. Its time is that of its stages, looks included; the
+figure and the summary come after it. The engine takes its steps in one piece, as in peers.py. 216: the smallest box of
+scaling.py; the others are those of peers.py.
 """
 
 import argparse
