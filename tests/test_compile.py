@@ -2,6 +2,7 @@
 sources keep."""
 
 import ast
+import ctypes
 import os
 import re
 import subprocess
@@ -15,9 +16,9 @@ from conftest import ROOT
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.errors import TypingError
-from numba.core.registry import CPUDispatcher
+from numba.core.registry import CPUDispatcher, cpu_target
 
-from rigidmd.compile import Code, call, call_blocks, kernel, numba_private, opened, packed, task
+from rigidmd.compile import Bound, Code, Laid, call, call_blocks, kernel, numba_private, opened, packed, task
 from rigidmd.compile.cache import cache_folder
 from rigidmd.compile.numba_private import Index, Inner, Kernel, callback
 
@@ -105,6 +106,57 @@ def test_references_are_not_counted_where_it_is_asked_for(counted):
 def test_a_callback_is_compiled_for_given_types_and_cached():
     code = callback(lambda x, k: None, (types.float64, types.intp), {})
     assert code.address and type(code._cache._cache_file) is Index
+
+
+# --- values in memory ------------------------------------------------------------------------------------------------
+
+
+class Mixed(NamedTuple):
+    """Values of every kind that a term may have."""
+
+    small: np.int8
+    flags: tuple
+    plane: np.ndarray
+    nothing: None
+    single: np.float32
+    flag: bool
+    inner: tuple
+    number: float
+    count: int
+    turned: np.ndarray
+    code: Code | None
+
+
+@task()
+def _tell(parcel, block):
+    mixed, found = opened(parcel)
+    found[0], found[1], found[2] = mixed.small, mixed.flags[0], mixed.flags[1]
+    found[3], found[4], found[5] = mixed.plane[1, 2], mixed.single, mixed.flag
+    found[6], found[7] = mixed.inner[0], mixed.inner[1][0][1]
+    found[8], found[9], found[10] = mixed.number, mixed.count, mixed.turned[2, 1]
+    found[11] = mixed.plane.shape[0] + len(mixed.inner[1][0])
+    mixed.plane[0, 0] = -1.0
+
+
+def test_values_are_laid_down_as_compiled_code_has_them():
+    plane, found = np.arange(6.0).reshape(2, 3), np.zeros(12)
+    inner = (np.uint16(65000), (np.array([7, 8, 9], np.int32),))
+    turned, code = np.arange(6, dtype=np.float32).reshape(2, 3).T, Code(add=(_add, (np.zeros(3), 0.0)))
+    mixed = Mixed(np.int8(-3), (True, False), plane, None, np.float32(0.5), True, inner, 2.5, -(2**40), turned, code)
+    Bound(_tell, (mixed, found))()
+    assert found.tolist() == [-3, 1, 0, 5, 0.5, 1, 65000, 8, 2.5, -(2**40), 5, 5]
+    assert plane[0, 0] == -1.0
+    context, laid = cpu_target.target_context, Laid(mixed)
+    assert ctypes.sizeof(laid._memory) == context.get_abi_sizeof(context.get_value_type(laid.kind))
+
+
+def test_what_cannot_be_laid_down_or_has_another_type_is_named():
+    with pytest.raises(TypeError, match="unicode_type cannot be laid down"):
+        Laid((1.0, "text"))
+    code = Code(add=(_add, (np.zeros(3), 0.0)))
+    assert code.lay_down((np.zeros(2), 1.0)).kind == numba.typeof((np.zeros(3), 0.0))
+    with pytest.raises(TypingError, match=r"add was compiled for .*float64, 1d.*, not for .*float32, 1d"):
+        code.lay_down((np.zeros(3, np.float32), 0.0))
 
 
 # --- addresses -------------------------------------------------------------------------------------------------------

@@ -56,6 +56,7 @@ LIBRARIES = {
     "chemiscope": {"looking/inline.py"},
     "numba": {
         "compile/cache.py", "compile/code.py", "compile/crew.py", "compile/kernels.py", "compile/lane_math.py",
+        "compile/layout.py",
         "compile/lane_types.py", "compile/lanes.py", "compile/machine.py", "compile/numba_private.py",
         "compile/own.py", "compile/records.py", "forces/pairs/loop.py", "forces/pairs/sites.py", "forces/terms.py",
     },

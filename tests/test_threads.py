@@ -14,7 +14,7 @@ import pytest
 from conftest import ROOT, small_scene
 
 from rigidmd import Every, Simulation, run_together
-from rigidmd.compile import Code, call_blocks, kernel, laid_down, opened, packed, set_threads, task
+from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
 from rigidmd.compile.crew import CLAIMED, FIRST_HELPER, _crew, _take
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.schemes import SCHEMES
@@ -78,11 +78,6 @@ def _note(parcel, block):
 
 
 @kernel(outer=True)
-def _lay_down(content, room):
-    return laid_down(content, room)
-
-
-@kernel(outer=True)
 def _take_alone(cells, job, address, room, blocks, own, threads):
     return _take(cells, job, address, room, blocks, own, threads)
 
@@ -100,11 +95,11 @@ def _take_alone(cells, job, address, room, blocks, own, threads):
     ],
 )
 def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(own, threads, claimed, expected):
-    cells, order, room = np.zeros(FIRST_HELPER, np.int64), np.zeros(7, np.int64), np.zeros(64)
+    cells, order = np.zeros(FIRST_HELPER, np.int64), np.zeros(7, np.int64)
     cells[CLAIMED : CLAIMED + 6] = claimed
     code = Code(note=(_note, order))
-    assert _lay_down(order, room) <= len(room)
-    last = _take_alone(cells.ctypes.data, 4, code.address("note"), room.ctypes.data, 6, own, threads)
+    laid = code.lay_down(order)
+    last = _take_alone(cells.ctypes.data, 4, code.address("note"), laid.address, 6, own, threads)
     assert order[1 : order[0] + 1].tolist() == expected
     assert last == (len(expected) == 6)
 

@@ -5,30 +5,31 @@ The names that the author of a term needs are exported here; `lanes` has the vec
 
 from rigidmd.compile import threads  # noqa: F401  (before Numba is loaded)
 from rigidmd.compile.code import (
+    Bound,
     Code,
     Parcel,
     Task,
-    address_of,
     call,
     call_blocks,
     compile_together,
-    laid_down,
     opened,
     packed,
     task,
 )
 from rigidmd.compile.crew import jump_to, set_threads
 from rigidmd.compile.kernels import implements, is_a, kernel
+from rigidmd.compile.layout import Laid
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 
 __all__ = [
     "BLOCKS",
     "MOST_BLOCKS",
     "SIMD_BITS",
+    "Bound",
     "Code",
+    "Laid",
     "Parcel",
     "Task",
-    "address_of",
     "call",
     "call_blocks",
     "compile_together",
@@ -36,7 +37,6 @@ __all__ = [
     "is_a",
     "jump_to",
     "kernel",
-    "laid_down",
     "opened",
     "packed",
     "set_threads",

@@ -1,5 +1,6 @@
 """Machine code that is called by address. Each address carries the type that the code was compiled for."""
 
+import ctypes
 import hashlib
 import threading
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from numba.extending import NativeValue, intrinsic, models, overload, register_m
 
 from rigidmd.compile import ahead, crew
 from rigidmd.compile.kernels import kernel, options_of
+from rigidmd.compile.layout import Laid, Word
 from rigidmd.compile.numba_private import callback, kept_callback, uncounted
 
 ADDRESS = ir.IntType(8).as_pointer()
@@ -143,7 +145,7 @@ class Code:
         if plan is not None:
             plan.extend(of)
         self._addresses = np.array([one.address(parcel) if plan is None else 0 for one, parcel in of], np.uintp)
-        self.table = self._addresses.ctypes.data
+        self.word = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(parcels.items()))
         self._names = list(tasks)
 
@@ -151,8 +153,15 @@ class Code:
         """Address of a task."""
         return int(self._addresses[self._names.index(name)])
 
+    def lay_down(self, content: object) -> Laid:
+        """A content in memory, for every task. Raises TypingError if one was compiled for another type."""
+        laid = Laid(content)
+        for name in self._names:
+            self.numba_type.place(name, Parcel(laid.kind))
+        return laid
 
-class CodeType(types.Type):
+
+class CodeType(Word):
     """Numba type of a `Code`: its tasks, and the type of parcel that each accepts."""
 
     def __init__(self, parcels: tuple[tuple[str, Parcel], ...]):
@@ -195,9 +204,9 @@ class _CodeModel(models.PrimitiveModel):
 
 @unbox(CodeType)
 def _unbox_code(kind, value, context):
-    table = context.pyapi.object_getattr_string(value, "table")
-    address = context.pyapi.long_as_ulonglong(table)
-    context.pyapi.decref(table)
+    word = context.pyapi.object_getattr_string(value, "word")
+    address = context.pyapi.long_as_ulonglong(word)
+    context.pyapi.decref(word)
     return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
 
 
@@ -227,37 +236,22 @@ def _jump(typing, address, parcel, block):
     return types.void(types.intp, parcel, types.intp), emit
 
 
-@intrinsic
-def laid_down(typing, content, room):
-    """Write a value into an array (n,) of float64, from where `jump_to` can take it as a parcel; the room it needs.
+class Bound:
+    """A task with its content, for Python to call without holding its lock.
 
-    Nothing is written if the room is too small. References to arrays in it are not counted: whoever keeps the room must
-    also keep them.
+    A call takes a microsecond. Numba would look at every array in every call: after a stretch of computing the core has
+    to fetch all of them again, and the code that looks at them.
+
+    content : a tuple; its arrays are kept, and those that change tell the task what to do
     """
 
-    def emit(context, builder, signature, arguments):
-        there = context.make_array(signature.args[1])(context, builder, arguments[1])
-        value = _uncounted(context, builder, signature.args[0], arguments[0])
-        size = ir.IntType(64)(-(-context.get_abi_sizeof(value.type) // 8))
-        with builder.if_then(builder.icmp_signed("<=", size, builder.extract_value(there.shape, 0))):
-            builder.store(value, builder.bitcast(there.data, value.type.as_pointer()))
-        return size
+    def __init__(self, task: Task, content: tuple):
+        code = Code(task=(task, content))
+        self._content = code.lay_down(content)
+        self._function = ctypes.CFUNCTYPE(None, ctypes.c_ssize_t, ctypes.c_ssize_t)(code.address("task"))
 
-    return types.int64(content, room), emit
-
-
-def _uncounted(context, builder, kind: types.Type, value):
-    """A value whose arrays have no owner."""
-    if isinstance(kind, types.Array):
-        array = context.make_array(kind)(context, builder, value)
-        for owner in ("meminfo", "parent"):
-            setattr(array, owner, ir.Constant(getattr(array, owner).type, None))
-        return array._getvalue()
-    if isinstance(kind, types.BaseTuple):
-        for k, inner in enumerate(kind.types):
-            part = _uncounted(context, builder, inner, builder.extract_value(value, k))
-            value = builder.insert_value(value, part, k)
-    return value
+    def __call__(self) -> None:
+        self._function(self._content.address, 0)
 
 
 @kernel

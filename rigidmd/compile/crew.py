@@ -129,7 +129,7 @@ def _ring(typing, bell):
 
 @intrinsic
 def jump_to(typing, address, parcel, block):
-    """Call the task at an address for a parcel, or what `laid_down` has written, at another."""
+    """Call the task at an address for a parcel, or a `Laid` value, at another."""
 
     def emit(context, builder, signature, arguments):
         kind = ir.FunctionType(ir.VoidType(), [WORD, WORD])

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import Bound, Code, call_blocks, implements, is_a, kernel, opened, packed, task
 from rigidmd.core.schemes import BATH, BOX, DRIFT, KICK, STRETCH, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN, WORK
 from rigidmd.dynamics.baths import apply, bath_code
@@ -67,7 +67,7 @@ def row_of(scheme: Scheme) -> Row:
     return Row(kind, fraction, moment, every, gradient, last)
 
 
-@kernel(outer=True)
+@kernel
 def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor):
     """Step until `until` steps of dt have been taken, counted in state.step.
 
@@ -130,6 +130,49 @@ def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, 
         state.step[NOW] += 1
     catch_up(model, code, state, load, waiting)
     return OK
+
+
+#: Numbers of `Advance`: what a call is told (`until`, `looked`), its status, and the three of the cursor.
+UNTIL, LOOKED, STATUS, CURSOR = 0, 1, 2, 3
+
+
+class Advance:
+    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `looked` and the cursor."""
+
+    def __init__(self, *arguments):
+        self.arguments = arguments
+        self._dt, self._told = np.zeros(1), np.zeros(CURSOR + 3, np.int64)
+        self._call = Bound(_advance, (arguments, self._dt, self._told))
+
+    def begin(self, dt: float, until: int, looked: bool, loaded: bool) -> None:
+        """Say what the next calls do. loaded : whether the load is that of the present positions"""
+        self._dt[0] = dt
+        self._told[:] = until, looked, OK, 0, loaded, 0
+
+    def __call__(self) -> int:
+        """Go on; a status code."""
+        self._call()
+        return int(self._told[STATUS])
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the load is that of the present positions."""
+        return self._told[CURSOR + 1] != 0
+
+
+@kernel(outer=True)
+def advance_body(model, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor):
+    """`advance` of a body, for Python."""
+    return advance(model, None, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor)
+
+
+@task()
+def _advance(parcel, block):
+    (model, code, state, load, terms, bath, box, row, probe, heat, room), dt, told = opened(parcel)
+    told[STATUS] = advance(
+        model, code, state, load, terms, bath, box, row, probe, heat, room, dt[0], told[UNTIL], told[LOOKED] != 0,
+        told[CURSOR:],
+    )  # fmt: skip
 
 
 def kick(model, code, state, load, waiting, h):

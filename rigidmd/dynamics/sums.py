@@ -40,9 +40,8 @@ SIZE = np.int64(2**63 - 1)
 def extent_of(state: State, load: Load = EXAMPLE[1]) -> Extent:
     """The extent of a state and of the load on it."""
     found = np.empty(len(Extent._fields))
-    _find_largest(
-        state.position, state.velocity, state.rotation, state.angular_momentum_body, load.force, load.torque_body, found
-    )
+    arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
+    _find_largest(*(array.ravel() for array in arrays), found)
     return Extent(*found.tolist())
 
 
@@ -55,9 +54,9 @@ def _find_largest(position, velocity, rotation, angular, force, torque, found):
 
 @kernel
 def _largest(values):
-    """The bits of the largest size in a contiguous array. Integers are compared several at a time; floats, of which NaN
-    has no order, one by one."""
-    bits = values.reshape(values.size).view(np.int64)
+    """The bits of the largest size. Integers are compared several at a time; floats, of which NaN has no order, one by
+    one."""
+    bits = values.view(np.int64)
     most = np.int64(0)
     for k in range(len(bits)):
         most = max(most, bits[k] & SIZE)

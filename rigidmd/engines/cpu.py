@@ -23,7 +23,7 @@ from rigidmd.core.state import (
     State,
     no_load,
 )
-from rigidmd.dynamics.advance import Model, Row, advance, code_of, row_of
+from rigidmd.dynamics.advance import Advance, Model, advance_body, code_of, row_of
 from rigidmd.dynamics.baths import NoBath, heat_room
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.boxes import BoxRoom, NoBox, Piston, box_room
@@ -105,7 +105,8 @@ class Engine:
         self._first = True
         self._checked: State | None = None
         self._moved: State | None = None
-        self._row: tuple[Scheme, Row] | None = None
+        self._bound: tuple[tuple, Advance] | None = None  # what it is bound to
+        self._row: tuple[Scheme, tuple] | None = None
 
     @property
     def workspaces(self) -> dict[str, NamedTuple]:
@@ -144,31 +145,44 @@ class Engine:
         self._moved = state
         if self.load is None:
             self.load = no_load(state)
+        move = self._move_molecules if isinstance(self.model, Model) else self._move_body
+        self._stale = not move(state, self.load, row, workspaces, (float(dt), int(until), looked))
+
+    def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: tuple) -> bool:
+        """`advance` of molecules; whether the load is that of the new positions."""
+        loading = self._loading_for("steps", workspaces)
+        bound_to = (self.model, row, state, load, loading)
+        if self._bound is None or any(now is not then for now, then in zip(bound_to, self._bound[0], strict=True)):
+            model, rest = self.model_for(row), self._rest_of(row, state)
+            kind = (type(model.rotor), type(rest[0]))
+            if kind not in self._codes:
+                self._codes[kind] = code_of(model, rest[0])
+            self._bound = bound_to, Advance(model, self._codes[kind], state, load, loading.loader, *rest)
+        advance = self._bound[1]
+        advance.begin(*orders, not self._stale)
+        other = self._probe and self._probe.load
+        loading.bind(workspaces, state, load, other)
+        while status := advance():
+            loading.bind(self._answer(status, state), state, load, other)
+        return advance.loaded
+
+    def _move_body(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: tuple) -> bool:
+        """`advance` of a body; whether the load is that of the new position."""
+        if self._row is None or self._row[0] is not row:
+            self._row = row, self._rest_of(row, state)
+        model, rest, cursor = self.model_for(row), self._row[1], np.array([0, not self._stale, 0], np.int64)
+        while status := advance_body(model, state, load, workspaces, *rest, *orders, cursor):
+            workspaces = self._answer(status, state)
+        return cursor[1] != 0  # False also if there was no step, so that no forces were evaluated
+
+    def _rest_of(self, row: Scheme, state: State) -> tuple:
+        """What `advance` needs for a row besides the bodies and what acts on them."""
         if row.has_gradient and self._probe is None:
             self._probe = probe_for(state)
-        probe = self._probe if row.has_gradient else None
         if row.box is not None and self._room is None:
             self._room = box_room(state)
-        model, bath, box = self.model_for(row), row.bath or NoBath(), row.box or NoBox()
-        room = self._room if row.box is not None else None
-        cursor = np.array([0, not self._stale, 0], np.int64)
-        if self._row is None or self._row[0] is not row:
-            self._row = row, row_of(row)
-        rest = (bath, box, self._row[1], probe, self._heat, room, float(dt), int(until), looked, cursor)
-        while status := self._step(model, state, self.load, workspaces, rest):
-            workspaces = self._answer(status, state)
-        self._stale = cursor[1] == 0  # true also if there was no step, so that no forces were evaluated
-
-    def _step(self, model: Model | Body, state: State, load: Load, workspaces: tuple, rest: tuple) -> int:
-        """`advance`, with the terms as it takes them; a status code."""
-        if not isinstance(model, Model):
-            return advance(model, None, state, load, workspaces, *rest)
-        bath, _, _, probe, *_ = rest
-        kind = (type(model.rotor), type(bath))
-        if kind not in self._codes:
-            self._codes[kind] = code_of(model, bath)
-        loader = self._loading_for("steps", workspaces).bind(workspaces, state, load, probe and probe.load)
-        return advance(model, self._codes[kind], state, load, loader, *rest)
+        probe, room = self._probe if row.has_gradient else None, self._room if row.box is not None else None
+        return row.bath or NoBath(), row.box or NoBox(), row_of(row), probe, self._heat, room
 
     def _loading_for(self, use: str, workspaces: tuple[NamedTuple, ...]) -> Loading:
         """The terms behind a loader, one for steps and one for looks, each bound to a load of its own."""

@@ -14,14 +14,12 @@ from numba import literal_unroll, types
 
 from rigidmd.compile import (
     Code,
-    address_of,
+    Laid,
     implements,
     is_a,
     jump_to,
     kernel,
-    laid_down,
     opened,
-    packed,
     task,
 )
 from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State
@@ -186,13 +184,6 @@ def _add_rate(parcel, block):
     power[0] += energy_rate(term, state)
 
 
-@kernel(outer=True)
-def _lay_down(loader, k, code, term, state, load, other, room):
-    content = (term, state, load, other, loader.tallies[k], loader.status, loader.power)
-    loader.tallied[k] = address_of(code, "tallied", packed(content))  # checks the type
-    return laid_down(content, room)
-
-
 class Loading:
     """The terms of an engine behind their loader; keeps alive what it refers to.
 
@@ -203,9 +194,11 @@ class Loading:
         drives = any(getattr(type(own), "drives", False) for own in workspaces)
         self.loader = loader_for(len(workspaces), called and drives, with_energies)
         self._codes = [term_code(own, self.loader, called) for own in workspaces]
-        self._rooms = [np.zeros(64) for _ in workspaces]
+        self._laid: list[Laid] = []
+        self._given: tuple = (None,) * 4
         self._kept: tuple = ()
         for k, code in enumerate(self._codes):
+            self.loader.tallied[k] = code.address("tallied")
             self.loader.plain[k] = code.address("plain") if called else 0
             if self.loader.rate is not None:
                 self.loader.rate[k] = code.address("rate")
@@ -215,16 +208,20 @@ class Loading:
 
         Numba takes milliseconds to find the types of so many arrays; nothing is done where they are those of last time.
         """
+        given = (workspaces, state, load, other)
+        if all(now is then for now, then in zip(given, self._given, strict=True)):
+            return self.loader
         kept = (*workspaces, *state, *load, *(other or load))
         if len(kept) == len(self._kept) and all(now is then for now, then in zip(kept, self._kept, strict=True)):
+            self._given = given
             return self.loader
-        self._kept = ()
-        for k, (own, code) in enumerate(zip(workspaces, self._codes, strict=True)):
-            content = (self.loader, k, code, own, state, load, other or load)
-            while (needed := _lay_down(*content, self._rooms[k])) > len(self._rooms[k]):
-                self._rooms[k] = np.zeros(needed)
-            self.loader.content[k] = self._rooms[k].ctypes.data
-        self._kept = kept
+        loader, loads = self.loader, (load, other or load)
+        self._laid = [
+            code.lay_down((own, state, *loads, loader.tallies[k], loader.status, loader.power))
+            for k, (own, code) in enumerate(zip(workspaces, self._codes, strict=True))
+        ]
+        loader.content[:] = [laid.address for laid in self._laid]
+        self._given, self._kept = given, kept
         return self.loader
 
 
