@@ -172,6 +172,32 @@ def test_an_extent_has_the_largest_of_every_array(molecules):
     assert extent_of(state)[4:] == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("molecules", [{"spce": 40}, {"argon": 40}])
+def test_what_is_measured_at_the_end_of_a_move_is_that_of_the_state(molecules):
+    system, engine, state = built(molecules, 25.0, 3)
+    verlet = SCHEMES["velocity_verlet"]
+    state = engine.begin(state, verlet)
+
+    def same(known=True):
+        assert engine.extent(state) == (extent_of(state, engine.load) if known else None)
+        load, _ = engine.look(state)
+        for found, expected in zip(engine.sums(state, load), sums_over(system.model, state, load), strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+    assert engine.extent(state) is None
+    for until, looked in ((3, True), (5, False), (7, True), (7, False), (7, True)):
+        engine.advance(state, verlet, 0.001, until, looked)
+        same()
+    state.position[1] += 0.3
+    state.velocity[1] *= 100.0
+    engine.forget()
+    same(known=False)
+    engine.advance(state, SCHEMES["pefrl"], 0.001, 8, True)  # ends with a drift: its forces are those before
+    same(known=False)
+    other = engine.begin(system.state, verlet)
+    assert engine.extent(other) is None
+
+
 def test_time_can_be_reversed(liquid):
     _, engine, state = liquid
     there = run(engine, state, 0.001, 200)

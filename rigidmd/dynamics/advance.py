@@ -10,6 +10,7 @@ from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN, WORK
 from rigidmd.dynamics.baths import apply, bath_code
 from rigidmd.dynamics.boxes import load_for, move_box, stretch
 from rigidmd.dynamics.gradient import add_gyration, displace, evaluate
+from rigidmd.dynamics.sums import SUMS, Extent, Sums, add_up, find_largest, sums_of
 from rigidmd.forces.pairs.sites import blocks_of, share_of
 from rigidmd.forces.terms import PLAIN, TALLIED, is_driven, total_energy_rate
 from rigidmd.mechanics.groups import TOGETHER, kick_group, turn_group
@@ -137,12 +138,15 @@ UNTIL, LOOKED, STATUS, CURSOR = 0, 1, 2, 3
 
 
 class Advance:
-    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `looked` and the cursor."""
+    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `looked` and the cursor.
+
+    At the end it measures the state and its load while the cores still have them at hand.
+    """
 
     def __init__(self, *arguments):
-        self.arguments = arguments
         self._dt, self._told = np.zeros(1), np.zeros(CURSOR + 3, np.int64)
-        self._call = Bound(_advance, (arguments, self._dt, self._told))
+        self._extent, self._sums = np.zeros(len(Extent._fields)), np.zeros(SUMS)
+        self._call = Bound(_advance, (arguments, self._dt, self._told, self._extent, self._sums))
 
     def begin(self, dt: float, until: int, looked: bool, loaded: bool) -> None:
         """Say what the next calls do. loaded : whether the load is that of the present positions"""
@@ -159,6 +163,16 @@ class Advance:
         """Whether the load is that of the present positions."""
         return self._told[CURSOR + 1] != 0
 
+    @property
+    def extent(self) -> Extent:
+        """That of the state, and of the load as last computed."""
+        return Extent(*self._extent.tolist())
+
+    @property
+    def sums(self) -> Sums | None:
+        """The sums over the state and its load; None if the last call was not to be looked at."""
+        return sums_of(self._sums) if self._told[LOOKED] else None
+
 
 @kernel(outer=True)
 def advance_body(model, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor):
@@ -168,11 +182,21 @@ def advance_body(model, state, load, terms, bath, box, row, probe, heat, room, d
 
 @task()
 def _advance(parcel, block):
-    (model, code, state, load, terms, bath, box, row, probe, heat, room), dt, told = opened(parcel)
+    (model, code, state, load, terms, bath, box, row, probe, heat, room), dt, told, extent, sums = opened(parcel)
     told[STATUS] = advance(
         model, code, state, load, terms, bath, box, row, probe, heat, room, dt[0], told[UNTIL], told[LOOKED] != 0,
         told[CURSOR:],
     )  # fmt: skip
+    if told[STATUS] == OK:
+        find_largest(
+            state.position.ravel(), state.velocity.ravel(), state.rotation.ravel(),
+            state.angular_momentum_body.ravel(), load.force.ravel(), load.torque_body.ravel(), extent,
+        )  # fmt: skip
+        if told[LOOKED] != 0:
+            add_up(
+                model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
+                state.angular_momentum_body, load.force, load.torque_body, sums,
+            )  # fmt: skip
 
 
 def kick(model, code, state, load, waiting, h):

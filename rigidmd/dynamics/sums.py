@@ -1,13 +1,15 @@
 """Sums over the molecules of a state and its largest numbers, for a look at a run: one pass over each array, where
 NumPy takes a dozen with arrays between."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import EXAMPLE, Load, State
-from rigidmd.dynamics.advance import Model
+
+if TYPE_CHECKING:
+    from rigidmd.dynamics.advance import Model
 
 
 class Sums(NamedTuple):
@@ -20,6 +22,10 @@ class Sums(NamedTuple):
     momentum: np.ndarray  # (3,) sum m V
     flow: np.ndarray  # (3, 3) sum m V (x) V
     orthogonality: float  # largest entry of |Q^T Q - 1|; NaN if one is
+
+
+#: How many numbers there are in `Sums`.
+SUMS = 17
 
 
 class Extent(NamedTuple):
@@ -41,12 +47,13 @@ def extent_of(state: State, load: Load = EXAMPLE[1]) -> Extent:
     """The extent of a state and of the load on it."""
     found = np.empty(len(Extent._fields))
     arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
-    _find_largest(*(array.ravel() for array in arrays), found)
+    find_largest(*(array.ravel() for array in arrays), found)
     return Extent(*found.tolist())
 
 
 @kernel(outer=True)
-def _find_largest(position, velocity, rotation, angular, force, torque, found):
+def find_largest(position, velocity, rotation, angular, force, torque, found):
+    """Fill in the numbers (6,) of an `Extent` of arrays as rows of numbers."""
     bits = found.view(np.int64)
     bits[0], bits[1], bits[2] = _largest(position), _largest(velocity), _largest(rotation)
     bits[3], bits[4], bits[5] = _largest(angular), _largest(force), _largest(torque)
@@ -63,19 +70,26 @@ def _largest(values):
     return most
 
 
-def sums_over(model: Model, state: State, load: Load = EXAMPLE[1]) -> Sums:
+def sums_over(model: "Model", state: State, load: Load = EXAMPLE[1]) -> Sums:
     """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
-    found, momentum, flow = np.zeros(5), np.zeros(3), np.zeros((3, 3))
-    _add_up(
+    found = np.zeros(SUMS)
+    add_up(
         model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
-        state.angular_momentum_body, load.force, load.torque_body, found, momentum, flow,
+        state.angular_momentum_body, load.force, load.torque_body, found,
     )  # fmt: skip
-    translation, rotation, force, torque, orthogonality = map(float, found)
-    return Sums(translation, rotation, force, torque, momentum, flow, orthogonality)
+    return sums_of(found)
+
+
+def sums_of(found: np.ndarray) -> Sums:
+    """The sums in the numbers that `add_up` has filled in."""
+    translation, rotation, force, torque, orthogonality = found[:5].tolist()
+    vectors = found[5:].copy()
+    return Sums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality)
 
 
 @kernel(outer=True)
-def _add_up(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found, p, flow):
+def add_up(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found):
+    """Fill in the numbers (SUMS,) of `Sums`: orthogonality is the fifth, then come momentum and flow."""
     px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
     for m in range(len(velocity)):
         own = mass[species[m]]
@@ -106,8 +120,7 @@ def _add_up(species, mass, inverse_mass, inverse_inertia, velocity, rotation, an
                 if not abs(entry) <= worst and worst == worst:  # NaN is kept
                     worst = abs(entry)
     found[0], found[1], found[2], found[3], found[4] = xx + yy + zz, turning, pushed, twisted, worst
-    p[0], p[1], p[2] = px, py, pz
-    flow[0, 0], flow[1, 1], flow[2, 2] = xx, yy, zz
-    flow[0, 1] = flow[1, 0] = xy
-    flow[0, 2] = flow[2, 0] = xz
-    flow[1, 2] = flow[2, 1] = yz
+    found[5], found[6], found[7] = px, py, pz
+    found[8], found[9], found[10] = xx, xy, xz
+    found[11], found[12], found[13] = xy, yy, yz
+    found[14], found[15], found[16] = xz, yz, zz

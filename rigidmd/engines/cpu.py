@@ -28,6 +28,7 @@ from rigidmd.dynamics.baths import NoBath, heat_room
 from rigidmd.dynamics.body import Body
 from rigidmd.dynamics.boxes import BoxRoom, NoBox, Piston, box_room
 from rigidmd.dynamics.gradient import Probe, probe_for
+from rigidmd.dynamics.sums import Extent, Sums, sums_over
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.external.walls import Behind, LennardJonesWalls
@@ -105,6 +106,7 @@ class Engine:
         self._first = True
         self._checked: State | None = None
         self._moved: State | None = None
+        self._known: Load | None = None  # what was last told of the steps
         self._bound: tuple[tuple, Advance] | None = None  # what it is bound to
         self._row: tuple[Scheme, tuple] | None = None
 
@@ -146,6 +148,7 @@ class Engine:
         if self.load is None:
             self.load = no_load(state)
         move = self._move_molecules if isinstance(self.model, Model) else self._move_body
+        self._known = None
         self._stale = not move(state, self.load, row, workspaces, (float(dt), int(until), looked))
 
     def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: tuple) -> bool:
@@ -212,7 +215,18 @@ class Engine:
         moving = self._loadings.get("steps")
         if self.load is None or moving is None or state is not self._moved or self._stale or not moving.loader.known[0]:
             return self.evaluate(state)
-        return self._told(self.load, moving)
+        self._known, tallies = self._told(self.load, moving)
+        return self._known, tallies
+
+    def sums(self, state: State, load: Load) -> Sums:
+        """The sums over a state and the load on it, as `look` or `evaluate` has given it."""
+        found = self._bound[1].sums if self._bound is not None and load is self._known else None
+        return found or sums_over(self.model, state, load)
+
+    def extent(self, state: State) -> Extent | None:
+        """The extent of the state that was just moved, and of the load on it; None of any other."""
+        known = self._bound is not None and state is self._moved and not self._stale
+        return self._bound[1].extent if known else None
 
     def _told(self, load: Load, loading: Loading) -> tuple[Load, dict[str, Tally]]:
         """Copies of a load and of the tallies of its terms."""

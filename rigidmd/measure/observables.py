@@ -9,7 +9,7 @@ from rigidmd.assemble.momenta import Freedom
 from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.sums import sums_over
-from rigidmd.engines import Engine
+from rigidmd.engines import Engine, cpu
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 UNIT, UNKNOWN = np.eye(3), np.full((3, 3), nan)
@@ -131,7 +131,8 @@ def observe(
         components["tail" if system.own else "lennard_jones_tail"] = system.tail.energy(volume)
         beyond = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
-    sums = sums_over(system.model, state, load)
+    own = isinstance(engine, cpu.Engine)
+    sums = engine.sums(state, load) if own else sums_over(system.model, state, load)
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
     slant = verlet_step**2 / 12
     translation_unbiased = translation + slant * sums.force

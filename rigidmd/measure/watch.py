@@ -15,7 +15,7 @@ from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.sums import extent_of
+from rigidmd.dynamics.sums import Extent, extent_of
 from rigidmd.engines.cpu import BehindWallError, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import SteadyForce
@@ -109,18 +109,21 @@ class StepCheck:
         """Take the scale of momenta from a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
         self.thermal = max(2 * kinetic / max(self._system.freedom.total, 1), self._deepest_well)
 
-    def finding(self, state: State, load: Load, stage: Stage) -> Finding | None:
+    def finding(self, state: State, load: Load, stage: Stage, extent: Extent | None) -> Finding | None:
         """`next_step` of a stage, if it has steps."""
         if stage.is_minimisation:
             return None
-        return self.next_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND)
+        return self.next_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND, extent)
 
-    def next_step(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
+    def next_step(
+        self, state: State, load: Load, scheme: Scheme, dt: float, extent: Extent | None = None
+    ) -> Finding | None:
         """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
 
-        load : at this state or at the last kick
+        load : at this state or at the last kick; extent : of both, if it is known
         """
-        return None if self._is_mild(state, load, scheme, dt) else self._looked_at(state, load, scheme, dt)
+        largest = extent or extent_of(state, load)
+        return None if self._is_mild(largest, scheme, dt) else self._looked_at(state, load, scheme, dt)
 
     @np.errstate(over="ignore", invalid="ignore")
     def _looked_at(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
@@ -153,10 +156,10 @@ class StepCheck:
                 return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
         return None
 
-    def _is_mild(self, state: State, load: Load, scheme: Scheme, dt: float) -> bool:
+    def _is_mild(self, largest: Extent, scheme: Scheme, dt: float) -> bool:
         """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces, velocities and
         so on: nearly always, and many times as fast as to look at each of them."""
-        limits, stride, largest = self._limits, dt * max(map(abs, scheme.drifts)), extent_of(state, load)
+        limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
         if not largest.force + largest.torque < inf:
             return False
         if limits.kick and self.thermal > 0:
@@ -165,7 +168,7 @@ class StepCheck:
                 return False
         if limits.move and not sqrt(3) * stride * largest.velocity <= limits.move * self._diameter:
             return False
-        if not (limits.turn_rad and len(state.rotation)):
+        if not limits.turn_rad:
             return True
         return sqrt(3) * stride * largest.angular_momentum * self._most_per_momentum <= limits.turn_rad
 

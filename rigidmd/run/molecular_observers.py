@@ -152,7 +152,7 @@ class Sampler(Observer):
         seen = moment._seen
         if not self._check.thermal:
             self._check.rescale(seen.kinetic)
-        if finding := self._check.finding(run.state, seen.load, stage):
+        if finding := self._check.finding(run.state, seen.load, stage, run.extent):
             raise finding
         if finding := watch.sample_finding(run.system, run.scene.watch, rows[since], now):
             raise finding
@@ -205,7 +205,8 @@ class StepWatch(Observer):
         run, engine = self._run, self._run.engine
         if not isinstance(engine, Engine) or engine.load is None:
             return  # no force has been evaluated yet
-        if finding := self._check.finding(run.state, engine.load, run.scene.stages[moment.stage]):
+        stage = run.scene.stages[moment.stage]
+        if finding := self._check.finding(run.state, engine.load, stage, run.extent):
             raise finding
 
 

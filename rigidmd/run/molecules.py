@@ -16,7 +16,7 @@ from rigidmd.assemble.to_atoms import atoms_of
 from rigidmd.compile.machine import threads_for
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
-from rigidmd.dynamics.sums import extent_of
+from rigidmd.dynamics.sums import Extent, extent_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.measure import watch
@@ -355,8 +355,13 @@ class MolecularSimulation(Simulation):
             self.write_scene(self.folder)
 
     def _is_finite(self) -> bool:
-        rest = self.state.books.tolist() + self.state.bath.tolist()
-        return all(map(isfinite, [*extent_of(self.state), *rest]))
+        state, extent = self.state, self.extent or extent_of(self.state)
+        return all(map(isfinite, [*extent[:4], *state.books.tolist(), *state.bath.tolist()]))
+
+    @property
+    def extent(self) -> Extent | None:
+        """The extent of the state and its load, if it is known from the last step."""
+        return self.engine.extent(self.state) if isinstance(self.engine, Engine) else None
 
     def _look(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]
