@@ -460,14 +460,23 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
     monkeypatch.setattr(log.clock, "monotonic", lambda: now)
     path, samples = tmp_path / "log.csv", Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows
     file = log.Log(path, False)
-    for now, lines in ((0.1, 1), (0.4, 1), (0.6, 4), (0.7, 4), (5.0, 6), (5.1, 6)):
+
+    def lines():
+        return len(path.read_text().splitlines()) - 1
+
+    assert lines() == 0
+    for k in range(60):  # the first at once, then the lines of half a second
+        now = 0.01 * k
         file.write(samples[0])
-        assert len(path.read_text().splitlines()) == lines, now
+        assert lines() == (1 if k < 50 else 51)
+    for now, written in ((5.0, 61), (5.01, 61), (5.1, 63), (5.2, 64), (5.21, 64)):  # lines that come seldom do not wait
+        file.write(samples[0])
+        assert lines() == written, now
     assert file.kept[0] == path.stat().st_size
-    assert len(path.read_text().splitlines()) == 7
+    assert lines() == 65
     file.write(samples[0])
     file.close()
-    assert len(path.read_text().splitlines()) == 8
+    assert lines() == 66
 
 
 def test_from_python_in_five_lines():

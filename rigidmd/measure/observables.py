@@ -12,7 +12,7 @@ from rigidmd.dynamics.sums import sums_over
 from rigidmd.engines import Engine, cpu
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
-UNIT, UNKNOWN = np.eye(3), np.full((3, 3), nan)
+UNIT = np.eye(3)
 
 
 class Reading(NamedTuple):
@@ -138,7 +138,7 @@ def observe(
     translation_unbiased = translation + slant * sums.force
     rotation_unbiased = rotation + slant * sums.torque
     freedom = freedom or system.freedom
-    pressure = UNKNOWN
+    pressure = np.full((3, 3), nan)
     if volume < inf:
         pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * UNIT
     return Observation(

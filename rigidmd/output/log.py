@@ -1,4 +1,4 @@
-"""log.csv: one line a sample, on the disk within half a second of computing, so that a killed run keeps its samples.
+"""log.csv: one line a sample, soon on the disk, so that a killed run keeps its samples.
 
 The first columns are those of OpenMM's StateDataReporter.
 """
@@ -7,6 +7,7 @@ import csv
 import io
 import time as clock
 from collections.abc import Sequence
+from math import inf
 from operator import attrgetter
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from rigidmd.core.files import AppendedFile
 from rigidmd.measure import samples
 from rigidmd.measure.samples import Sample
 
-#: Seconds that a line may wait for others: dozens written together take a tenth of the time.
-DELAY = 0.5
+#: Seconds that a line may wait for others, which together take a tenth of the time, and after which it waits for none.
+DELAY, SELDOM = 0.5, 0.05
 #: Columns that are written on request.
 TENSOR = tuple(name for name in samples.COLUMNS if name.startswith("pressure_") and len(name) == len("pressure_xx"))
 
@@ -40,7 +41,7 @@ class Log:
         self._values = attrgetter(*shared)
         self._time = shared.index("time")
         self._rows: list[list] = []
-        self._written = clock.monotonic()
+        self._written = self._came = -inf
         self._file = AppendedFile(path, kept)
         if kept is None:
             self._rows.append(list(self._columns.values()))
@@ -53,21 +54,25 @@ class Log:
         return self._file.kept
 
     def write(self, sample: Sample) -> None:
-        """Add a line."""
+        """Add a line. It is written at once if none came shortly before."""
         row = [*self._values(sample), *sample.own]
         row[self._time] = round(sample.time, 9)
         self._rows.append(row)
-        if clock.monotonic() - self._written >= DELAY:
+        now = clock.monotonic()
+        before, self._came = self._came, now
+        if now - before >= SELDOM or now - self._written >= DELAY:
             self.flush()
+            self._written = now
 
     def flush(self) -> None:
-        """Write all lines so far."""
+        """Write all lines so far. Those that cannot be written are lost, as their sample stops the run."""
+        rows, self._rows = self._rows, []
+        if not rows:
+            return
         lines = io.StringIO(newline="")
         writer = csv.writer(lines, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
-        writer.writerows([None if x != x else x for x in row] for row in self._rows)  # NaN
+        writer.writerows([None if x != x else x for x in row] for row in rows)  # NaN
         self._file.append(lines.getvalue().encode())
-        self._rows.clear()
-        self._written = clock.monotonic()
 
     def close(self) -> None:
         """Write the rest and close the file."""

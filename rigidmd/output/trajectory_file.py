@@ -124,7 +124,7 @@ class TrajectoryFile:
         self._file.close()
 
     def _xtc_frame(self, state: State, time: float, step: int) -> bytes:
-        """A frame of the most usual format, as MDAnalysis' writer makes it, in a third of the time."""
+        """A frame of the most usual format, as MDAnalysis' writer makes it, in half of the time."""
         positions = self._system.site_positions(state, self._wrapped).astype(np.float32)
         _check_fits(self._path, positions)
         positions *= NM_PER_A
