@@ -52,6 +52,8 @@ Precision = Literal["double", "mixed"]
 #: Owners of arrays in the memory of an engine, besides its terms, and the arrays of each.
 LOAD, BOX = "load", "box"
 REMEMBERED = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
+#: dt, `until` and `looked` of `Engine.advance`.
+Orders = tuple[float, int, bool]
 DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
@@ -151,7 +153,7 @@ class Engine:
         self._known = None
         self._stale = not move(state, self.load, row, workspaces, (float(dt), int(until), looked))
 
-    def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: tuple) -> bool:
+    def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: Orders) -> bool:
         """`advance` of molecules; whether the load is that of the new positions."""
         loading = self._loading_for("steps", workspaces)
         bound_to = (self.model, row, state, load, loading)
@@ -169,7 +171,7 @@ class Engine:
             loading.bind(self._answer(status, state), state, load, other)
         return advance.loaded
 
-    def _move_body(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: tuple) -> bool:
+    def _move_body(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: Orders) -> bool:
         """`advance` of a body; whether the load is that of the new position."""
         if self._row is None or self._row[0] is not row:
             self._row = row, self._rest_of(row, state)
@@ -219,14 +221,15 @@ class Engine:
         return self._known, tallies
 
     def sums(self, state: State, load: Load) -> Sums:
-        """The sums over a state and the load on it, as `look` or `evaluate` has given it."""
+        """The sums over a state of molecules and the load on it, as `look` or `evaluate` has given it."""
         found = self._bound[1].sums if self._bound is not None and load is self._known else None
-        return found or sums_over(self.model, state, load)
+        return found or sums_over(cast(Model, self.model), state, load)
 
     def extent(self, state: State) -> Extent | None:
         """The extent of the state that was just moved, and of the load on it; None of any other."""
-        known = self._bound is not None and state is self._moved and not self._stale
-        return self._bound[1].extent if known else None
+        if self._bound is None or self._stale or state is not self._moved:
+            return None
+        return self._bound[1].extent
 
     def _told(self, load: Load, loading: Loading) -> tuple[Load, dict[str, Tally]]:
         """Copies of a load and of the tallies of its terms."""

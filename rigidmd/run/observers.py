@@ -138,11 +138,11 @@ class Frames(Observer):
 
     def see(self, moment: Moment) -> None:
         """A frame."""
+        system, state = self._run.system, self._run.state
         if self._file is not None:
-            self._file.write(moment.state, moment.time, moment.step)
+            self._file.write(state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))
         else:
-            system, state = self._run.system, moment.state
             positions = system.site_positions(state, self._wrapped).astype(np.float32)
             velocities = system.site_velocities(state).astype(np.float32)
             self._frames.append(Frame(moment.time, positions, state.cell.copy(), velocities, state.rotation.copy()))
