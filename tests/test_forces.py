@@ -614,7 +614,8 @@ def test_a_switched_force_is_that_of_the_product(name, start):
     for law in (one, two):
         found = np.empty((len(r), 2))
         pair_forces_at(law.room(1, np.float64), charges.room(1, np.float64), r**2, found)
-        assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < 2e-12
+        limit = 1e-13 if name == "switch" else 2e-12  # terms of the smooth one are up to 1e4 times their sum
+        assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < limit
 
 
 @pytest.mark.parametrize("start", [8.1, 7.2, 6.8])

@@ -164,11 +164,11 @@ class System:
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
         owner = self.sites.molecule
-        return _of(self.centres(state, wrapped), owner) + _arms(state, owner, self.sites.offset_body)
+        return _gathered(self.centres(state, wrapped), owner) + _arms(state, owner, self.sites.offset_body)
 
     def positions_of(self, state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
         """Positions (k, 3) of points fixed in molecules (k,) at offsets (k, 3), lab frame, Å, not wrapped."""
-        return _of(state.position, molecule) + _arms(state, molecule, offset_body)
+        return _gathered(state.position, molecule) + _arms(state, molecule, offset_body)
 
     def centres(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Centres of mass (n, 3), lab frame, Å; wrapped: inside the box."""
@@ -177,22 +177,22 @@ class System:
     def site_velocities(self, state: State) -> np.ndarray:
         """Velocities (s, 3) of all sites, lab frame, Å/ps."""
         owner = self.sites.molecule
-        velocity = _of(state.velocity, owner)
+        velocity = _gathered(state.velocity, owner)
         if len(state.rotation) == 0:
             return velocity
         omega = state.angular_momentum_body * self.model.inverse_inertia[self.model.species]
         lab = np.einsum("nij,nj->ni", state.rotation, omega)
-        return velocity + np.cross(_of(lab, owner), _arms(state, owner, self.sites.offset_body))
+        return velocity + np.cross(_gathered(lab, owner), _arms(state, owner, self.sites.offset_body))
 
 
 def _arms(state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
     """Vectors (k, 3) from the centres of molecules (k,) to points at offsets (k, 3) in the body frame, lab frame, Å."""
     if len(state.rotation) == 0:
         return np.zeros_like(offset_body)
-    return np.einsum("sij,sj->si", _of(state.rotation, molecule), offset_body)
+    return np.einsum("sij,sj->si", _gathered(state.rotation, molecule), offset_body)
 
 
-def _of(values: np.ndarray, molecule: np.ndarray) -> np.ndarray:
+def _gathered(values: np.ndarray, molecule: np.ndarray) -> np.ndarray:
     """values[molecule], in a quarter of the time."""
     return values.take(molecule, axis=0)
 

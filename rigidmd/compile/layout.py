@@ -23,8 +23,8 @@ class Laid:
     Raises TypeError if there is something in it besides numbers, arrays, None, codes, and tuples of these
     """
 
-    def __init__(self, value: Any, kind: types.Type | None = None):
-        self.value, self.kind = value, kind or numba.typeof(value)
+    def __init__(self, value: Any):
+        self.value, self.kind = value, numba.typeof(value)
         self._memory = _struct((("whole", self.kind),))()
         _fill(self._memory, (("whole", self.kind),), (value,))
         self.address = ctypes.addressof(self._memory)
