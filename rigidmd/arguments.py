@@ -3,6 +3,7 @@
 import argparse
 import re
 import sys
+from math import inf
 
 #: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
 BY_SIGNAL = 128
@@ -14,7 +15,7 @@ OUT_OF_TIME = 75
 def time_ps(text: str) -> float:
     """Picoseconds in a time such as 200ps."""
     found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
-    if found is None:
+    if found is None or float(found[1]) == inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
     return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
 
@@ -22,10 +23,11 @@ def time_ps(text: str) -> float:
 def seconds(text: str) -> float:
     """Seconds in H:MM:SS, MM:SS or D-H:MM:SS."""
     found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
-    if found is None:
+    days, hours, minutes, rest = (float(part or 0) for part in (found.groups() if found else [inf] * 4))
+    found_seconds = 86400 * days + 3600 * hours + 60 * minutes + rest
+    if found_seconds == inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
-    days, hours, minutes, rest = (float(part or 0) for part in found.groups())
-    return 86400 * days + 3600 * hours + 60 * minutes + rest
+    return found_seconds
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ import json
 import shlex
 import sys
 import warnings
+from collections.abc import Iterator
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -40,6 +41,9 @@ EXAMPLES = """examples:
   rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
   rigidmd help                              the chapters of the documentation
 """
+
+#: What the loader of shared libraries and the system report where memory does not suffice.
+NO_ROOM = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -77,18 +81,22 @@ def main(arguments: list[str] | None = None) -> int:
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
-    except Exception as error:  # libraries turn Ctrl-C into errors of many types; all others are raised again
-        if not _is_of_ctrl_c(error):
-            raise
-        print("rigidmd: interrupted", file=sys.stderr)
-        return INTERRUPTED
+    except Exception as error:  # libraries turn what happens into errors of many types; all others are raised again
+        causes = list(_causes(error))
+        if any(isinstance(cause, KeyboardInterrupt) for cause in causes):
+            print("rigidmd: interrupted", file=sys.stderr)
+            return INTERRUPTED
+        if any(words in str(cause) for cause in causes for words in NO_ROOM):
+            print("rigidmd: not enough memory to load the program; raise the limit (ulimit -v)", file=sys.stderr)
+            return BAD_INPUT
+        raise
 
 
-def _is_of_ctrl_c(error: BaseException | None) -> bool:
-    """Whether an error came of Ctrl-C, which some libraries turn into errors of their own."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and those it came of."""
+    while error is not None:
+        yield error
         error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _parser() -> argparse.ArgumentParser:

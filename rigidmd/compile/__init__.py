@@ -3,7 +3,7 @@
 The names that the author of a term needs are exported here; `lanes` has the vectors.
 """
 
-from rigidmd.compile import threads  # noqa: F401  (before Numba is loaded)
+from rigidmd.compile import settings  # noqa: F401  (before Numba is loaded)
 from rigidmd.compile.code import (
     Bound,
     Code,

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numba
 
-from rigidmd.compile.machine import SIMD_BITS
+from rigidmd.compile.machine import CODE_SETTINGS, SIMD_BITS
 
 PACKAGE = Path(__file__).parent.parent
 #: Files and folders with compiled code; tests/test_rooms.py checks that no other file has a kernel.
@@ -28,8 +28,8 @@ UNUSED_AFTER_DAYS = 30.0
 
 @functools.cache
 def source_digest() -> str:
-    """Hexadecimal digest of the sources of compiled code, Numba's version and the width of vectors."""
-    digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS}".encode())
+    """Hexadecimal digest of the sources of compiled code, Numba's version and settings, and the width of vectors."""
+    digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS} {CODE_SETTINGS}".encode())
     for path in sorted(path for name in COMPILED for path in _sources(PACKAGE / name)):
         digest.update(path.relative_to(PACKAGE).as_posix().encode())
         digest.update(path.read_bytes())
@@ -43,7 +43,7 @@ def _sources(place: Path) -> list[Path]:
 def _named_folder() -> Path:
     """The folder for compiled code of these sources, writable or not."""
     if named := os.environ.get("RIGIDMD_CACHE"):
-        base = Path(named)
+        base = Path(named).absolute()
     else:
         import platformdirs
 
@@ -61,6 +61,14 @@ def shared_folder() -> str | None:
 def is_lasting() -> bool:
     """Whether what is compiled is kept where other processes read it."""
     return cache_folder() == str(_named_folder())
+
+
+def kept_in_words() -> str:
+    """Whether what is compiled is kept, for messages."""
+    if is_lasting():
+        return "kept on disk: the next run starts at once"
+    folder = _named_folder().parent
+    return f"not kept, as {folder} cannot be written: the next run compiles again; RIGIDMD_CACHE names another folder"
 
 
 @functools.cache

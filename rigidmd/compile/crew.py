@@ -24,7 +24,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from rigidmd.compile.kernels import kernel, options_of
-from rigidmd.compile.machine import MOST_BLOCKS, MOST_THREADS, PROCESSOR_FEATURES
+from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS
 from rigidmd.compile.numba_private import callback, uncounted
 
 WORD = ir.IntType(64)
@@ -92,7 +92,7 @@ def _pause(typing):
     """Leave the core to its other thread for a moment."""
 
     def emit(context, builder, signature, arguments):
-        if "sse2" in PROCESSOR_FEATURES:
+        if IS_X86:
             kind = ir.FunctionType(ir.VoidType(), [])
             builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", (), kind), [])
         return context.get_dummy_value()

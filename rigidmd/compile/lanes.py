@@ -23,11 +23,10 @@ from rigidmd.compile import (
     lane_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
 )
 from rigidmd.compile.lane_types import COUNT, Lanes, Mask, filled, multiply_add
-from rigidmd.compile.machine import PROCESSOR_FEATURES
+from rigidmd.compile.machine import IS_X86
 
-#: Whether this machine has the instruction that `picked` uses and estimates to 14 bits; whether it has any estimates.
-HAS_AVX512 = SIMD_BITS == 512 and "avx512f" in PROCESSOR_FEATURES
-IS_X86 = "sse2" in PROCESSOR_FEATURES
+#: Whether this machine has the instruction that `picked` uses and estimates to 14 bits.
+HAS_AVX512 = SIMD_BITS == 512
 
 
 def lane_count(dtype) -> int:

@@ -46,6 +46,12 @@ class State(NamedTuple):
         """A state that shares nothing with this one."""
         return State(*(array.copy() for array in self))
 
+    def __repr__(self) -> str:
+        """Short: arrays of many bodies would flood a screen."""
+        count = max(len(self.rotation), len(self.position))
+        bodies = f"{count} {'body' if count == 1 else 'bodies'}"
+        return f"<State of {bodies} at time {self.time[NOW]:g}, step {self.step[NOW]}>"
+
     @property
     def volume(self) -> float:
         """Volume of the cell, Å³; infinite where there is no box."""

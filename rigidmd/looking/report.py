@@ -32,8 +32,9 @@ MEANS = (
 KNOWN = (
     ("rigidmd_version", "rigidmd"), ("numba_version", "Numba"), ("llvmlite_version", "llvmlite"),
     ("numpy_version", "NumPy"), ("python_version", "Python"), ("machine", "machine"), ("processor", "processor"),
-    ("vector_bits", "bits of a vector"), ("threads", "threads"), ("precision", "precision"), ("seed", "seed"),
-    ("scene_sha256", "SHA-256 of the scene"), ("input_sha256", "SHA-256 of the files that it read"),
+    ("vector_bits", "bits of a vector"), ("numba_settings", "settings of Numba"), ("threads", "threads"),
+    ("precision", "precision"), ("seed", "seed"), ("scene_sha256", "SHA-256 of the scene"),
+    ("input_sha256", "SHA-256 of the files that it read"),
 )  # fmt: skip
 #: Files of a run: ending or name -> what is in it.
 ABOUT = {

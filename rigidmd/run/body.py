@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
+from rigidmd.compile.cache import kept_in_words
 from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
@@ -75,7 +76,7 @@ class BodySimulation(Simulation):
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
-        self._say("compiling (kept on disk: the next run starts at once)")
+        self._say(f"compiling ({kept_in_words()})")
         self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0)
         self._reset()
         self._stretches = self._walk()

@@ -1,6 +1,7 @@
 """When a run writes a checkpoint, and when its time is up: wall time decides, and changes no bit of a run."""
 
 import time as clock
+from math import inf
 from pathlib import Path
 
 from rigidmd.output.checkpoint import Checkpoint, write_checkpoint
@@ -9,6 +10,13 @@ from rigidmd.output.checkpoint import Checkpoint, write_checkpoint
 PIECE = 1.0
 #: Time left for the last checkpoint and the files of the end, in times that the longest checkpoint took; and seconds.
 COSTS, SPARE = 3.0, 2.0
+
+
+def checked_walltime(seconds: float) -> float:
+    """Seconds until a run has to end; ValueError unless they are finite and not negative."""
+    if not 0 <= seconds < inf:
+        raise ValueError(f"walltime is {seconds!r}, must be a finite number of seconds, not negative")
+    return seconds
 
 
 class Keeper:

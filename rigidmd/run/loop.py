@@ -32,7 +32,7 @@ from rigidmd.output.folder import (
 )
 from rigidmd.output.progress import Spot, announce, is_shown, progress_of
 from rigidmd.output.report import write_summary
-from rigidmd.run.keeper import PIECE, Keeper
+from rigidmd.run.keeper import PIECE, Keeper, checked_walltime
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
 from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
@@ -141,7 +141,7 @@ class Simulation(Base):
         self._interrupted = False
         self._signal: int | None = None
         self._resume = resume
-        self._deadline = None if walltime is None else clock.monotonic() + walltime
+        self._deadline = None if walltime is None else clock.monotonic() + checked_walltime(walltime)
         self._keeper = Keeper(None, False, None)  # before a run
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")

@@ -13,6 +13,7 @@ from rigidmd.assemble.momenta import remove_momentum
 from rigidmd.assemble.rows import row as row_of_stage
 from rigidmd.assemble.system import System, build
 from rigidmd.assemble.to_atoms import atoms_of
+from rigidmd.compile.cache import kept_in_words
 from rigidmd.compile.machine import threads_for
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
@@ -152,7 +153,7 @@ class MolecularSimulation(Simulation):
 
     def _relieve(self) -> None:
         """Compile the forces, and relieve overlaps of a lattice."""
-        self._say("compiling (kept on disk: the next run starts at once)")
+        self._say(f"compiling ({kept_in_words()})")
         with told_plainly(self.system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):

@@ -7,6 +7,7 @@ them need belong to the moment or the run.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,13 @@ if TYPE_CHECKING:
     from rigidmd.output.trajectory_file import TrajectoryFile
     from rigidmd.run.loop import Simulation
     from rigidmd.run.results import Results
+
+
+def above_zero(interval: float, name: str) -> float:
+    """An interval between observations; ValueError unless it is a finite time above 0."""
+    if not 0 < interval < inf:
+        raise ValueError(f"{name} is {interval!r}, must be a finite time above 0")
+    return interval
 
 
 class Observer:
@@ -65,9 +73,7 @@ class Every(Observer):
     """Calls `function(moment)` every `interval` ps (s for a single body)."""
 
     def __init__(self, interval: float, function: Callable[[Moment], object]):
-        if not interval > 0:
-            raise ValueError(f"Every({interval!r}, ...): the interval must be a time above 0")
-        self.interval = interval
+        self.interval = above_zero(interval, "the interval of Every")
         self.function = function
 
     def see(self, moment: Moment) -> None:

@@ -2,12 +2,13 @@
 
 import hashlib
 import json
+import os
 import platform
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
 
-from rigidmd.compile.machine import PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
+from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
 from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene, Scene
 
@@ -19,6 +20,7 @@ APART = ("name", "threads", "output.checkpoint_minutes", "output.figure", "outpu
 
 def computed_with() -> dict[str, Any]:
     """All that besides the scene may change the bits of a result, as JSON has it."""
+    settings = " ".join(f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ)
     return {
         **{f"{package}_version": version(package) for package in PACKAGES},
         "python_version": platform.python_version(),
@@ -26,6 +28,7 @@ def computed_with() -> dict[str, Any]:
         "processor": PROCESSOR,
         "processor_features": list(PROCESSOR_FEATURES),
         "vector_bits": SIMD_BITS,
+        **({"numba_settings": settings} if settings else {}),
     }
 
 

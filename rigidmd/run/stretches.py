@@ -5,7 +5,7 @@ from operator import and_
 from typing import NamedTuple
 
 from rigidmd.core.schemes import Scheme, Solver
-from rigidmd.run.observers import Observer
+from rigidmd.run.observers import Observer, above_zero
 
 
 class Stretch(NamedTuple):
@@ -28,7 +28,8 @@ class Agenda:
         self._regular: list[tuple[int, int, int]] = []  # number of an observer, steps between two looks, steps before
         for k, observer in enumerate(observers):
             if observer.interval is not None:  # may continue from the stretch before
-                self._regular.append((k, max(1, round(observer.interval / stretch.dt)), stretch.counted))
+                interval = above_zero(observer.interval, f"the interval of {type(observer).__name__}")
+                self._regular.append((k, max(1, round(interval / stretch.dt)), stretch.counted))
             elif observer.steps:
                 self._regular.append((k, observer.steps, 0))
 

@@ -28,6 +28,8 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
     the runs that failed. The simulations keep to one thread, in their summaries and scenes too.
     """
     simulations = list(simulations)
+    if strange := [one for one in simulations if not isinstance(one, Simulation)]:
+        raise TypeError(f"{strange[0]!r:.60} is not a Simulation")
     if len({id(one) for one in simulations}) < len(simulations):
         raise ValueError("a simulation is given twice; make one for each run")
     if jobs is not None and jobs < 1:

@@ -1,7 +1,7 @@
 """What `rigidmd precision --averages` measures: the bias of averages in the ensemble of a scene's last stage."""
 
 from collections.abc import Callable
-from math import floor, log10, nan
+from math import floor, inf, log10, nan
 
 import numpy as np
 
@@ -60,8 +60,8 @@ def averages(
     check_is_at_home(scene)
     stage = _with_thermostat(scene)
     told = [_method(name, stage) for name in methods] if methods else _usual(stage)
-    if not (sample > 0 and all(step > 0 for step in timesteps or [])):
-        raise SceneError("precision", ["time steps and --sample-ps must be greater than 0"])
+    if not all(0 < length < inf for length in (sample, *(timesteps or []))):
+        raise SceneError("precision", ["time steps and --sample-ps must be finite and greater than 0"])
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
         raise SceneError("--timesteps", [f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"])
     simulation, state = start_of_last_stage(scene)

@@ -18,7 +18,7 @@ from rigidmd.run.provenance import differences, keys_of
 #: Of summary.json: what is compared besides the scene.
 MADE = (
     "rigidmd_version", "numba_version", "llvmlite_version", "numpy_version", "python_version", "machine", "processor",
-    "vector_bits", "threads",
+    "vector_bits", "numba_settings", "threads",
 )  # fmt: skip
 #: Columns by which samples are matched: steps if they mean the same times in both, else times.
 STEP, TIMES = "Step", ("Time (ps)", "t")

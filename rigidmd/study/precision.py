@@ -1,6 +1,7 @@
 """`rigidmd precision`: suitable integrators at suitable time steps on the start of a scene."""
 
 from collections.abc import Callable
+from math import inf
 
 from rigidmd.core.schemes import RADAU, SCHEMES, SOLVERS
 from rigidmd.errors import SceneError
@@ -49,8 +50,8 @@ def precision(
         faults = [f"there is no {name}{meant(name, known)} (known: {', '.join(known)})" for name in unknown]
         raise SceneError("--integrators", faults)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
-    if not all(length > 0 for length in lengths) or repeats < 1:
-        raise SceneError("precision", ["time steps, span, averages and repeats must be greater than 0"])
+    if not all(0 < length < inf for length in lengths) or repeats < 1:
+        raise SceneError("precision", ["time steps, span, averages and repeats must be finite and greater than 0"])
     subject, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
     if averages and subject.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])

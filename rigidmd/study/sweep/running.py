@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rigidmd.output.sweep_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, Point, write_manifest
+from rigidmd.run.keeper import checked_walltime
 from rigidmd.run.signals import handled
 from rigidmd.scene import Scene
 from rigidmd.study.sweep.plan import settle
@@ -89,7 +90,7 @@ def run_points(
     busy: set[str] = set()
     ends_at, least = None, 0.0
     if walltime is not None:
-        ends_at = clock.time() + walltime - min(SPARE, SPARE_SHARE * walltime)
+        ends_at = clock.time() + checked_walltime(walltime) - min(SPARE, SPARE_SHARE * walltime)
         least = min(LEAST, LEAST_SHARE * walltime)
     pressed = 0
 
