@@ -51,6 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a signal.
     """
+    from rigidmd.core.memory import free_memory, in_words  # now: an import may need more than there is
     from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
     from rigidmd.output.streams import checked_streams, open_streams
 
@@ -74,8 +75,6 @@ def main(arguments: list[str] | None = None) -> int:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
     except MemoryError:
-        from rigidmd.core.memory import free_memory, in_words
-
         what, free = getattr(options, "scene", "this"), in_words(free_memory())
         print(f"rigidmd: {what}: not enough memory ({free} free); take fewer molecules or samples", file=sys.stderr)
         return BAD_INPUT

@@ -1,4 +1,4 @@
-"""Properties of the processor that Numba compiles for: the width of its vectors, its threads, how finely work is divided."""
+"""The processor that Numba compiles for, the width of its vectors, its threads, and how finely work is divided."""
 
 import os
 

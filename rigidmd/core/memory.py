@@ -1,8 +1,13 @@
 """How much memory this process may still take, and sentences for what needs more."""
 
+import contextlib
 import importlib
 from math import inf
 from pathlib import Path
+
+resource = None
+with contextlib.suppress(ImportError):  # not on Windows
+    resource = importlib.import_module("resource")
 
 #: Share of the free memory that is left to other things: Python, machine code, files.
 SPARE = 0.05
@@ -19,7 +24,7 @@ def free_memory() -> float:
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
     ):
         free = min(free, _number_in(f"/sys/fs/cgroup/{limit}") - min(_number_in(f"/sys/fs/cgroup/{used}"), 1e18))
-    return max(0.0, min(free, _limit() - 1024 * _number_in("/proc/self/status", "VmSize:", 0.0)))
+    return max(0.0, min(free, left_by_limit()))
 
 
 def memory_fault(needed: float, what: str) -> str:
@@ -35,14 +40,13 @@ def in_words(size: float) -> str:
     return f"{size / 1e9:.3g} GB"
 
 
-def _limit() -> float:
-    """Bytes that this process may have in all."""
-    try:
-        resource = importlib.import_module("resource")  # not on Windows
-    except ImportError:
+def left_by_limit() -> float:
+    """Bytes of addresses that the limit of this process (`ulimit -v`) leaves; infinite where there is none."""
+    if resource is None:
         return inf
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return inf if soft == resource.RLIM_INFINITY else float(soft)
+    used = 1024 * _number_in("/proc/self/status", "VmSize:", 0.0)
+    return inf if soft == resource.RLIM_INFINITY else soft - used
 
 
 def _number_in(file: str, label: str = "", absent: float = inf) -> float:
