@@ -9,6 +9,7 @@ from typing import Annotated, NamedTuple, get_args, get_type_hints
 import numpy as np
 
 from rigidmd.measure.columns import Column
+from rigidmd.scene.stage import Stage
 
 
 class Sample(NamedTuple):
@@ -152,3 +153,8 @@ class Samples:
 
 
 _VALUES = attrgetter(*NUMBERS)
+
+
+def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
+    """Which samples (n,), of stages with these indices, are of motion: none of minimisations."""
+    return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])
