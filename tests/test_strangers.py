@@ -320,8 +320,8 @@ def test_samples_give_back_what_was_added():
     assert samples.of_stage(1).rows == added[5:]
     assert len(samples.of_stage(2)) == 0
     for since in range(10):
-        for time in np.arange(-0.1, 2.6, 0.05):
-            assert samples.latest(time, since) == max([k for k in range(since, 10) if k / 4 <= time], default=since)
+        for moment in np.arange(-0.1, 2.6, 0.05):
+            assert samples.latest(moment, since) == max([k for k in range(since, 10) if k / 4 <= moment], default=since)
     column = samples["time"]
     samples.append(a_sample(9, (0.0, 0.0)))  # columns are copies
     assert len(column) == 10

@@ -164,7 +164,7 @@ def _history(
 
 def _evened(time: np.ndarray) -> np.ndarray:
     """Times (f,) of frames without the rounding of files to single precision, if nothing else makes them uneven."""
-    even = np.linspace(*time[[0, -1]], len(time)) if len(time) else time
+    even = np.linspace(time[0], time[-1], len(time)) if len(time) else time
     rounding = np.spacing(np.abs(time).max(initial=0.0).astype(np.float32))
     return even if np.all(np.abs(even - time) <= 2 * rounding) else time
 

@@ -4,7 +4,7 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from operator import attrgetter
-from typing import Annotated, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class Samples:
         if table is not None:
             if table.ndim != 2 or table.shape[1] != len(self._numbers) or table.dtype != np.float64:
                 raise ValueError(f"samples have the shape {table.shape}")
-            self._values.frombytes(np.ascontiguousarray(table).reshape(-1).view(np.uint8))
+            self._values.frombytes(table.tobytes())
             if not np.isin(self._column("stage"), np.arange(len(self.stages))).all():
                 raise ValueError("samples are of stages that the scene does not have")
             step = self._column("step")
@@ -120,7 +120,7 @@ class Samples:
     def row(self, k: int) -> Sample:
         """Sample k; -1 is the last one."""
         first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
-        values = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
+        values: dict[str, Any] = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
         values |= {name: int(values[name]) for name in ("step", "stage")}
         own = self._values[first + width : first + len(self._numbers)]
         return Sample(**values, stage_name=self.stages[values["stage"]], own=tuple(own))
