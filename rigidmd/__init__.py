@@ -2,7 +2,7 @@
 
 import rigidmd
 
-scene = rigidmd.Scene.read("systems/water.toml")
+scene = rigidmd.Scene.read("water.toml")
 results = rigidmd.Simulation(scene).run()
 print(results["temperature"].mean(), results.units["temperature"], results.universe())
 """

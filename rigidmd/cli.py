@@ -2,10 +2,11 @@
 
 import argparse
 import json
+import re
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -56,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     from rigidmd.output.streams import checked_streams, open_streams
 
     open_streams()
-    options = _parser().parse_args(arguments)
+    options = _parsed(sys.argv[1:] if arguments is None else arguments)
 
     def show(message, category, *where, **more):
         warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
@@ -98,7 +99,28 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parsed(words: list[str]) -> argparse.Namespace:
+    """The options of a command line; a command or an option that there is not ends it, with what may be meant."""
+    parser, commands = _parser()
+    name = next((word for word in words if not word.startswith("-")), None)
+    if name is not None and name not in commands:
+        parser.error(f"there is no command {name!r}{_meant(name, commands) or '; `rigidmd --help` lists them'}")
+    options, unknown = parser.parse_known_args(words)
+    if unknown and name is not None:
+        known = re.findall(r"(?<![\w-])--[a-z-]+", commands[name].format_help())
+        commands[name].error(f"there is no argument {unknown[0]!r}{_meant(unknown[0].partition('=')[0], known)}")
+    return options
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    """'; did you mean ...?' for a word that is not known."""
+    from rigidmd.validation import meant  # not before it is needed: it loads pydantic
+
+    return meant(name, dict.fromkeys(known))
+
+
+def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser of a command line, and those of its commands by name."""
     parser = argparse.ArgumentParser(
         prog="rigidmd",
         description="Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene file.",
@@ -122,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)")
     new.add_argument("--force", action="store_true", help="replace that file")
 
-    run = _command(commands, "run", _run, "run a scene", "rigidmd run systems/water.toml -o runs/water")
+    run = _command(commands, "run", _run, "run a scene", "rigidmd run water.toml -o runs/water")
     _scene_arguments(run)
     run.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
     run.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
@@ -162,7 +184,7 @@ def _parser() -> argparse.ArgumentParser:
         "energy",
         _energy,
         "energies and forces of the start",
-        "rigidmd energy systems/water_dimer.toml --json",
+        "rigidmd energy water_dimer.toml --json",
     )
     _scene_arguments(energy)
     energy.add_argument(
@@ -174,7 +196,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     check = _command(
-        commands, "check", _check, "describe a run without running it", "rigidmd check systems/water_nitrogen.toml"
+        commands, "check", _check, "describe a run without running it", "rigidmd check water_nitrogen.toml"
     )
     _scene_arguments(check)
     add_engine(check)
@@ -185,8 +207,8 @@ def _parser() -> argparse.ArgumentParser:
         "precision",
         _precision,
         "measure the error and the run time of integrators at several time steps",
-        "rigidmd precision systems/heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
-        "  rigidmd precision systems/heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles\n"
+        "rigidmd precision heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
+        "  rigidmd precision heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles\n"
         "  rigidmd precision liquid.toml --averages --sample-ps 50 --timesteps 1,2,4,6,8 "
         "--integrators baoab,velocity_verlet+nose_hoover",
     )
@@ -271,8 +293,8 @@ def _parser() -> argparse.ArgumentParser:
     chapters = _command(
         commands, "help", _help, "list the chapters of the documentation, or print one", "rigidmd help water | less"
     )
-    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print")
-    return parser
+    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them")
+    return parser, commands.choices
 
 
 class _Version(argparse.Action):
@@ -303,8 +325,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KEY=VALUE",
         dest="overrides",
-        help="override a key of the scene by its dotted path (list entries count from 0); KEY= without a value "
-        "removes the key; may be repeated",
+        help="override a key of the scene by its dotted path (an entry of a list by its number from 0, or a "
+        "stage by its name); KEY= without a value removes the key; may be repeated",
     )
     add_trust(parser)
 
@@ -326,7 +348,7 @@ def _read_scene(options: argparse.Namespace, **more):
     from rigidmd.scene import Scene, parse_override
 
     if options.trust:
-        from rigidmd.own.trust import trust
+        from rigidmd.own.trust import check_trusted, trust
 
         for path in options.trust:
             trust(path)
@@ -334,7 +356,10 @@ def _read_scene(options: argparse.Namespace, **more):
     for option, key in (("engine", "name"), ("ranks", "ranks"), ("platform", "platform")):
         if (value := getattr(options, option, None)) is not None:
             overrides[f"engine.{key}"] = value
-    return Scene.read(options.scene, overrides | more)
+    scene = Scene.read(options.scene, overrides | more)
+    if options.trust:
+        check_trusted(scene, options.trust)
+    return scene
 
 
 def _examples(options: argparse.Namespace) -> int:
@@ -358,11 +383,13 @@ def _examples(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
+    from rigidmd.scene import Scene
     from rigidmd.shipped import copy_example, find_example, series_of
 
     example = find_example(options.name)
     path = Path(options.output or f"{example.name}{example.path.suffix}")
-    written = copy_example(example, path, options.force)
+    read = Scene.read(example.path).inputs.values() if example.kind == "scene" else ()
+    written = copy_example(example, path, options.force, read)
     if example.name != options.name:
         print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
     print(f"{path}: {example.about}")

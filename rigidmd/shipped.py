@@ -4,7 +4,9 @@ import difflib
 import json
 import re
 import shutil
+import textwrap
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +19,8 @@ PACKAGE = Path(__file__).parent
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
 NOTEBOOK, SCRIPT = ".ipynb", ".py"
+#: Shipped files in the chapters: stem, ending.
+_SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
 #: What an example is, by the ending of its file.
 KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
 
@@ -105,11 +109,11 @@ def series_of(name: str) -> list[str]:
     return [example.name for example in examples() if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)]
 
 
-def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
+def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path] = ()) -> list[Path]:
     """Copy an example to `path` and the files that it reads beside it; the paths written. Raises OutputError."""
     if path.suffix != example.path.suffix:
         raise OutputError(f"{path} must end in {example.path.suffix}: name a file for the {example.kind} with -o")
-    inputs = _inputs(example, path.parent) if example.kind == "scene" else {}
+    inputs = {path.parent / file.relative_to(example.path.parent): file for file in read}
     for target in (path, *inputs):
         kept = target in inputs and target.is_file() and target.read_bytes() == inputs[target].read_bytes()
         if target.is_dir():
@@ -126,14 +130,6 @@ def copy_example(example: Example, path: Path, force: bool) -> list[Path]:
     return [path, *inputs]
 
 
-def _inputs(example: Example, folder: Path) -> dict[Path, Path]:
-    """Where a copied scene in a folder looks for the files that it reads, and where they are."""
-    from rigidmd.scene import Scene
-
-    scene = Scene.read(example.path)
-    return {folder / file.relative_to(example.path.parent): file for file in scene.inputs.values()}
-
-
 def contents() -> dict[str, str]:
     """Chapters of the documentation: name -> what it is about, the first line under its title."""
     return {name: (DOCS / f"{name}.md").read_text(encoding="utf-8").splitlines()[2] for name in CHAPTERS}
@@ -142,9 +138,31 @@ def contents() -> dict[str, str]:
 def chapter_text(name: str) -> str:
     """A chapter as plain text, without comments; pictures become name and path. Raises Faults."""
     if name not in CHAPTERS:
-        near = difflib.get_close_matches(name, CHAPTERS, 1, 0.5)
+        near = difflib.get_close_matches(name, CHAPTERS, 1, 0.6)
         hint = f"did you mean {near[0]}? " if near else ""
-        raise Faults("help", [f"there is no chapter {name!r}; {hint}there are {', '.join(CHAPTERS)}"])
+        word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
+        found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
+        named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
+        where = f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
+        raise Faults("help", [f"there is no chapter {name!r}; {hint}{where}"])
+    return _plain(name)
+
+
+def _plain(name: str) -> str:
+    """The text of a chapter. Shipped files, which lie elsewhere in a wheel, are named as `rigidmd new` copies them."""
     text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
     text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
-    return re.sub(r"!\[([^\]]*)\]\((?:\.\./)*([^)]*)\)", r"[picture: \1, \2]", text).rstrip()
+    copied = sorted(set(_SHIPPED.findall(text)))
+    title, _, text = text.partition("\n")
+    if copied:
+        files = textwrap.fill(", ".join(f"{stem}{ending}" for stem, ending in copied), 120)
+        title += f"\n\n`rigidmd new NAME` copies the shipped files that are named here:\n{files}"
+    text = re.sub(r"!\[([^\]]*)\]\(((?:\.\./)*)([^)]*)\)", _picture, _SHIPPED.sub(r"\1\2", text))
+    return f"{title}\n{text}".rstrip()
+
+
+def _picture(found: re.Match) -> str:
+    """A picture as plain text: its name, and its path where it is there."""
+    about, up, path = found.groups()
+    there = (DOCS / up / path).is_file()
+    return f"[picture: {about}{f', {path}' if there else ''}]"

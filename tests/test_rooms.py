@@ -9,7 +9,7 @@ PACKAGE = ROOT / "rigidmd"
 
 # In this order: a room may import from those above it and from itself.
 ROOMS = [
-    ("errors", "units", "core", "compile", "validation", "arguments"),
+    ("errors", "units", "core", "compile", "validation", "arguments", "shipped"),
     ("mechanics",),
     ("forces",),
     ("dynamics",),
@@ -21,7 +21,6 @@ ROOMS = [
     ("measure",),
     ("output",),
     ("analyse",),
-    ("shipped",),
     ("peers",),
     ("run",),
     ("study",),

@@ -33,7 +33,10 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
             if not (folder / MARKER).is_file():
                 raise OutputError(f"{folder} is not empty and holds no earlier run; name another folder with -o")
             if not force:
-                raise OutputError(f"{folder} holds an earlier run; --force replaces it, -o names another folder")
+                resume = f"`rigidmd resume {folder}` continues it, " if (folder / CHECKPOINT).is_file() else ""
+                raise OutputError(
+                    f"{folder} holds an earlier run; {resume}--force replaces it, -o names another folder"
+                )
             doomed = {(folder / name).resolve() for name in written_by_runs(folder)}
             for path in inputs:
                 if path.resolve() in doomed:

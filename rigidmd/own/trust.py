@@ -1,11 +1,13 @@
 """Python files of users, which run only where a user says so: forces of a scene, and analyses."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 
 from rigidmd.core.files import file_fault
 from rigidmd.core.own_code import OF_FILE, digest_of, module_of
 from rigidmd.errors import SceneError, told
+from rigidmd.scene import Scene
 
 #: Digests of the files that may run.
 _TRUSTED: set[str] = set()
@@ -17,6 +19,18 @@ def trust(path: str | Path) -> None:
     A file is code: it can do whatever you can. Read it before. On the command line, --trust FILE does the same.
     """
     _TRUSTED.add(digest_of(_source(Path(path), "--trust")))
+
+
+def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
+    """Raise SceneError for a trusted file that is none of those that a scene runs: nothing of it would be run."""
+    named = [path for key, path in scene.inputs.items() if key.endswith(".module")]
+    contents = [_source(path, "forces.custom") for path in named]
+    for path in paths:
+        if _source(Path(path), "--trust") not in contents:
+            files = f"it names {', '.join(map(str, named))}" if named else "it names none"
+            raise SceneError(
+                "--trust", [f"{path} is not a file that [[forces.custom]] of {scene.source} names by module: {files}"]
+            )
 
 
 def trusted_module(path: Path, key: str) -> ModuleType:

@@ -19,6 +19,7 @@ from rigidmd.core.toml_text import (
     whole_number,
 )
 from rigidmd.errors import SceneError
+from rigidmd.shipped import examples
 from rigidmd.validation import Section, faults_of, meant, nearest, numbers_beyond, perhaps, place
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ class Scene(Section):
         `overrides` may be anywhere, and are taken relative to the working directory.
         """
         path = Path(path)
-        data, text = read_toml(path, SceneError)
+        data, text = read_tables(path)
         data.setdefault("name", name_of_file(path))
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
 
@@ -190,8 +191,9 @@ class Scene(Section):
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults = [] if held else kind.strange_paths(data, folder)
         overridden = []
-        for key, value in (overrides or {}).items():
-            faults += _override(data, key, value)
+        for named, value in (overrides or {}).items():
+            key, wrong = _override(data, named, value)
+            faults += wrong
             if value is None and whole_number(key.rpartition(".")[2]) is not None:
                 text = ""  # entries after a removed one have other numbers than in the text
             else:
@@ -200,12 +202,13 @@ class Scene(Section):
             raise SceneError(source, [f"{place(keys, text, overridden)}: {fault}" for keys, fault in wrong])
         faults += [f"{place(keys, text, overridden)}: {fault}" for keys, fault in numbers_beyond(data, *kind.SIZES)]
         faults += kind.contradictions(data, text)
+        refusal = lambda found: SceneError(source, [one + _removes(one, data, overridden) for one in found])  # noqa: E731
         try:
             scene = kind.model_validate(data)
         except ValidationError as error:
-            raise SceneError(source, faults + faults_of(error, kind, text, overridden)) from None
+            raise refusal(faults + faults_of(error, kind, text, overridden)) from None
         if faults:
-            raise SceneError(source, faults)
+            raise refusal(faults)
         scene._source = source
         scene._folder = folder
         scene._held = held or {}
@@ -220,11 +223,18 @@ class Scene(Section):
             if not (fault := file_fault(path)):
                 continue
             keys = [part if (number := whole_number(part)) is None else number for part in key.split(".")]
-            there = _beside(path)
-            stems = nearest(path.stem, {other.stem for other in there if other.name != path.name})
-            alike = perhaps([other.name for other in there if other.stem in stems])
-            faults.append(f"{place(keys, text, overridden)}: {fault}: {shortened(str(path))}{alike}")
+            faults.append(f"{place(keys, text, overridden)}: {fault}: {shortened(str(path))}{_alike(path)}")
         return faults
+
+
+def read_tables(path: Path) -> tuple[dict[str, Any], str]:
+    """The tables of a scene file, and its text. Raises SceneError, which names a shipped scene of such a name."""
+    fault = file_fault(path)
+    if fault.startswith("there is no such file"):
+        shipped = nearest(path.stem, [example.name for example in examples()])
+        new = f"; `rigidmd new {shipped[0]}` copies a shipped scene" if shipped else "; `rigidmd examples` lists scenes"
+        raise SceneError(str(path), [fault + (_alike(path, ".toml") or new)])
+    return read_toml(path, SceneError)
 
 
 def name_of_file(path: Path) -> str:
@@ -232,12 +242,14 @@ def name_of_file(path: Path) -> str:
     return re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene"
 
 
-def _beside(path: Path) -> list[Path]:
-    """What lies in the folder of a path; nothing if there is no such folder."""
+def _alike(path: Path, ending: str = "") -> str:
+    """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are none."""
     try:
-        return sorted(path.parent.iterdir())
+        there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(ending)]
     except (OSError, ValueError):
-        return []
+        return ""
+    stems = nearest(path.stem, {other.stem for other in there if other.name != path.name})
+    return perhaps([other.name for other in there if other.stem in stems])
 
 
 def file_name(name: str, endings: tuple[str, ...]) -> str:
@@ -261,27 +273,57 @@ def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"
     return best if own[best] > 0 else None
 
 
-def _override(data: dict, key: str, value: Any) -> list[str]:
-    """Set one dotted key in nested tables and lists in place; None removes it. Returns faults."""
-    if key in ("structure.file", "structure.topology") or re.fullmatch(r"molecules\.\d+\.(file|parameters)", key):
+def _removes(fault: str, data: dict, overridden: Iterable[str]) -> str:
+    """How the command line removes the keys that contradict overridden ones; empty for any other fault."""
+    if not re.search("not both|omit one|contradict", fault):
+        return ""
+    names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
+    tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)]) if overridden else ()
+    keys = [table + name for table in tables for name in names]
+    return "".join(
+        f"; --set {key}= removes it" for key in dict.fromkeys(keys) if key not in overridden and _holds(data, key)
+    )
+
+
+def _holds(data: Any, key: str) -> bool:
+    """Whether nested tables have a dotted key, which is not a table itself."""
+    for part in key.split("."):
+        if not isinstance(data, dict) or part not in data:
+            return False
+        data = data[part]
+    return not isinstance(data, dict)
+
+
+def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
+    """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, and faults.
+
+    An entry of a list is named by its number from 0, or by its name: the key that is returned has its number.
+    """
+    if key in ("structure.file", "structure.topology") or re.fullmatch(r"molecules\.[^.]+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".", DEEPEST + 1)
     if len(parents) > DEEPEST:
-        return [f"--set {shortened(key)}: is a key of more than {DEEPEST} parts"]
+        return key, [f"--set {shortened(key)}: is a key of more than {DEEPEST} parts"]
     target: Any = data
+    indices: list[Any] = []
     for depth, part in enumerate([*parents, last]):
         here = ".".join(key.split(".")[:depth])
         listed, table = isinstance(target, list), isinstance(target, dict)
+        number = whole_number(part)
         if listed:
-            number = whole_number(part)
+            names = [_name_of_entry(entry) for entry in target]
+            if number is None and names.count(part) == 1:
+                number = names.index(part)
             if number is None or number >= len(target):
-                return [f"--set {key}: {here} has entries 0 to {len(target) - 1}, not {part!r}"]
+                called = f" ({', '.join(map(shortened, names))})" if number is None and any(names) else ""
+                return key, [f"--set {key}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"]
         elif not table:
-            return [f"--set {key}: {here} is not a table"]
+            return key, [f"--set {key}: {here} is not a table"]
         elif value is None and part not in target:
             there = meant(part, target) or f"; there are {', '.join(target)}"
-            return [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
-        index = int(part) if listed else part
+            return key, [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
+        index: Any = number if listed else part
+        indices.append(index)
         if depth == len(parents) and value is None:
             del target[index]
         elif depth == len(parents):
@@ -290,7 +332,13 @@ def _override(data: dict, key: str, value: Any) -> list[str]:
             target = target.setdefault(index, {})
         else:
             target = target[index]
-    return []
+    return ".".join(map(str, indices)), []
+
+
+def _name_of_entry(entry: Any) -> Any:
+    """What an entry of a list is called: a stage by its name or ensemble, molecules by their name or model."""
+    keys = [key for key in ("name", "ensemble", "model") if isinstance(entry, dict) and key in entry]
+    return entry[keys[0]] if keys else ""
 
 
 def parse_override(text: str) -> tuple[str, Any]:

@@ -21,7 +21,7 @@ def add_commands(
         "export",
         _export,
         "write a scene as a folder that runs on another engine by itself",
-        "rigidmd export systems/water_pme.toml --to lammps -o water_lammps",
+        "rigidmd export water_pme.toml --to lammps -o water_lammps",
     )
     scene_arguments(export)
     export.add_argument("--to", required=True, choices=["lammps", "openmm", "gromacs"], help="the engine")
@@ -34,7 +34,7 @@ def add_commands(
         _verify,
         "compute a scene on two engines and hold them against each other: energies by term, forces, virial, a short "
         "run; exit code 0 if they agree, else 1",
-        "rigidmd verify systems/water_pme.toml --engine lammps --ranks 2",
+        "rigidmd verify water_pme.toml --engine lammps --ranks 2",
     )
     scene_arguments(verify)
     add_engine(verify, "lammps or openmm", "the scene's, or lammps; openmm on its platform Reference")

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rigidmd.core.toml_text import read_toml, shortened
+from rigidmd.core.toml_text import shortened
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.output.folder import FolderLock
 from rigidmd.output.sweep_folder import (
@@ -21,7 +21,7 @@ from rigidmd.output.sweep_folder import (
     write_manifest,
 )
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.base import name_of_file
+from rigidmd.scene.base import name_of_file, read_tables
 from rigidmd.study.sweep.axes import Axis, axes_of, checked
 from rigidmd.study.sweep.figure import write_figure
 from rigidmd.study.sweep.plan import known_axes, planned, settle
@@ -79,8 +79,11 @@ def opened(wanted: Wanted, stack: ExitStack) -> Opened:
 
     for path in wanted.trust:
         trust(path)
-    data, _ = read_toml(wanted.path, SceneError)
+    data, _ = read_tables(wanted.path)
     axes = wanted.axes if wanted.replicas is None else _with_seeds(wanted, data)
+    keys = [key for axis in axes for key in axis.keys]
+    if wanted.trust and not any("module" in str(told) for told in (data.get("forces"), keys)):
+        raise SceneError("--trust", [f"{wanted.path} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
     folder = wanted.folder or Path("runs") / f"{named or name_of_file(wanted.path)}-sweep"
     check_sweep_folder(folder)
