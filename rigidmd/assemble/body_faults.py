@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from rigidmd.assemble.body_parts import frame_of, resistance_of
+from rigidmd.assemble.body_parts import frame_of, inertia_at_centre, principal, resistance_of
 from rigidmd.core.schemes import SCHEMES, SOLVERS
 from rigidmd.forces.body.frame import Turning
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.mechanics.course import keeps_direction
 from rigidmd.scene import BodyScene
+from rigidmd.scene.body import axis_of_symmetry
 
 
 def unfit(
@@ -15,7 +16,7 @@ def unfit(
 ) -> list[str]:
     """Keys that this body cannot follow, or that would have no effect on it."""
     faults, body, fluid = [], scene.body, scene.fluid
-    turning, principal = bool(moments.any()), np.array_equal(axes, np.eye(3))
+    turning, along_axes = bool(moments.any()), np.array_equal(axes, np.eye(3))
     if not turning:
         faults += _idle_of_points(scene)
         if body.pinned:
@@ -29,10 +30,18 @@ def unfit(
         for k in np.flatnonzero(moments == 0):
             if added_mass[k - 1] != added_mass[k - 2]:
                 faults.append("fluid.added_mass_kg: a linear body has equal added masses across its axis")
-    if turning and not principal:
+    if turning and not along_axes:
         faults += _needs_principal_axes(scene)
     if (scene.wheels or scene.changing_inertia) and turning and not (moments > 0).all():
         faults.append("wheels and changing_inertia need a body with inertia about every axis")
+    if scene.output.drawn_as == "top" and turning:
+        at_centre, _ = principal(inertia_at_centre(scene))
+        if axis_of_symmetry(at_centre) is None:
+            shown = ", ".join(f"{moment:.4g}" for moment in at_centre)
+            faults.append(
+                f"output.drawn_as: a top has two equal moments of inertia about its centre of mass, and these are {shown} "
+                "kg m²; name 'cuboid', 'ellipsoid' or a solid"
+            )
     if body.pinned:
         if scene.changing_inertia is not None and centre.any():
             faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")

@@ -51,6 +51,14 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
     return mass, tensor, np.zeros(3), points, tuple(f"P{k}" for k in range(1, len(points) + 1))
 
 
+def inertia_at_centre(scene: BodyScene) -> np.ndarray:
+    """The inertia tensor (3, 3) about the centre of mass, of a changing one that of the start."""
+    if scene.changing_inertia is not None:
+        return np.diag(scene.changing_inertia.inertia_kg_m2[0])
+    mass, tensor, centre, _, _ = inertia_of(scene)
+    return shifted(tensor, -mass, centre) if scene.body.pinned else tensor
+
+
 def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
     """Centre and vertices (7, 3) of the homogeneous ellipsoid with this inertia tensor; one point without inertia."""
     moments, axes = np.linalg.eigh(tensor)

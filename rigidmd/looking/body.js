@@ -122,7 +122,7 @@
     const rod = () => {
       if (!data.pinned) return;
       pen.strokeStyle = ink; pen.lineWidth = 2.5;
-      pen.beginPath(); pen.moveTo(...pivot); pen.lineTo(...flat(centre)); pen.stroke();
+      if (data.rod) { pen.beginPath(); pen.moveTo(...pivot); pen.lineTo(...flat(centre)); pen.stroke(); }
       pen.fillStyle = ink; pen.beginPath(); pen.arc(...pivot, 3.5, 0, 7); pen.fill();
     };
     const before = dot(centre, view.eye) > 0;

@@ -55,7 +55,8 @@ class BodyPicture:
         self._faces(axes, rotation, origin)
         if self._pinned:
             ends = np.stack([origin, centre]) @ view[:2].T
-            axes.plot(*ends.T, color=INK, lw=2.2, zorder=2.5 if view[2] @ (centre - origin) < 0 else 1.5)
+            if not film.mesh.stem:
+                axes.plot(*ends.T, color=INK, lw=2.2, zorder=2.5 if view[2] @ (centre - origin) < 0 else 1.5)
             axes.plot(*ends[0], "o", color=INK, ms=5, zorder=2.5)
         start = origin if self._pinned else centre
         for name, values in film.vectors.items():

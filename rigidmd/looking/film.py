@@ -1,5 +1,7 @@
 """Films of runs as files: .mp4 by ffmpeg, .gif by Pillow. Matplotlib draws every frame."""
 
+import contextlib
+import importlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +23,8 @@ ENDINGS = (".mp4", ".gif")
 #: Frames a second, seconds, and pixels of height of a film; inches of its picture.
 RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 15}, 10.0, {".mp4": 640, ".gif": 448}
 INCHES = 6.4
+#: Rotations between two frames beyond which a body seems to rotate backwards.
+STROBES = 0.5
 #: Panels beside a film at most.
 PANELS = 3
 #: Frames of molecules that are read at most.
@@ -42,15 +46,27 @@ class Film(NamedTuple):
     told: list[str]
 
 
+def ffmpeg() -> str | None:
+    """The program that writes .mp4: on the path, or that of the package imageio-ffmpeg; None if there is none."""
+    if found := shutil.which("ffmpeg"):
+        return found
+    with contextlib.suppress(ImportError, RuntimeError):  # RuntimeError: the package without its program
+        return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    return None
+
+
 def default_name() -> str:
     """The name of a film: .mp4 where there is ffmpeg."""
-    return f"film{ENDINGS[0] if shutil.which('ffmpeg') else ENDINGS[1]}"
+    return f"film{ENDINGS[0] if ffmpeg() else ENDINGS[1]}"
 
 
 def check_writer(path: Path) -> None:
     """Raise OutputError if a film of this kind cannot be written here."""
-    if path.suffix == ".mp4" and not shutil.which("ffmpeg"):
-        raise OutputError(f"{path}: .mp4 needs ffmpeg, which is not installed; name a .gif, which needs nothing more")
+    if path.suffix == ".mp4" and ffmpeg() is None:
+        raise OutputError(
+            f"{path}: .mp4 needs ffmpeg: install the program, or `pip install imageio-ffmpeg`, which brings it; or name a "
+            ".gif, which needs nothing more"
+        )
 
 
 def write_film(
@@ -65,7 +81,7 @@ def write_film(
 
     seconds : its length; height : pixels, made even; progress : called with the share that is done
     """
-    from matplotlib import animation
+    from matplotlib import animation, rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -87,10 +103,12 @@ def write_film(
     kind = animation.FFMpegWriter if path.suffix == ".mp4" else animation.PillowWriter
     options = {"codec": "h264", "extra_args": ["-pix_fmt", "yuv420p", "-crf", "20"]} if path.suffix == ".mp4" else {}
     writer = kind(fps=rate, **options)
-    with whole_file(path) as temporary:
+    times = np.linspace(film.begin, film.end, count)
+    told = [*record.missing, *film.told, *_strobes(record, times, seconds)]
+    with whole_file(path) as temporary, rc_context({"animation.ffmpeg_path": ffmpeg() or "ffmpeg"}):
         try:
             with writer.saving(figure, str(temporary), figure.dpi):
-                for k, time in enumerate(np.linspace(film.begin, film.end, count)):
+                for k, time in enumerate(times):
                     film.draw(axes, time)
                     clock.set_text(f"{time:.{digits}f} {record.time_unit}")
                     for cursor, axis in cursors:
@@ -103,7 +121,21 @@ def write_film(
         except (RuntimeError, ValueError) as error:
             raise OutputError(f"{path} cannot be written as a film: {error}") from None
     speed = (film.end - film.begin) / seconds
-    return path, [*record.missing, *film.told, f"{seconds:g} s of film: {speed:.3g} {record.time_unit} a second"]
+    return path, [*told, f"{seconds:g} s of film: {speed:.3g} {record.time_unit} a second"]
+
+
+def _strobes(record: Record, times: np.ndarray, seconds: float) -> list[str]:
+    """A sentence if a single body rotates too far between frames for its rotation to be seen."""
+    if not record.is_body or "omega_lab_x" not in record.columns:
+        return []
+    size = np.linalg.norm([record.columns[f"omega_lab_{k}"] for k in "xyz"], axis=0)
+    turns = float(size.max() * (times[1] - times[0]) / (2 * np.pi))
+    if turns <= STROBES:
+        return []
+    return [
+        f"The body rotates up to {turns:.2g} times between two frames, so that it may seem to stand or to rotate "
+        f"backwards: a film of {seconds * turns / STROBES:.3g} s shows its rotation."
+    ]
 
 
 def _panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:

@@ -1,4 +1,4 @@
-"""The surface of a single body, to be drawn: its solid, its points joined, or the cuboid of the same inertia."""
+"""The surface of a single body, to be drawn: its solid, its points joined, or a solid of the same inertia."""
 
 from itertools import pairwise, product
 from typing import NamedTuple
@@ -6,13 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.body import BodySystem
-from rigidmd.assemble.body_parts import inertia_of, principal
-from rigidmd.mechanics.inertia import shifted
+from rigidmd.assemble.body_parts import inertia_at_centre, inertia_of, principal
 from rigidmd.mechanics.rotation import direction
 from rigidmd.mechanics.solids import SOLIDS
+from rigidmd.scene.body import EVEN, Solid, axis_of_symmetry
 
 #: Corners of a circle; a body that has no thickness gets this share of its reach.
 ROUND, THIN = 24, 0.02
+#: Edges of the cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its length.
+CUBOID, STEM = (12 / 5) ** 0.5, 0.06
+EQUAL = "of the same mass and inertia"
 
 
 class Mesh(NamedTuple):
@@ -22,6 +25,7 @@ class Mesh(NamedTuple):
     faces: list[list[int]]  # corners of each face, in order, seen from outside counterclockwise
     painted: list[bool]  # which faces show how the body turns
     about: str  # what it is, in words
+    stem: bool = False  # whether it reaches to the pivot
 
     @property
     def reach(self) -> float:
@@ -36,48 +40,83 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(system: BodySystem) -> Mesh:
-    """The surface of a body."""
+    """The surface of a body: what the scene draws it as, its solid, its points joined, or a body of equal inertia."""
     table, scene = system.scene.body, system.scene
-    mass, tensor, centre, _, _ = inertia_of(scene)
-    if table.points is not None:
+    mass, _, centre, _, _ = inertia_of(scene)
+    wanted = scene.output.drawn_as
+    if wanted is None and table.points is not None:
         places = np.array([p.position_m for p in table.points])
         masses = np.array([p.mass_kg for p in table.points])
         return _of_points(places if table.pinned else places - masses @ places / mass, masses)
-    if table.solid is not None:
-        shape = SOLIDS[table.solid.shape]
-        stretch = np.zeros(3)
-        for name, axes in shape.dimensions.items():
-            stretch[axes] = table.solid.dimensions[name]
-        stretch = np.maximum(stretch, THIN * stretch.max())
-        unit = UNITS.get(table.solid.shape, _ball)()
-        return Mesh(
-            unit.vertices * stretch + centre,
-            unit.faces,
-            unit.painted,
-            _with_article(table.solid.shape),
-        )
-    if scene.changing_inertia is not None:
-        tensor = np.diag(system.inertia)
-    if table.pinned:
-        tensor = shifted(tensor, -mass, centre)
-    return _equal_cuboid(mass, tensor, centre)
+    if isinstance(wanted, Solid):
+        stands = wanted.shape == "cone" and table.pinned
+        return _of_solid(wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre)
+    if wanted is None and table.solid is not None:
+        return _of_solid(table.solid, centre)
+    return _of_equal_inertia(wanted, mass, inertia_at_centre(scene), centre, table.pinned)
 
 
-def _with_article(shape: str) -> str:
-    return f"an {shape}" if shape[0] in "aeiou" else f"a {shape}"
+def _of_solid(solid: Solid, place: np.ndarray) -> Mesh:
+    """A solid of given dimensions about a place."""
+    stretch = np.zeros(3)
+    for name, axes in SOLIDS[solid.shape].dimensions.items():
+        stretch[axes] = solid.dimensions[name]
+    stretch = np.maximum(stretch, THIN * stretch.max())
+    unit = UNITS.get(solid.shape, _ball)()
+    article = "an" if solid.shape[0] in "aeiou" else "a"
+    return Mesh(unit.vertices * stretch + place, unit.faces, unit.painted, f"{article} {solid.shape}")
 
 
-def _equal_cuboid(mass: float, tensor: np.ndarray, centre: np.ndarray) -> Mesh:
-    """The homogeneous cuboid of this mass and inertia about its centre; a ball for a point."""
+def _of_equal_inertia(wanted: str | None, mass: float, tensor: np.ndarray, centre: np.ndarray, pinned: bool) -> Mesh:
+    """A homogeneous body of this mass and inertia about its centre: a solid of revolution if two moments are equal,
+    else a cuboid, or what is wanted.
+    """
     if not tensor.any():
         unit = _ball()
         return Mesh(unit.vertices, unit.faces, unit.painted, "a ball, as it is a point")
     moments, axes = principal(tensor)
-    lengths = np.sqrt(np.maximum(6 / mass * (moments.sum() - 2 * moments), 0.0))
-    lengths = np.maximum(lengths, THIN * lengths.max())
-    unit = _cuboid()
-    told = "the cuboid of the same mass and inertia"
-    return Mesh((unit.vertices * lengths) @ axes.T + centre, unit.faces, unit.painted, told)
+    symmetric = axis_of_symmetry(moments)
+    if wanted in (None, "top") and symmetric is not None:
+        return _top(mass, moments, axes, symmetric, centre, pinned)
+    lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))  # half axes of the ellipsoid
+    lengths, unit, shape = np.maximum(lengths, THIN * lengths.max()), _ball(), "ellipsoid"
+    if wanted != "ellipsoid":
+        lengths, unit, shape = CUBOID * lengths, _cuboid(), "cuboid"
+    return Mesh((unit.vertices * lengths) @ axes.T + centre, unit.faces, unit.painted, f"the {shape} {EQUAL}")
+
+
+def _top(mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, centre: np.ndarray, pinned: bool) -> Mesh:
+    """The homogeneous cylinder, or ball, of these moments, on a stem if its pivot lies on the axis outside of it.
+
+    A cylinder has m r²/2 about its axis and m (3 r² + h²)/12 about the others: there is one for any two moments.
+    """
+    along, across = moments[symmetric], moments[symmetric - 1]
+    far = float(np.linalg.norm(centre))
+    axis, right = axes[:, symmetric], axes[:, symmetric - 2]
+    is_ball = bool(np.ptp(moments) <= EVEN * moments.max())
+    if is_ball and far:
+        axis = centre / far
+        right = direction(np.cross(np.eye(3)[np.abs(axis).argmin()], axis))
+    elif axis @ centre < 0:
+        axis = -axis
+    if is_ball:
+        radius = float(np.sqrt(2.5 * along / mass))
+        half, rings = radius, [(radius * np.sin(a), radius * np.cos(a)) for a in np.linspace(np.pi, 0, 13)]
+    else:
+        radius, height = float(np.sqrt(2 * along / mass)), float(np.sqrt(max(12 * across - 6 * along, 0.0) / mass))
+        radius, half = max(radius, THIN * height), max(height, THIN * 2 * radius) / 2
+        rings = [(radius, -half), (radius, half)]
+    about = f"the {'ball' if is_ball else 'cylinder'} {EQUAL}"
+    stem = pinned and far > half and float(axis @ centre) > (1 - EVEN) * far
+    if stem:
+        thick = min(STEM * far, 0.5 * radius)
+        if is_ball:
+            rings[0] = (thick, -float(np.sqrt(radius**2 - thick**2)))
+        rings = [(0.0, -far), (thick, min(2 * thick - far, rings[0][1])), (thick, rings[0][1]), *rings[is_ball:]]
+        about += ", on a stem"
+    unit = _stack(rings)
+    frame = np.stack([right, np.cross(axis, right), axis])
+    return Mesh(unit.vertices @ frame + centre, unit.faces, unit.painted, about, stem)
 
 
 def _of_points(places: np.ndarray, masses: np.ndarray) -> Mesh:

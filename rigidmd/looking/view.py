@@ -89,6 +89,7 @@ def body_part(record: Record, film: BodyFilm) -> list[str]:
         "axis": film.axis.tolist(),
         "centre": film.centre.tolist(),
         "pinned": not record.body.flies,
+        "rod": not film.mesh.stem,
         "unit": film.unit,
         "azimuth": film.azimuth,
     }

@@ -44,6 +44,15 @@ LARGEST_ORTHOGONALITY_ERROR = 1e-9
 FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
 
+#: Moments of inertia are equal, for a picture, if they differ by less than this share of the largest.
+EVEN = 1e-6
+
+
+def axis_of_symmetry(moments: np.ndarray) -> int | None:
+    """The axis about which a body with these principal moments is symmetric: 2 (axis 3) if all are equal; or None."""
+    near = EVEN * moments.max()
+    return next((k for k in (2, 0, 1) if abs(moments[k - 1] - moments[k - 2]) <= near), None)
+
 
 class Solid(Section):
     """A homogeneous solid; axis 3 is its axis of symmetry; a cone stands on its tip."""
@@ -324,6 +333,12 @@ class BodyOutput(Section):
     none"""
     axis: Vector | None = None
     """Body axis whose path is drawn; default: towards the centre of mass, else the axis of symmetry, else axis 3"""
+
+    drawn_as: Literal["top", "ellipsoid", "cuboid"] | Solid | None = None
+    """Shape that films and pages draw, and nothing else: "top", "ellipsoid" or "cuboid" of the body's mass and inertia,
+    or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default: the solid or
+    the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if it is pinned
+    outside; else a cuboid"""
 
     @field_validator("trajectory")
     @classmethod
