@@ -39,8 +39,8 @@ def unfit(
         if axis_of_symmetry(at_centre) is None:
             shown = ", ".join(f"{moment:.4g}" for moment in at_centre)
             faults.append(
-                f"output.drawn_as: a top has two equal moments of inertia about its centre of mass, and these are {shown} "
-                "kg m²; name 'cuboid', 'ellipsoid' or a solid"
+                "output.drawn_as: a top has two equal moments of inertia about its centre of mass, and these are "
+                f"{shown} kg m²; name 'cuboid', 'ellipsoid' or a solid"
             )
     if body.pinned:
         if scene.changing_inertia is not None and centre.any():

@@ -64,8 +64,8 @@ def check_writer(path: Path) -> None:
     """Raise OutputError if a film of this kind cannot be written here."""
     if path.suffix == ".mp4" and ffmpeg() is None:
         raise OutputError(
-            f"{path}: .mp4 needs ffmpeg: install the program, or `pip install imageio-ffmpeg`, which brings it; or name a "
-            ".gif, which needs nothing more"
+            f"{path}: .mp4 needs ffmpeg: install the program, or `pip install imageio-ffmpeg`, which brings it; "
+            "a .gif needs nothing more"
         )
 
 
