@@ -145,6 +145,9 @@ class Molecule:
     mixing: Mixing | None = None
     parameters: tuple[dict[str, float], ...] = ()  # of each site, for pair laws of users
 
+    def __repr__(self) -> str:
+        return f"<Molecule {self.name}: {self.words}>"
+
     @property
     def marks(self) -> tuple[float, ...]:
         """Mass, u, moments of inertia, u Å², and number of sites (5,): by them a saved state knows its model."""

@@ -165,9 +165,9 @@ def _read_curve(folder: Path, told: dict[str, Any]) -> Curve:
 
 def drawn(curve: Curve):
     """The figure of a curve: each column with a band of one standard error."""
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
-    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    figure = Picture(figsize=(WIDTH, HEIGHT), layout="constrained")
     axis = figure.subplots()
     header, x = curve.axis
     shown = [title for title in curve.columns if not UNDRAWN.fullmatch(title)][:MOST_CURVES]

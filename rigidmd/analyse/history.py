@@ -67,6 +67,9 @@ class History:
     def __len__(self) -> int:
         return len(self.time)
 
+    def __repr__(self) -> str:
+        return f"<History: {len(self)} frames over {self.span:g} ps>"
+
     @property
     def span(self) -> float:
         """Time from the first frame to the last, ps."""

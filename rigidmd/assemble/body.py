@@ -74,6 +74,9 @@ class BodySystem:
     left_out: list[str] = field(default_factory=list)
     space = Unbounded()
 
+    def __repr__(self) -> str:
+        return f"<BodySystem of {self.scene.in_short}>"
+
     @property
     def turns(self) -> bool:
         """Whether it has an orientation."""

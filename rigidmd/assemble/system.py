@@ -65,6 +65,9 @@ class System:
     thermostat: Any = None  # of the user's own, in place of that of every stage
     own: dict[str, str] = field(default_factory=dict)  # terms of the user's own by name, in words
 
+    def __repr__(self) -> str:
+        return f"<System of {self.scene.in_short}>"
+
     @cached_property
     def sites(self) -> Sites:
         """Every site, made when it is first asked for: a run needs them only to write a trajectory."""

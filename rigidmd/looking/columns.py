@@ -19,8 +19,7 @@ from rigidmd.output.run_figures import run_figures
 from rigidmd.validation import meant
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from rigidmd.output.picture import Picture
     from rigidmd.run.results import Results
 
 #: Inches: width of a figure, height of a panel, of what is around them.
@@ -42,7 +41,7 @@ def record_of(
     return Record(Path(), system.scene, system, summary, columns, [])
 
 
-def plot(results: "Results", names: tuple[str, ...], log: bool) -> "Figure":
+def plot(results: "Results", names: tuple[str, ...], log: bool) -> "Picture":
     """The figure of these columns, of the name of a figure, or the first figure of the run. Raises KeyError."""
     figures = {}
     if not set(names[:1]) & set(results.units):

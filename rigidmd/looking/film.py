@@ -83,14 +83,15 @@ def write_film(
     """
     from matplotlib import animation, rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+
+    from rigidmd.output.picture import Picture
 
     check_writer(path)
     record = read_record(folder)
     film = _of_body(record) if record.is_body else _of_molecules(record)
     pixels = 2 * round((height or HEIGHT[path.suffix]) / 2)
     across = 2 * round(pixels * (1.75 if with_plots else 1.0) / 2)
-    figure = Figure(figsize=(INCHES * across / pixels, INCHES), dpi=pixels / INCHES)
+    figure = Picture(figsize=(INCHES * across / pixels, INCHES), dpi=pixels / INCHES)
     FigureCanvasAgg(figure)
     width = 1 / 1.75 if with_plots else 1.0
     axes = figure.add_axes((0.0, 0.0, width, 1.0))
@@ -144,10 +145,11 @@ def _panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
     Returns (cursor, axis) of each; a cursor is a line of the figure.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    still = Figure(figsize=figure.get_size_inches(), dpi=figure.dpi)
+    from rigidmd.output.picture import Picture
+
+    still = Picture(figsize=figure.get_size_inches(), dpi=figure.dpi)
     canvas = FigureCanvasAgg(still)
     chosen = plots.panels(record)[:PANELS]
     found = []

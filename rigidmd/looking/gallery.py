@@ -70,10 +70,10 @@ def write_gallery(
 
 def _picture(record: Record) -> str:
     """A moment of the film, PNG in base64."""
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
     film = body_film(record)
-    figure = Figure(figsize=(INCHES, INCHES), dpi=DPI)
+    figure = Picture(figsize=(INCHES, INCHES), dpi=DPI)
     time = float(np.interp(SHARE, [0, 1], film.time[[0, -1]]))
     BodyPicture(film, not record.body.flies).draw(figure.add_axes((0, 0, 1, 1)), time)
     stream = io.BytesIO()

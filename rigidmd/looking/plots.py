@@ -83,9 +83,9 @@ def draw(record: Record) -> str:
 
 
 def _draw(record: Record, k: int, panel: Panel) -> str:
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
-    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    figure = Picture(figsize=(WIDTH, HEIGHT), layout="constrained")
     axis = figure.subplots()
     draw_panel(axis, record, panel)
     axis.set_title(panel.title, loc="left", fontsize=9, color=INK)

@@ -134,6 +134,9 @@ class Averages:
     def __post_init__(self):
         self._fits: dict[str, Fit] = {}
 
+    def __repr__(self) -> str:
+        return f"<Averages of {self.name}, {self.stage}: {len(self.runs)} runs of {self.sampled:g} ps>"
+
     def points(self, quantity: Quantity) -> list[Point]:
         """All means of a quantity."""
         return [point for run in self.runs if (point := self.point(run, quantity))]

@@ -42,6 +42,9 @@ class Motion:
     def __len__(self) -> int:
         return len(self.columns.get("t", ()))
 
+    def __repr__(self) -> str:
+        return f"<Motion: {len(self)} samples of {', '.join(self.columns)}>"
+
     def __getitem__(self, column: str) -> np.ndarray:
         """A column as an array (t,) in SI units; "Q", of a body that turns, as matrices (t, 3, 3)."""
         if column not in self.described:

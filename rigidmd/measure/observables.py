@@ -37,6 +37,9 @@ class Reading(NamedTuple):
     torque_body: np.ndarray  # (n, 3) on each molecule, body frame, kJ/mol; (0, 3) of points
     orthogonality: float  # largest entry of |QᵀQ - 1|
 
+    def __repr__(self) -> str:
+        return f"<Reading: potential {self.potential:.6g} kJ/mol, temperature {self.temperature:.6g} K>"
+
 
 class Observation(NamedTuple):
     """Observables at one moment, in internal units (Å, ps, u, K, u Å²/ps²)."""

@@ -150,6 +150,9 @@ class Precision:
     sampled: float | None = None  # ps of averaging
     left_out: dict[str, str] = field(default_factory=dict)  # usual methods that were not tried -> reason
 
+    def __repr__(self) -> str:
+        return f"<Precision of {self.subject.name}: {len(self.trials)} trials>"
+
     @property
     def most_exact(self) -> Trial:
         """The trial with the smallest energy error, whose averages are the reference of the others."""

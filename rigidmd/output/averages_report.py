@@ -196,12 +196,12 @@ def draw(path: Path, found: Averages) -> None:
 
 def figure_of(found: Averages):
     """Bias against the step, a panel a quantity, with error bars and the band within 1 %."""
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
     shown = [quantity for quantity in found.quantities if found.points(quantity)]
     columns = min(3, max(1, len(shown)))
     rows = max(1, -(-len(shown) // columns))
-    figure = Figure(figsize=(3.7 * columns, 3.0 * rows + 0.9), layout="constrained")
+    figure = Picture(figsize=(3.7 * columns, 3.0 * rows + 0.9), layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     methods = methods_of(found)
     handles = {}

@@ -9,7 +9,7 @@ from rigidmd.core.files import whole_file
 from rigidmd.output.figure import COOL, FAINT, INK, WARM, camera, circle, save_figure, settings, thin_series
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
@@ -21,7 +21,7 @@ UP = np.array([0.0, 0.0, 1.0])
 MOST_POINTS, FLOOR = 10_000, 1e-17
 
 
-def draw_motion(folder: Path, figures: dict[str, "Figure"]) -> list[Path]:
+def draw_motion(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
     """Write figures as PNG and SVG, with the same bytes for the same run. Returns the paths. Raises OutputError."""
     written = []
     for stem, figure in figures.items():
@@ -41,7 +41,7 @@ def motion_figures(
     invariants: list[str],
     gravity: np.ndarray | None,
     flies: bool,
-) -> dict[str, "Figure"]:
+) -> dict[str, "Picture"]:
     """The figures of FIGURES that these columns allow, under a title with the name of the run.
 
     inertia : of a body whose omega stays on the ellipsoids of energy and momentum; flies : of one that is pinned, the

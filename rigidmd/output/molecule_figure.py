@@ -34,7 +34,7 @@ class _Sphere(NamedTuple):
 
 def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     """Draw a molecule into a file; the ending sets the format. Raises OutputError."""
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
     check_target(path, ENDINGS, force, "figure")
     view = _view(m)
@@ -42,7 +42,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     spheres = [_Sphere((x, y), depth, _radius(m, i)) for i, (x, y, depth) in enumerate(seen.tolist())]
     reach = [max(s.radius, m.sigma[i] / 2 if m.epsilon[i] > 0 else 0.0) for i, s in enumerate(spheres)]
     half = 1.12 * max(np.abs(s.centre).max() + r for s, r in zip(spheres, reach, strict=True))
-    figure = Figure(figsize=(INCHES, INCHES * 1.12))
+    figure = Picture(figsize=(INCHES, INCHES * 1.12))
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half))
     axes.set_axis_off()
     _diameters(axes, m, spheres)

@@ -270,11 +270,11 @@ def figure_of(found: Precision):
 
     A bar shows the spread of the run times.
     """
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
     s = found.subject
     per = "ps" if s.time_unit == "fs" else "s"
-    figure = Figure(figsize=(10, 4.8), layout="constrained")
+    figure = Picture(figsize=(10, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     turning = any(not np.isnan(t.rotation_error) for t in found.trials)
     titles = {

@@ -14,7 +14,8 @@ from rigidmd.output.figure import COOL, FAINT, INK, WARM, shown_range, thin_seri
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from rigidmd.output.picture import Picture
 
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 #: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.
@@ -172,7 +173,7 @@ def signed(value: float, error: float) -> str:
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
-def energy_figure(system: System, samples: Samples, summary: dict) -> "Figure":
+def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     """The drift of the conserved energy in each stage, on the scale of the last; energies and temperatures."""
     from rigidmd.output.picture import Picture  # Matplotlib is slow to import
 

@@ -14,10 +14,12 @@ from rigidmd.output.body_figures import motion_figures
 from rigidmd.output.report import energy_figure
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
 
-def run_figures(system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any]) -> "dict[str, Figure]":
+def run_figures(
+    system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any]
+) -> "dict[str, Picture]":
     """The figures of a run by the names of their files; those that there are samples for."""
     if isinstance(system, BodySystem):
         return body_figures(system, samples) if isinstance(samples, Motion) else {}
@@ -26,7 +28,7 @@ def run_figures(system: System | BodySystem, samples: Samples | Motion, summary:
     return {}
 
 
-def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Figure]":
+def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
     """Figures of the axis, angles, omega, path and errors; none of fewer than three samples."""
     if len(samples) <= 2:
         return {}

@@ -149,14 +149,14 @@ def picture(finding: Finding, styles: dict[str, dict] | None = None):
 
     styles : integrator -> colour and marker; None without numbers
     """
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
     styles = styles or styles_of([finding])
     varied = len({t.x for t in finding.trials if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
     panels = [kind for kind, has in (("trials", varied), ("limits", finding.limits)) if has]
     if not panels:
         return None
-    figure = Figure(figsize=(4.6 * len(panels), 3.0), layout="constrained")
+    figure = Picture(figsize=(4.6 * len(panels), 3.0), layout="constrained")
     for axis, kind in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
         for family in finding.families:
             (_draw_trials if kind == "trials" else _draw_limits)(axis, finding, family, styles[family])

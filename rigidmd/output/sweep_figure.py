@@ -42,11 +42,11 @@ class Axis(NamedTuple):
 
 def draw_sweep(path: Path, title: str, axis: Axis, panels: list[Panel]) -> None:
     """Write the figure. Raises OutputError."""
-    from matplotlib.figure import Figure
+    from rigidmd.output.picture import Picture
 
     across = min(ACROSS, len(panels))
     down = -(-len(panels) // across)
-    figure = Figure(figsize=(WIDTH * across, HEIGHT * down + 0.4), layout="constrained")
+    figure = Picture(figsize=(WIDTH * across, HEIGHT * down + 0.4), layout="constrained")
     grid = figure.subplots(down, across, squeeze=False)
     for place, panel in zip(grid.flat, panels, strict=False):
         _draw(place, axis, panel)

@@ -26,6 +26,9 @@ class Moment:
         self.time = time
         self.stage = stage
 
+    def __repr__(self) -> str:
+        return f"<Moment at time {self.time:g}, step {self.step}, stage {self.stage}>"
+
     @cached_property
     def state(self) -> State:
         """The state of the run."""

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     import MDAnalysis
     import pandas
     from chemiscope.widget import StructureWidget
-    from matplotlib.figure import Figure
 
     from rigidmd.analyse.findings import Finding
     from rigidmd.analyse.history import History
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from rigidmd.measure.motion import Motion
     from rigidmd.measure.samples import Samples
     from rigidmd.output.frame import Frame
+    from rigidmd.output.picture import Picture
 
 
 @dataclass(repr=False)
@@ -93,7 +93,7 @@ class Results:
         }
         return pandas.DataFrame({header: self[name] for name, header in written.items()})
 
-    def plot(self, *columns: str, log: bool = False) -> "Figure":
+    def plot(self, *columns: str, log: bool = False) -> "Picture":
         """A figure of Matplotlib, which a notebook shows and `savefig` writes.
 
         columns : names, drawn against time, those of one unit together; log: absolute values on a logarithmic axis.

@@ -50,6 +50,8 @@ class Scene(Section):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.in_short}>"
 
+    __str__ = __repr__
+
     def _repr_html_(self) -> str:
         from rigidmd.looking.notebook import scene_html
 
