@@ -29,6 +29,7 @@ from rigidmd.output import log, progress
 from rigidmd.output.log import columns
 from rigidmd.output.report import summary_text
 from rigidmd.run import Every, Simulation
+from rigidmd.run.minimise import minimise
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN
 
@@ -583,6 +584,60 @@ def test_off_a_terminal_lines_say_how_far_it_is(monkeypatch, capsys):
     assert len(lines) == 5
     simulation.run()
     assert capsys.readouterr().err == ""
+
+
+def test_the_time_left_is_of_the_steps_of_this_run(monkeypatch, capsys, tmp_path):
+    now = [0.0]
+
+    def wait(seconds):
+        now[0] += seconds
+
+    def slowly(*given):
+        wait(1000.0)
+        return minimise(*given)
+
+    def lines(duration, **options):
+        stages = [{"ensemble": "minimise", "most_iterations": 2}, {"duration_ps": 0.02}, {"duration_ps": duration}]
+        scene = small_scene({"argon": 10}, 20.0, stages=stages, output={"figure": False})
+        looks = Every(0.002, lambda moment: wait(20.0))
+        compiling = {"say": lambda sentence: wait(500.0)}
+        run = Simulation(scene, tmp_path / "out", observers=looks, warn=str, **compiling, **options)
+        run.run(progress=True)
+        return [line for line in capsys.readouterr().err.splitlines() if "ps/s" in line]
+
+    monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rigidmd.run.molecules, "minimise", slowly)
+    first, *_, last = lines(0.02)
+    assert first == "  0.004 of 0.04 ps, 0.0001 ps/s, 06:00 left"
+    assert last == "  0.04 of 0.04 ps, 0.0001 ps/s, 00:00 left"
+    assert lines(0.04, resume=True)[0] == "  0.044 of 0.06 ps, 0.0001 ps/s, 02:40 left"
+
+
+@pytest.mark.parametrize("kind", ["lines", "terminal", "notebook"])
+def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
+    now, shown = [0.0], []
+    monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress, "in_notebook", lambda: kind == "notebook")
+    monkeypatch.setattr(progress.Spot, "show", lambda self, bundle, metadata=None: shown.append(bundle["text/plain"]))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: kind == "terminal", raising=False)
+    with progress.progress_of(100.0, "ps", True) as bar:
+        for before in (70.0, 0.0):
+            bar.skip(before)
+            now[0] += 1000.0
+            bar.unpause()
+            for _ in range(2):
+                now[0] += 40.0
+                bar.update(4.0)
+    err = capsys.readouterr().err
+    if kind == "lines":
+        assert err.splitlines()[0] == "  74 of 100 ps, 0.1 ps/s, 04:20 left"
+        assert err.splitlines()[-1] == "  86 of 100 ps, 0.1 ps/s, 02:20 left"
+    elif kind == "terminal":
+        assert "74.0/100.0 ps [00:40<04:20]" in err
+        assert "86.0/100.0 ps [02:40<02:20]" in err
+    else:
+        assert "74 %: 74 of 100 ps, 00:40, 04:20 left" in shown
+        assert shown[-2:] == ["86 %: 86 of 100 ps, 02:40, 02:20 left", "86 %: 86 of 100 ps, 02:40"]
 
 
 def test_a_killed_run_leaves_a_readable_log_and_trajectory(tmp_path):

@@ -1,11 +1,9 @@
 """Progress of a run: a bar on a terminal or in a notebook, elsewhere a line now and then."""
 
-import contextlib
 import html
 import io
 import sys
 import time as clock
-from collections.abc import Callable, Iterator
 from typing import Any
 
 from tqdm import tqdm
@@ -54,36 +52,63 @@ def announce(sentence: str, spot: Spot) -> None:
         print(f"  {sentence} ...", file=sys.stderr, flush=True)
 
 
-@contextlib.contextmanager
-def progress_of(
-    total: float, unit: str, shown: bool | None, spot: Spot | None = None
-) -> Iterator[Callable[[float], object]]:
-    """A function to call with each advance, in `unit` of time.
+def progress_of(total: float, unit: str, shown: bool | None, spot: Spot | None = None) -> "Bar":
+    """A bar, to be used in a `with` statement, whose `update` takes each advance, in `unit` of time.
 
     shown : None shows it only in a notebook; spot : where a notebook shows it, and keeps it at the end
     """
     if not is_shown(shown):
-        yield lambda advance: None
-        return
+        return Bar(disable=True)
     if in_notebook():
-        # with miniters no thread of tqdm's shows it, whose output would have no cell
-        with _NotebookBar(spot or Spot(), total=total, unit=unit, mininterval=0.2, miniters=0) as bar:
-            yield bar.update
-        return
+        return _NotebookBar(spot or Spot(), total=total, unit=unit)
     if not sys.stderr.isatty():
-        yield _Lines(total, unit).advance
-        return
-    form = "{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]"
-    with tqdm(total=total, bar_format=form, leave=False, mininterval=0.2) as bar:
-        yield bar.update
+        return _Lines(total=total, unit=unit)
+    return Bar(total=total, bar_format="{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]")
 
 
-class _NotebookBar(tqdm):
+class Bar(tqdm):
+    """A bar on a terminal. Its rate is that of what it has seen done, without pauses."""
+
+    def __init__(self, **options: Any):
+        # with miniters no thread of tqdm's shows it, whose output would have no cell in a notebook
+        super().__init__(**{"leave": False, "mininterval": 0.2, "miniters": 0, "smoothing": 0.0} | options)
+        self._time, self.initial = clock.monotonic, 0.0
+        self.start_t = self.last_print_t = self._marked = clock.monotonic()
+
+    def skip(self, amount: float) -> None:
+        """Count what was done before."""
+        self.n += amount
+        self.initial += amount
+
+    def unpause(self) -> None:
+        """Leave out the time since the last advance, which something else took: compiling, minimising."""
+        pause, self._marked = clock.monotonic() - self._marked, clock.monotonic()
+        self.start_t += pause
+        self.last_print_t += pause
+
+    def update(self, n: float | None = 1) -> bool | None:
+        """Count an advance, up to the total, and show it now and then."""
+        self._marked = clock.monotonic()
+        return super().update(n if self.disable else min(n or 0.0, self.total - self.n))
+
+    @property
+    def rate(self) -> float:
+        """Done in a second; 0 while nothing is."""
+        elapsed = clock.monotonic() - self.start_t
+        return (self.n - self.initial) / elapsed if elapsed > 0 else 0.0
+
+    @property
+    def left(self) -> str:
+        """How long the rest takes, in words; empty while nothing is known."""
+        return f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left" if self.rate > 0 else ""
+
+
+class _NotebookBar(Bar):
     """A bar of HTML, which any notebook shows without widgets, and keeps with its file."""
 
     def __init__(self, spot: Spot, **options: Any):
         self._spot, self._ended = spot, False
-        super().__init__(file=io.StringIO(), **options)
+        super().__init__(file=io.StringIO(), leave=True, **options)
 
     def close(self) -> None:
         """Show how far it came; nothing is left to wait for."""
@@ -99,9 +124,7 @@ class _NotebookBar(tqdm):
             share, text = 1.0, f"{total:.4g} {told['unit']} in {elapsed:.3g} s"
         else:
             share = done / total
-            rate = told["rate"] or (done / elapsed if elapsed > 0 else 0.0)
-            left = f", {tqdm.format_interval((total - done) / rate)} left" if rate > 0 and not self._ended else ""
-            text += f", {tqdm.format_interval(elapsed)}{left}"
+            text += f", {tqdm.format_interval(elapsed)}{'' if self._ended or elapsed == 0 else self.left}"
         bar = (
             f'<progress value="{share:.4f}" max="1" style="width:18em;max-width:50%;vertical-align:middle"></progress>'
         )
@@ -113,24 +136,14 @@ class _NotebookBar(tqdm):
         )
 
 
-class _Lines:
+class _Lines(Bar):
     """Time done, rate and time left, as lines on standard error."""
 
-    def __init__(self, total: float, unit: str):
-        self._total, self._unit, self._done = total, unit, 0.0
-        self._began = self._last = clock.monotonic()
+    def __init__(self, **options: Any):
+        super().__init__(file=io.StringIO(), mininterval=PAUSE, delay=PAUSE, **options)
 
-    def advance(self, amount: float) -> None:
-        """Count, and print a line if the last one is old enough."""
-        self._done += amount
-        now = clock.monotonic()
-        if now - self._last < PAUSE:
-            return
-        self._last = now
-        rate = self._done / (now - self._began)
-        left = tqdm.format_interval((self._total - self._done) / rate) if rate > 0 else "?"
-        print(
-            f"  {self._done:.4g} of {self._total:.4g} {self._unit}, {rate:.3g} {self._unit}/s, {left} left",
-            file=sys.stderr,
-            flush=True,
-        )
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Print a line, unless it is the empty one of the end."""
+        if msg is None:
+            done = f"  {self.n:.4g} of {self.total:.4g} {self.unit}, {self.rate:.3g} {self.unit}/s{self.left}"
+            print(done, file=sys.stderr, flush=True)

@@ -382,12 +382,12 @@ class Simulation(Base):
         durations = self._durations()
         self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
         whole = sum(durations)
-        with progress_of(whole, self.time_unit, progress if whole > 0 else False, self._spot) as advanced:
+        with progress_of(whole, self.time_unit, progress if whole > 0 else False, self._spot) as bar:
             for k in range(place.stretch, len(durations)):
                 if resumed := kept is not None and k == kept.told["place"]["stretch"]:
                     self.stretch = stretch = self._reenter(k)
                     done = int(self.state.step[NOW]) - place.first
-                    advanced(place.time + done * stretch.dt)
+                    bar.skip(place.time + done * stretch.dt)
                 else:
                     self.stretch = stretch = self._enter(k)
                     place = place._replace(stretch=k, first=int(self.state.step[NOW]), seconds=0.0)
@@ -403,6 +403,7 @@ class Simulation(Base):
                     due = [observer.interval is not None or observer.ends for observer in observers]
                     self._show(observers, Moment(self, place.first, place.time, k), due)
                 shown, pace = None, 0.0
+                bar.unpause()
                 while done < stretch.steps and not self._interrupted:
                     to = agenda.next_look(done)
                     if pace > 0:
@@ -416,9 +417,9 @@ class Simulation(Base):
                     place = place._replace(seconds=place.seconds + seconds)
                     if not self._is_finite():
                         raise NotFiniteError(self.state)
-                    advanced(stretch.dt * (to - done))
-                    done = to
+                    advance, done = stretch.dt * (to - done), to
                     self._show(observers, self._moment(place, done), shown)
+                    bar.update(advance)
                     if self._keeper.time_is_up:
                         self._interrupted = self._out_of_time = True
                     elif done < stretch.steps and self._keeper.is_due:

@@ -314,8 +314,8 @@ class MolecularSimulation(Simulation):
         """Minimise as the present stage says, with a warning if it does not converge."""
         k = self._stage
         stage = self.scene.stages[k]
-        with progress_of(stage.most_iterations, "iterations", progress, self._spot) as advanced:
-            found = minimise(self.system, self.state, stage, lambda: self._interrupted, advanced)
+        with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
+            found = minimise(self.system, self.state, stage, lambda: self._interrupted, bar.update)
         self.engine.forget()
         self._minima[k] = found
         if not found.converged:

@@ -11,6 +11,7 @@ from rigidmd.arguments import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME, add_t
 from rigidmd.errors import visible
 
 if TYPE_CHECKING:
+    from rigidmd.output.progress import Bar
     from rigidmd.output.sweep_folder import Manifest
     from rigidmd.study.sweep.sweeping import Opened
     from rigidmd.study.sweep.table import Table
@@ -142,8 +143,8 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
             print(
                 f"  on the cluster {options.scheduler}, {threads} thread{'s' if threads > 1 else ''} each", flush=True
             )
-        with progress_of(sweep.left, "points", True) as advanced:
-            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(advanced).hear)
+        with progress_of(sweep.left, "points", True) as bar:
+            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(bar).hear)
     else:
         from rigidmd.study.sweep.running import Outcome
 
@@ -169,8 +170,8 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
 class _Listener:
     """Shows what points say: shares as progress, warnings once each, failures at once."""
 
-    def __init__(self, advanced: Callable[[float], object]):
-        self._advanced = advanced
+    def __init__(self, bar: "Bar"):
+        self._bar = bar
         self._shares: dict[str, float] = {}
         self._told: set[str] = set()
 
@@ -179,11 +180,14 @@ class _Listener:
         from tqdm import tqdm
 
         if kind in ("share", "ended", "died"):
-            before = self._shares.get(name, 0.0)
+            before, begins = self._shares.get(name, 0.0), kind == "share" and name not in self._shares
             ended = kind != "share"
             now = value if not ended else (1.0 if kind == "ended" and value["state"] == "finished" else before)
+            if begins and not self._shares:
+                self._bar.unpause()  # this is when the first steps begin
             self._shares[name] = max(before, now)
-            self._advanced(max(0.0, now - before))
+            # what a resumed point had before
+            (self._bar.skip if begins else self._bar.update)(max(0.0, now - before))
             why = value if kind == "died" else value["message"] if ended else None
             if why:
                 tqdm.write(f"  {name}: {visible(why)}", file=sys.stderr)
