@@ -1,18 +1,25 @@
 """Figures: long curves have no gaps, many curves are told apart."""
 
 import io
+from itertools import combinations
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, small_scene
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from rigidmd.assemble.system import build
 from rigidmd.core.schemes import SCHEMES
+from rigidmd.looking.columns import columns_figure, record_of
+from rigidmd.looking.plots import draw_panel, panels
+from rigidmd.measure.samples import NUMBERS, Sample, Samples
 from rigidmd.measure.subjects import COMPARATORS, body_subject
 from rigidmd.measure.trials import Precision, Trial
 from rigidmd.output import precision_report
-from rigidmd.output.figure import AT_ONCE, save_figure
+from rigidmd.output.figure import AT_ONCE, save_figure, shown_range
+from rigidmd.output.report import energy_figure
 from rigidmd.scene import Scene
 
 
@@ -42,6 +49,80 @@ def test_long_curves_have_no_gaps(points):
 def test_no_figure_is_written_past_this():
     written = [path.name for path in (ROOT / "rigidmd").rglob("*.py") if ".savefig(" in path.read_text()]
     assert written == ["figure.py"]
+
+
+STAGES = ["minimise", "equilibration", "a short one", "another", "quench", "production at 300 K"]
+STEPS = [0, 5, 3, 4, 0, 500]
+
+
+def samples_of(rng, start=-1000.0):
+    """Samples of a run of STAGES; a minimisation begins far above, and its first stage begins far from its mean."""
+    rows, step = [], 0
+    blank = dict.fromkeys(Sample._fields, 0.0) | {"own": ()}
+    for k, (name, steps) in enumerate(zip(STAGES, STEPS, strict=True)):
+        for n in range(steps or 2):
+            step += bool(steps)
+            value = -10 + rng.normal() + (start * np.exp(-4 * n) if k == 1 else 1e4 if not steps else 0.0)
+            given = {"step": step, "time": 0.1 * step, "stage": k, "stage_name": name, "potential": value}
+            noise = {"kinetic": rng.normal(), "temperature_translation": 300 + rng.normal(), "drift": rng.normal()}
+            rows.append(Sample(**blank | given | noise | {"temperature_rotation": float("nan")}))
+    return Samples.of_table(np.array([[float(getattr(row, name)) for name in NUMBERS] for row in rows]), STAGES)
+
+
+@pytest.fixture(scope="module")
+def staged():
+    stages = [
+        {"name": name, "duration_ps": 0.1 * steps} if steps else {"name": name, "ensemble": "minimise"}
+        for name, steps in zip(STAGES, STEPS, strict=True)
+    ]
+    system = build(small_scene({"argon": 4}, None, stages=stages))
+    told = {"drift_kJ_mol_ns_per_molecule": 0.1, "drift_error_kJ_mol_ns_per_molecule": 0.1}
+    return system, samples_of(np.random.default_rng(1)), {"stages": [told | {"name": name} for name in STAGES]}
+
+
+def test_the_figure_of_a_run_has_one_time_axis_and_stages_that_can_be_read(staged):
+    figure = energy_figure(*staged)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw(renderer)
+    assert len({axis.get_xlim() for axis in figure.axes}) == 1
+    for axis in figure.axes[1:]:
+        named = [text for text in axis.texts if text.get_text()]
+        assert [text.get_text() for text in named] == [STAGES[k] for k in (1, 2, 3, 5)]
+        boxes = [text.get_window_extent(renderer) for text in named]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        assert all(axis.get_window_extent(renderer).contains(*corner) for box in boxes for corner in box.corners())
+
+
+def test_panels_have_the_range_of_what_is_equilibrated(staged):
+    system, samples, summary = staged
+    record = record_of(system, samples, summary)
+    drawn = {panel.title.split(" (")[0]: panel for panel in panels(record)}
+    axis = Figure().subplots()
+    draw_panel(axis, record, drawn["potential energy"])
+    low, high = axis.get_ylim()
+    late = samples["potential"][samples["stage"] == 5] / 4
+    assert low < late.min() < late.max() < high
+    assert high - low < 4 * np.ptp(late)  # neither minimisations nor the start of the first stage
+    (line,) = (line for line in axis.lines if len(line.get_xdata()) > 2)
+    assert len(line.get_xdata()) == sum(STEPS)
+    figure = columns_figure(record, ["potential"], samples.described)
+    assert np.diff(figure.axes[0].get_ylim()) < 4 * 4 * np.ptp(late)
+
+
+@pytest.mark.parametrize(
+    ("values", "stage", "wanted"),
+    [
+        ([0.0, 1.0, 0.0, 1.0], [0, 0, 0, 0], (-0.05, 1.05)),  # all of it
+        ([99.0, 1.0, 0.0, 1.0], [0, 0, 0, 0], (-0.1, 2.1)),  # the start is beyond
+        ([99.0, 98.0, 99.0, 1.0, 0.0, 1.0, 0.0], [0, 0, 0, 1, 1, 1, 1], (-4.95, 103.95)),  # a stage of its own
+        ([5.0, 5.0, 5.0], [0, 0, 0], None),
+        ([np.nan, np.nan], [0, 0], None),
+        ([np.nan, 1.0, 0.0], [0, 0, 0], (-0.05, 1.05)),
+    ],
+)
+def test_what_range_is_shown(values, stage, wanted):
+    found = shown_range(np.array(values), np.array(stage))
+    assert found == (wanted and pytest.approx(wanted))
 
 
 def test_as_many_integrators_as_there_are_are_told_apart(monkeypatch, tmp_path):

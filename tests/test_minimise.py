@@ -2,7 +2,9 @@
 
 import csv
 import json
+import warnings
 
+import ase.units
 import numpy as np
 import pytest
 from conftest import shaken, small_scene
@@ -15,7 +17,11 @@ from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.core.state import NOW, State, state_of
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.looking.plots import panels
+from rigidmd.looking.report import write_report
 from rigidmd.molecules import load_model
+from rigidmd.output.record import read_record
+from rigidmd.output.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run.enthalpy import Enthalpy
 from rigidmd.run.minimise import minimise
@@ -396,7 +402,6 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         ([stage_of(), {"duration_ps": 1.0}], {"start": {}}, "the first stage in which time passes is nve"),
         ([stage_of(pressure_bar=1.0)], {"box": {"lengths_A": 20.0, "periodic": False}}, "box.periodic is false"),
         ([stage_of(pressure_bar=1.0)], {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]}, "frozen molecules do not move"),
-        ([stage_of()], {"output": {"trajectory": "t.dcd"}}, "two frames at one time"),
         (
             [stage_of(), {"ensemble": "nvt", "duration_ps": 1.0, "temperature_K": 300.0}],
             {"start": {"temperature_K": 0.0}},
@@ -482,7 +487,7 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     assert nvt["temperature_K"] > 0
     assert (tmp_path / "out" / "energy.png").is_file()
     again = Simulation(Scene.read(tmp_path / "out" / "scene.toml")).run()
-    assert [frame.time for frame in again._frames] == pytest.approx([0, 0, 0, 0.01, 0.02])
+    assert [frame.time for frame in again._frames] == pytest.approx([0, 0.01, 0.02])
     with np.load(tmp_path / "out" / "final.npz") as final:
         for name in ("position", "rotation", "velocity"):
             assert np.array_equal(final[name], getattr(again.state, name))
@@ -492,6 +497,82 @@ def test_a_minimum_alone_has_no_figure(tmp_path):
     Simulation(small_scene({"argon": 4}, None, stages=[stage_of()], start={}), tmp_path / "out").run(progress=True)
     assert "energy.png" not in {path.name for path in (tmp_path / "out").iterdir()}
     assert "stages:" in describe(small_scene({"argon": 4}, None, stages=[stage_of()], start={}))
+
+
+SHORT = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.02}
+SEVERAL = [stage_of(name="a"), stage_of(name="b"), SHORT, stage_of(name="c", most_iterations=3), SHORT]
+EVERY_STEP_OR_TWO = {"trajectory_interval_ps": 0.01, "log_interval_ps": 0.004, "pressure_tensor_interval_ps": 0.01}
+
+
+def several(folder, stages, trajectory, **options):
+    output = EVERY_STEP_OR_TWO | {"trajectory": trajectory, "figure": False}
+    scene = small_scene({"argon": 20}, 20.0, stages=stages, start={"temperature_K": 90.0}, output=output)
+    return Simulation(scene, folder, warn=lambda warning: None, **options)
+
+
+@pytest.mark.parametrize("ending", [".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb", None])
+def test_a_trajectory_has_one_frame_of_each_time(tmp_path, ending):
+    folder = None if ending is None else tmp_path / "out"
+    seen = []
+    looks = Every(0.01, lambda moment: seen.append(moment.state.position.copy()))
+    results = several(folder, SEVERAL, f"t{ending or '.xtc'}", observers=looks).run()
+    times = [0.0, 0.01, 0.02, 0.03, 0.04]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        u = results.universe()
+    assert [ts.time for ts in u.trajectory] == pytest.approx(times)
+    assert u.trajectory.dt == pytest.approx(0.01)
+    assert u.trajectory.totaltime == pytest.approx(0.04)
+    for ts, positions in zip(u.trajectory, seen, strict=True):  # those after the minimisations
+        assert ts.positions == pytest.approx(positions, abs=6e-3)
+    energies = results["potential"]
+    minima = {0: results.summary["stages"][1], 2: results.summary["stages"][3]}
+    for k, stage in minima.items():
+        assert results.atoms(k).get_potential_energy() / ase.units.kJ * ase.units.mol == pytest.approx(
+            20 * stage["minimum"]["energy_after_kJ_mol_per_molecule"]
+        )
+    assert list(results["stage"][:3]) == [0, 0, 1]  # the log has the energy before each minimisation
+    assert energies[0] > energies[1] >= energies[2]
+    if ending is None:
+        assert results._tensor[:, 0] == pytest.approx(times)
+        return
+    found = read_frames(folder / f"t{ending}", 20, 100)
+    assert found.time == pytest.approx(times, abs=1e-6)
+    record = read_record(folder)
+    assert list(record.columns["stage"]) == list(results["stage"])
+    assert list(np.unique(record.columns["stage"][record.moving])) == [2, 4]
+
+
+@pytest.mark.parametrize("stopped_in", [0, 1, 3])
+def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces(tmp_path, monkeypatch, stopped_in):
+    whole = several(tmp_path / "whole", SEVERAL, "t.xtc")
+    whole.run()
+    run = several(tmp_path / "out", SEVERAL, "t.xtc")
+
+    def stopped(system, state, stage, stop, advanced):
+        if run._stage == stopped_in:
+            run.stop()
+        return minimise(system, state, stage, stop, advanced)
+
+    monkeypatch.setattr("rigidmd.run.molecules.minimise", stopped)
+    results = run.run()
+    done = [0.0] if stopped_in < 2 else [0.0, 0.01, 0.02]
+    assert results.interrupted
+    assert [ts.time for ts in results.universe().trajectory] == pytest.approx(done)
+    several(tmp_path / "out", SEVERAL, "t.xtc", resume=True).run()
+    for name in ("t.xtc", "log.csv", "pressure_tensor.csv", "final.npz"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_a_minimum_alone_has_one_frame(tmp_path):
+    results = several(tmp_path / "out", [stage_of(), stage_of(name="again")], "t.xtc").run()
+    u = results.universe()
+    assert len(u.trajectory) == 1
+    assert u.atoms.positions == pytest.approx(results.state.position, abs=6e-3)
+    write_report(tmp_path / "out", tmp_path / "report.html")
+    record = read_record(tmp_path / "out")
+    assert panels(record) == []
+    assert not record.moving.any()
 
 
 def test_structures_that_overlap_may_be_minimised(tmp_path):

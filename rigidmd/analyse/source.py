@@ -9,6 +9,7 @@ from rigidmd.analyse.history import History, rebuilt
 from rigidmd.assemble.system import System
 from rigidmd.core.state import NO_CELL
 from rigidmd.errors import OutputError
+from rigidmd.measure.samples import moving
 from rigidmd.output.pressure import TENSOR_FILE, read_tensor
 from rigidmd.output.record import Record
 from rigidmd.output.trajectory import read_frames
@@ -89,10 +90,10 @@ def production_of(record: Record) -> tuple[Stage, np.ndarray]:
     Raises OutputError.
     """
     columns = record.columns
-    stage, first, last = _last_stage(record.molecules, columns)
+    stage, first, last, shown = _last_stage(record.molecules, columns)
     time = columns["time"]
-    begin = production(columns, (time >= first) & (time <= last), stage.changes_box)
-    return stage, (time >= begin) & (time <= last)
+    begin = production(columns, shown & (time >= first) & (time <= last), stage.changes_box)
+    return stage, shown & (time >= begin) & (time <= last)
 
 
 class _Raw(NamedTuple):
@@ -115,9 +116,9 @@ def _history(
     notes: list[str],
     step: Callable[[float], object],
 ) -> History:
-    stage, first, last = _last_stage(system, columns)
+    stage, first, last, shown = _last_stage(system, columns)
     if start is None:
-        own = (columns["time"] >= first) & (columns["time"] <= last)
+        own = shown & (columns["time"] >= first) & (columns["time"] <= last)
         begin = production(columns, own, stage.changes_box)
         notes = [*notes, f"production begins at {begin:g} ps, as detected in the stage from {first:g} to {last:g} ps"]
     else:
@@ -132,7 +133,8 @@ def _history(
         ]
     slack = 1e-6 * max(abs(last), 1.0)
     keep = np.flatnonzero((raw.time >= begin - slack) & (raw.time <= last + slack))
-    keep = keep[np.diff(raw.time[keep], prepend=-np.inf) > 0]  # not the start of a stage after the end of another
+    times = _evened(raw.time[keep])
+    keep, times = (of[np.diff(times, append=np.inf) > 0] for of in (keep, times))
     if len(keep) < 2:
         raise OutputError(
             f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of {len(raw.time)} "
@@ -142,13 +144,13 @@ def _history(
     bodies, mended = rebuilt(system, raw.sites[keep], velocities, raw.cells[keep], raw.wrapped, step)
     if not all(np.isfinite(array).all() for array in bodies if array is not None):
         raise OutputError("a frame holds what is no finite number")
-    samples = (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
+    samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
     if tensor is not None:
         tensor = tensor[(tensor[:, 0] >= begin - slack) & (tensor[:, 0] <= last + slack)]
     return History(
         system=system,
         stage=stage,
-        time=raw.time[keep],
+        time=times,
         cell=raw.cells[keep],
         positions=bodies.position,
         Q=bodies.Q,
@@ -160,17 +162,24 @@ def _history(
     )
 
 
+def _evened(time: np.ndarray) -> np.ndarray:
+    """Times (f,) of frames without the rounding of files to single precision, if nothing else makes them uneven."""
+    even = np.linspace(*time[[0, -1]], len(time)) if len(time) else time
+    rounding = np.spacing(np.abs(time).max(initial=0.0).astype(np.float32))
+    return even if np.all(np.abs(even - time) <= 2 * rounding) else time
+
+
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
-    """The last stage in which time passes and of which there are samples, with its begin and end, ps."""
-    names, time, stages = columns["stage_name"], columns["time"], system.scene.stages
+    """The last stage in which time passes and of which there are samples, its begin and end, ps, and which samples (l,)
+    are of motion."""
+    time, stages = columns["time"], system.scene.stages
     if all(stage.is_minimisation for stage in stages):
         raise OutputError("this run is a minimisation, in which no time passes: there is nothing to average")
-    before = time[0] + np.cumsum([0.0, *(stage.duration for stage in stages)])  # of stages with the same name
+    shown = moving(stages, columns["stage"])
     for k in reversed(range(len(stages))):
-        stage = stages[k]
-        own = np.flatnonzero((names == stage.label) & (time > before[k] + 0.5e-3 * stage.timestep_fs))
-        if len(own) and not stage.is_minimisation:
-            return stage, float(time[max(0, own[0] - 1)]), float(time[own[-1]])
+        own = np.flatnonzero(shown & (columns["stage"] == k))
+        if len(own) and time[own[-1]] > (first := time[max(0, own[0] - 1)]):
+            return stages[k], float(first), float(time[own[-1]]), shown
     raise OutputError("the run has not come to a stage in which time passes")
 
 

@@ -37,7 +37,7 @@ def record_of(
     if isinstance(samples, Motion):
         columns = samples.columns if names is None else {name: samples.columns[name] for name in ["t", *names]}
     else:
-        wanted = samples.described if names is None else dict.fromkeys(["time", "stage_name", *names])
+        wanted = samples.described if names is None else dict.fromkeys(["time", "stage", *names])
         columns = {name: samples[name] for name in wanted}
     return Record(Path(), system.scene, system, summary, columns, [])
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, thin_series
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, shown_range, thin_series
 from rigidmd.output.page import figure as figure_part
 from rigidmd.output.record import Record
 
@@ -30,10 +30,12 @@ def panels(record: Record) -> list[Panel]:
 
 
 def _of_molecules(record: Record) -> list[Panel]:
-    seen, n = record.columns, len(record.molecules.model.species)
+    seen, n, shown = record.columns, len(record.molecules.model.species), record.moving
 
     def curves(*names: tuple[str, str], per: int = 1) -> list[tuple[str, np.ndarray]]:
-        return [(label, seen[name] / per) for name, label in names if name in seen and np.isfinite(seen[name]).any()]
+        return [
+            (label, seen[name] / per) for name, label in names if name in seen and np.isfinite(seen[name][shown]).any()
+        ]
 
     found = [
         Panel(
@@ -96,18 +98,20 @@ def _draw(record: Record, k: int, panel: Panel) -> str:
 
 
 def draw_panel(axis, record: Record, panel: Panel) -> None:
-    """Draw the curves of a panel, with the beginnings of stages."""
-    time = record.time
-    stages = record.columns.get("stage_name")
+    """Draw the curves of a panel where time passes, with the beginnings of stages."""
+    shown, ranges = record.moving, []
+    time, stages = record.time[shown], record.columns.get("stage", np.zeros(len(shown)))[shown]
     for color, (label, values) in zip(COLORS * len(panel.curves), panel.curves, strict=False):
-        axis.plot(*thin_series(time, values, 600), color=color, lw=0.9, label=label or None)
+        axis.plot(*thin_series(time, values[shown], 600), color=color, lw=0.9, label=label or None)
+        ranges.append(None if panel.log or record.is_body else shown_range(values[shown], stages))
     if panel.log:
         axis.set_yscale("log")
     else:
         axis.ticklabel_format(axis="y", useOffset=False)
-    if stages is not None:
-        for k in np.flatnonzero(stages[1:] != stages[:-1]):
-            axis.axvline(time[k], color=FAINT, lw=0.6, ls=":")
+    if None not in ranges:
+        axis.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
+    for k in np.flatnonzero(stages[1:] != stages[:-1]):
+        axis.axvline(time[k], color=FAINT, lw=0.6, ls=":")
     axis.margins(x=0)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=8, colors=INK)

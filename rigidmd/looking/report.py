@@ -79,22 +79,19 @@ def parts(record: Record, film: str = "") -> Iterator[str]:
     yield section("How to repeat it", *_repeat(record))
 
 
-def _stages(record: Record) -> list[tuple[str, np.ndarray]]:
-    """(name, its samples) of each stage, in order."""
-    names = record.columns["stage_name"]
-    starts = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]]))
-    ends = [*starts[1:], len(names)]
-    return [(str(names[start]), np.arange(start, end)) for start, end in zip(starts, ends, strict=True)]
-
-
 def _means(record: Record) -> str:
     """Means of the log with their standard errors, which account for correlation."""
     n, seen = len(record.molecules.model.species), record.columns
     shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
     rows = []
-    for name, own in _stages(record):
+    for k in np.unique(seen["stage"][record.moving]):
+        own = np.flatnonzero(seen["stage"] == k)
         time = seen["time"][own]
-        cells = [name, f"{time[-1] - (seen['time'][own[0] - 1] if own[0] else time[0]):g}", len(own)]
+        cells = [
+            seen["stage_name"][own[0]],
+            f"{time[-1] - (seen['time'][own[0] - 1] if own[0] else time[0]):g}",
+            len(own),
+        ]
         for column, _, per_molecule in shown:
             values = seen[column][own] / (n if per_molecule else 1)
             if np.ptp(values) <= 1e-9 * np.abs(values).max():
@@ -103,7 +100,7 @@ def _means(record: Record) -> str:
             value, error = mean(values)
             cells.append("" if value is None or error is None else signed(value, error).lstrip("+"))
         rows.append(cells)
-    told = '<p class="faint">Means over a whole stage ± one standard error, from the lines of log.csv.</p>'
+    told = '<p class="faint">Means over a whole stage ± one standard error, from log.csv; none of minimisations.</p>'
     return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + told
 
 

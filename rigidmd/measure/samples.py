@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple, get_args, get_type_hints
 import numpy as np
 
 from rigidmd.measure.columns import Column
+from rigidmd.scene.stage import Stage
 
 
 class Sample(NamedTuple):
@@ -115,3 +116,8 @@ class Samples:
     def described(self) -> dict[str, Column]:
         """Name -> column."""
         return COLUMNS | own_columns(self.own)
+
+
+def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
+    """Which samples (n,), of stages with these indices, are of motion: none of minimisations."""
+    return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])

@@ -73,6 +73,17 @@ def thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple
     return time[kept], values[kept]
 
 
+def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
+    """Lowest and highest value (n,) on the axis of a curve: the range of the second half of each stage, and as much
+    above and below. What is beyond, at the start of a stage, would flatten the rest. None without a range."""
+    late = np.concatenate([own[len(own) // 2 :] for own in (values[stage == k] for k in np.unique(stage))])
+    late, values = late[np.isfinite(late)], values[np.isfinite(values)]
+    if len(late) == 0 or not (span := float(np.ptp(late))) > 0:
+        return None
+    low, high = max(values.min(), late.min() - span), min(values.max(), late.max() + span)
+    return low - 0.05 * (high - low), high + 0.05 * (high - low)
+
+
 def thin_path(path: np.ndarray, most: int) -> np.ndarray:
     """Indices of at most about so many points of a path (n, d), evenly along its length, with its ends."""
     if len(path) <= most:

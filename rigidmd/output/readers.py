@@ -110,8 +110,7 @@ class _Timed(ProtoReader):
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
-        # two frames at one time: before and after a minimisation
-        self._dt = float(next((gap for gap in np.diff(times) if gap > 0), 0.0))
+        self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
         super().__init__(*source, **options | {"times": times})  # readers give all their options to copies
         self._timed(self.ts)
 

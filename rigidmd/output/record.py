@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rigidmd.measure.motion import Snapshot, motion
 from rigidmd.output.checkpoint import latest
 from rigidmd.output.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
 from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.scene.stage import Stage
 
 #: Name of a column -> its header in log.csv, and back.
 HEADERS = {column.header: name for name, column in samples.COLUMNS.items() if column.header}
@@ -64,6 +66,14 @@ class Record:
         return self.columns["t" if self.is_body else "time"]
 
     @property
+    def moving(self) -> np.ndarray:
+        """Which samples (t,) are of motion: none of minimisations, in which no time passes."""
+        stages = getattr(self.scene, "stages", ())
+        return np.array(
+            [not (stages and stages[k].is_minimisation) for k in self.columns.get("stage", self.time)], bool
+        )
+
+    @property
     def time_unit(self) -> str:
         """Of `time`."""
         return "s" if self.is_body else "ps"
@@ -79,7 +89,7 @@ def read_record(folder: Path) -> Record:
         columns = _motion(folder, system, missing)
     else:
         system = build(scene, bare=True)
-        columns = _log(folder)
+        columns = _log(folder, scene.stages)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(f"{folder}: the run wrote no samples yet; `rigidmd resume {folder}` goes on with it")
     return Record(folder, scene, system, summary, columns, missing)
@@ -121,16 +131,29 @@ def _numbers(path: Path, header: str, cells: list[str]) -> np.ndarray:
         raise OutputError(f"{path}: column {header!r} holds what is no number") from None
 
 
-def _log(folder: Path) -> dict[str, np.ndarray]:
-    """Columns of log.csv by the names of `results[...]`."""
+def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
+    """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
     path = folder / LOG
     table = {HEADERS[header]: (header, cells) for header, cells in _table(path).items() if header in HEADERS}
     if lacking := [name for name in ("time", "stage_name") if name not in table]:
         raise OutputError(f"{path} is no log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
-    return {
+    found = {
         name: np.array(cells) if name == "stage_name" else _numbers(path, header, cells)
         for name, (header, cells) in table.items()
     }
+    return found | {"stage": _stage_of(found["stage_name"], found["time"], stages)}
+
+
+def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
+    """Index of the stage of each line. Several stages may have one name; their times tell them apart."""
+    found, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
+    for k, stage in enumerate(stages[:-1]):
+        end += stage.duration
+        own = (names[first:] == stage.label) & (time[first:] <= end + 0.5e-3 * stage.timestep_fs)
+        count = len(own) if own.all() else int(own.argmin())
+        found[first : first + count] = k
+        first += count
+    return found
 
 
 def _columns_of(system: BodySystem) -> list[str]:

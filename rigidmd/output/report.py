@@ -1,7 +1,6 @@
 """Reports of a run: summary.json, the summary as text, and energy.png."""
 
 import json
-from collections.abc import Sequence
 from math import floor, log10
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,15 +9,16 @@ import numpy as np
 
 from rigidmd.assemble.system import System
 from rigidmd.core.files import whole_file
-from rigidmd.measure.samples import Samples
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, thin_series
-from rigidmd.scene.stage import Stage
+from rigidmd.measure.samples import Samples, moving
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, shown_range, thin_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
+#: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.
+LETTER, MOST_ROWS = 0.012, 5
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
     "wrapped": "molecules are wrapped into the box; displacements need unwrapped frames",
@@ -172,68 +172,88 @@ def signed(value: float, error: float) -> str:
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
-def drawn(stages: Sequence[Stage], samples: Samples) -> np.ndarray:
-    """Which samples (n,) are drawn: none of minimisations, whose energy at the start would set the scale."""
-    return np.array([not stages[k].is_minimisation for k in samples["stage"]], bool)
-
-
-def draw_energy(path: Path, system: System, samples: Samples, summary: dict) -> None:
-    """energy.png."""
-    with whole_file(path) as temporary:
-        save_figure(energy_figure(system, samples, summary), temporary, dpi=150)
-
-
-def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: dict) -> None:
-    """The conserved energy of a stage, kJ/mol per molecule, with the line of its drift."""
-    axis.plot(*thin_series(time, drift), color=COOL, lw=0.9)
-    gradient, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
-    if len(time) > 2 and gradient is not None:
-        axis.plot(time, drift.mean() + gradient / 1000 * (time - time.mean()), color=WARM, lw=1.4)
-        title = f"{stage['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule"
-        axis.set_title(title, loc="left", fontsize=9, color=WARM)
-    axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
-
-
 def energy_figure(system: System, samples: Samples, summary: dict) -> "Figure":
-    """The drift of the last stage on its own scale; energies and temperatures of the whole run."""
+    """The drift of the conserved energy in each stage, on the scale of the last; energies and temperatures."""
     from rigidmd.output.picture import Picture  # Matplotlib is slow to import
 
-    stages = system.scene.stages
-    n = len(system.model.species)
-    shown = drawn(stages, samples)
+    stages, n = system.scene.stages, len(system.model.species)
+    shown = moving(stages, samples["stage"])
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
-    own = stage == stage[-1]
-    known = bool(np.isfinite(column["drift"][own]).any())  # another engine may tell no conserved energy
+    last = stage == stage[-1]
+    known = bool(np.isfinite(column["drift"][last]).any())  # another engine may tell no conserved energy
     figure = Picture(figsize=(8, 7), layout="constrained")
-    axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :])
+    axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes
     if known:
-        _draw_drift(axes[0], time[own], column["drift"][own] / n, summary["stages"][stage[-1]])
+        _draw_drift(axes[0], time, column["drift"] / n, stage, summary["stages"][stage[-1]])
     for name, color in (("potential", COOL), ("kinetic", WARM)):
-        parts.plot(*thin_series(time, (column[name] - column[name][-1]) / n), color=color, lw=0.9, label=name)
+        _draw(parts, time, (column[name] - column[name][-1]) / n, stage, color, name)
     parts.set_ylabel("energies less\ntheir last values\n(kJ/mol per molecule)")
     for name, color, label in (
         ("temperature_translation", COOL, "translation"),
         ("temperature_rotation", WARM, "rotation"),
     ):
         if np.isfinite(column[name]).all():
-            temperature.plot(*thin_series(time, column[name]), color=color, lw=0.9, label=label)
+            _draw(temperature, time, column[name], stage, color, label)
     temperature.set_ylabel("temperature (K)")
     temperature.set_xlabel("time (ps)")
+    starts = [float(time[stage == k][0]) for k in np.unique(stage)]
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
         axis.margins(x=0)
         axis.yaxis.label.set_fontsize(9)
-    for axis in (parts, temperature):
-        for k in np.unique(stage):
-            start = time[stage == k][0]
+        for start in starts:
             axis.axvline(start, color=FAINT, lw=0.6, ls=":")
-            axis.annotate(
-                stages[k].label, (start, 1), xycoords=("data", "axes fraction"), xytext=(4, -4),
-                textcoords="offset points", fontsize=9, color=FAINT, va="top",
-            )  # fmt: skip
         if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    for axis in (parts, temperature):
+        _label_stages(axis, starts, [stages[k].label for k in np.unique(stage)])
     figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
     return figure
+
+
+def _draw(axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray, color: str, label: str) -> None:
+    """A curve, with the limits of the axis wide enough for the range of it that is shown."""
+    before = axis.get_ylim() if axis.lines else None
+    axis.plot(*thin_series(time, values), color=color, lw=0.9, label=label)
+    if (limits := shown_range(values, stage)) is not None:
+        axis.set_ylim(min(limits[0], *(before or limits)), max(limits[1], *(before or limits)))
+
+
+def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, told: dict) -> None:
+    """The conserved energy since each stage began, kJ/mol per molecule; of the last one with the line of its drift."""
+    last = stage == stage[-1]
+    for k in np.unique(stage):
+        own = stage == k
+        axis.plot(*thin_series(time[own], drift[own]), color=COOL if own[-1] else FAINT, lw=0.9)
+    low, high = np.nanmin(drift[last]), np.nanmax(drift[last])
+    if high > low:
+        axis.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+    gradient, error = told["drift_kJ_mol_ns_per_molecule"], told["drift_error_kJ_mol_ns_per_molecule"]
+    if last.sum() > 2 and gradient is not None:
+        line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
+        axis.plot(time[last], line, color=WARM, lw=1.4)
+        title = f"{told['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule"
+        axis.set_title(title, loc="left", fontsize=9, color=WARM)
+    axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
+
+
+def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:
+    """Names of stages above the curves where they begin, each in the first row that is free there."""
+    left, right = axis.get_xlim()
+    rows: list[float] = []  # where the last name of each row ends, as a fraction of the axis
+    for start, label in zip(starts, labels, strict=True):
+        at, long = (start - left) / ((right - left) or 1.0), 0.015 + LETTER * len(label)
+        at_end = at > 0.5 and at + long > 1.0
+        begin, end = (at - long, at) if at_end else (at, at + long)
+        row = next((k for k, taken in enumerate(rows) if begin >= taken), len(rows))
+        if row == MOST_ROWS:
+            continue
+        rows[row : row + 1] = [end]
+        axis.annotate(
+            label, (start, 1), xycoords=("data", "axes fraction"), xytext=(-4 if at_end else 4, -2 - 11 * row),
+            textcoords="offset points", fontsize=9, color=FAINT, va="top", ha="right" if at_end else "left",
+        )  # fmt: skip
+    low, high = axis.get_ylim()
+    axis.set_ylim(low, high + 0.09 * len(rows) * (high - low))

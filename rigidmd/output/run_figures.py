@@ -8,10 +8,10 @@ from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.system import System
 from rigidmd.forces.body.frame import Inertial
 from rigidmd.measure.motion import Motion, drawn_axis
-from rigidmd.measure.samples import Samples
+from rigidmd.measure.samples import Samples, moving
 from rigidmd.mechanics.rotor import SplitRotor
 from rigidmd.output.body_figures import motion_figures
-from rigidmd.output.report import drawn, energy_figure
+from rigidmd.output.report import energy_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,7 +21,7 @@ def run_figures(system: System | BodySystem, samples: Samples | Motion, summary:
     """The figures of a run by the names of their files; those that there are samples for."""
     if isinstance(system, BodySystem):
         return body_figures(system, samples) if isinstance(samples, Motion) else {}
-    if isinstance(samples, Samples) and int(drawn(system.scene.stages, samples).sum()) > 1:
+    if isinstance(samples, Samples) and moving(system.scene.stages, samples["stage"]).sum() > 1:
         return {"energy": energy_figure(system, samples, summary)}
     return {}
 

@@ -103,8 +103,8 @@ def _checked(times: list[float]) -> list[float]:
     gaps = np.diff(times)
     if len(gaps) and np.ptp(gaps) > EVEN * gaps.max():
         warnings.warn(
-            f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps): dt is the first that is not 0; "
-            "use the time of each frame (ts.time)",
+            f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps): dt is the first of these; use the "
+            "time of each frame (ts.time)",
             stacklevel=4,
         )
     return times

@@ -81,8 +81,7 @@ def _reader(results: "Results", system: System) -> Callable[[int], "ase.Atoms"]:
         positions, velocities, cell = sites(k)
         found = atoms_of_sites(system, positions, velocities, cell, time)
         if len(same := np.flatnonzero(_same(times, time))):
-            at_last = k + 1 == len(frames) or frames[k + 1].time != time
-            energy = energies[same[-1 if at_last else 0]] * KJ_PER_MOL / EV  # two before and after a minimisation
+            energy = energies[same[-1]] * KJ_PER_MOL / EV  # after a minimisation that begins then
             found.calc = SinglePointCalculator(found, energy=float(energy))
         return found
 

@@ -27,7 +27,7 @@ class Keeper:
         self._deadline = deadline
         self._last = clock.monotonic()
         self._cost = 0.0
-        self._written: tuple[int, int] | None = None
+        self._written: tuple[int, int, bool] | None = None
         self.asked = False
 
     @property
@@ -46,8 +46,9 @@ class Keeper:
         ahead = PIECE + COSTS * self._cost + SPARE
         return self._deadline is not None and clock.monotonic() + ahead > self._deadline
 
-    def keep(self, checkpoint: Checkpoint, place: tuple[int, int]) -> None:
-        """Write a checkpoint of a place (stretch, step), once. Raises OutputError."""
+    def keep(self, checkpoint: Checkpoint, place: tuple[int, int, bool]) -> None:
+        """Write a checkpoint of a place (stretch, step, whether something was computed there), once. Raises
+        OutputError."""
         self.asked = False
         if self._folder is None or place == self._written:
             return

@@ -288,6 +288,10 @@ class Simulation(Base):
     def _recall(self, kept: Checkpoint) -> None:
         """Return to a checkpoint, in place of `_prepare`. Raises CheckpointError if it is of another scene."""
 
+    def _is_replaced(self, moment: Moment) -> bool:
+        """Whether the present moment is followed by another one of the same time."""
+        return False
+
     def _is_finite(self) -> bool:
         """Whether all variables of the state are finite."""
         return self.state.is_finite
@@ -372,7 +376,7 @@ class Simulation(Base):
         arrays |= {f"state/{name}": array for name, array in self.state._asdict().items()}
         arrays |= {f"engine/{name}": array for name, array in memory.items()}
         told = {"with": computed_with(), "place": place._asdict(), "run": self._memory(), "of": of}
-        self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW])))
+        self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW]), place.seconds > 0))
 
     def _run_stretches(
         self, observers: list[Observer], progress: bool | None, kept: Checkpoint | None = None
@@ -396,7 +400,7 @@ class Simulation(Base):
                     self._show(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
                     self._checkpoint(observers, place)
                 agenda = Agenda(observers, stretch)
-                if stretch.act is not None and not resumed:
+                if stretch.act is not None:
                     began = clock.perf_counter()
                     stretch.act(progress)
                     place = place._replace(seconds=clock.perf_counter() - began)
@@ -438,10 +442,9 @@ class Simulation(Base):
         """The moment after so many steps of the present stretch."""
         return Moment(self, place.first + done, place.time + done * self.stretch.dt, place.stretch)
 
-    @staticmethod
-    def _show(observers: list[Observer], moment: Moment, due: list[bool]) -> None:
+    def _show(self, observers: list[Observer], moment: Moment, due: list[bool]) -> None:
         for observer, now in zip(observers, due, strict=True):
-            if now:
+            if now and not (observer.once and self._is_replaced(moment)):
                 observer.see(moment)
 
     def ask_for_checkpoint(self, number: int | None = None) -> None:

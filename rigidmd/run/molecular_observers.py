@@ -1,23 +1,23 @@
 """Observers of molecules: samples with their checks and log, the final state, a figure."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rigidmd.core.files import whole_file
 from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
 from rigidmd.engines.cpu import Engine
 from rigidmd.measure import watch
 from rigidmd.measure.samples import Samples
 from rigidmd.output.checkpoint import Checkpoint
+from rigidmd.output.figure import save_figure
 from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.output.log import Log
 from rigidmd.output.pressure import TENSOR_FILE, TensorFile, tensor_row
-from rigidmd.output.report import draw_energy, drawn
+from rigidmd.output.run_figures import run_figures
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
-from rigidmd.scene.stage import Stage
 
 if TYPE_CHECKING:
     from rigidmd.run.molecules import MolecularSimulation
@@ -69,7 +69,7 @@ class LogFile(Observer):
 class PressureTensor(Observer):
     """pressure_tensor.csv: the pressure tensor at an interval of its own; without a folder in memory."""
 
-    reads_energies = True
+    once = reads_energies = True
 
     def __init__(self, interval: float):
         self.interval = interval
@@ -226,16 +226,13 @@ class FinalState(Observer):
 class EnergyFigure(Observer):
     """energy.png: drift, energies and temperatures."""
 
-    def __init__(self, stages: Sequence[Stage]):
-        self._stages = stages
-
     def files(self) -> list[str]:
         """One."""
         return [ENERGY]
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
         """Draw it if there are at least two samples."""
-        samples = results.samples
-        if isinstance(samples, Samples) and int(drawn(self._stages, samples).sum()) > 1:
-            draw_energy(run.path(ENERGY), run.system, samples, results.summary)
+        for figure in run_figures(run.system, results.samples, results.summary).values():
+            with whole_file(run.path(ENERGY)) as temporary:
+                save_figure(figure, temporary, dpi=150)
             results.files.append(run.path(ENERGY))

@@ -272,7 +272,7 @@ class MolecularSimulation(Simulation):
         stage = self.scene.stages[k]
         step = stage.timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
-            return Stretch(stage.scheme, step, 0, act=self._minimise)
+            return Stretch(stage.scheme, step, 0, act=None if k in self._minima else self._minimise)
         return Stretch(row_of_stage(self.system, k), step, stage.steps)
 
     def _durations(self) -> list[float]:
@@ -353,6 +353,15 @@ class MolecularSimulation(Simulation):
         self.system = replace(self.system, scene=self.scene)
         if self.folder is not None:
             self.write_scene(self.folder)
+
+    def _is_replaced(self, moment: Moment) -> bool:
+        stages, k = self.scene.stages, moment.stage
+        if stages[k].is_minimisation and k not in self._minima:
+            return True  # the start
+        ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
+        # an interrupted minimisation is repeated by a run that resumes, which also has another frame for it
+        ends_here = stages[k].is_minimisation and self._interrupted
+        return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def _is_finite(self) -> bool:
         state, extent = self.state, self.extent or extent_of(self.state)
@@ -436,7 +445,7 @@ class MolecularSimulation(Simulation):
         if self.folder is not None:
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
-            files += [EnergyFigure(self.scene.stages)] if output.figure else []
+            files += [EnergyFigure()] if output.figure else []
         return [*files, *observers]
 
     def _samples(self) -> Samples:

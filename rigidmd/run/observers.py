@@ -2,8 +2,9 @@
 
 All have the same methods: `files` it may write, `begin`, `see` a moment, `end`. An observer sees every `interval` of
 time, counted in steps of each stretch, or every `steps` steps, independent of the interval of results. If its `ends` is
-true, it also sees the last moment of every stretch. No observer depends on the order of observers: data that several of
-them need belong to the moment or the run.
+true, it also sees the last moment of every stretch. A time at which a minimisation begins has two states; one with
+`once` sees only the second. No observer depends on the order of observers: data that several of them need belong to the
+moment or the run.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -30,6 +31,7 @@ class Observer:
     interval: float | None = None  # ps, or s for a single body
     steps: int | None = None
     ends = False
+    once = False  # whether it sees one moment of each time: none before a minimisation
     reads_energies = False  # whether it always reads forces or energies: the last step then computes them too
 
     def files(self) -> list[str]:
@@ -62,7 +64,9 @@ class Observer:
 
 
 class Every(Observer):
-    """Calls `function(moment)` every `interval` ps (s for a single body)."""
+    """Calls `function(moment)` every `interval` ps (s for a single body), once for each time."""
+
+    once = True
 
     def __init__(self, interval: float, function: Callable[[Moment], object]):
         if not interval > 0:
@@ -97,6 +101,8 @@ class SceneFile(Observer):
 
 class Frames(Observer):
     """Topology and trajectory; without a folder, frames in memory."""
+
+    once = True
 
     def __init__(
         self, interval: float, topology: str, trajectory: str, velocities: bool = False, wrapped: bool = False

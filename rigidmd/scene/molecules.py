@@ -298,9 +298,6 @@ class MolecularScene(Scene):
         faults = []
         for k, stage in enumerate(self.stages):
             if stage.is_minimisation:
-                faults.append(
-                    f"output.trajectory: a .dcd file cannot hold two frames at one time (stages.{k}); use .xtc"
-                )
                 continue
             if stage.is_open:
                 faults.append(f"output.trajectory: a .dcd file cannot follow the step of stages.{k}; use .xtc")
