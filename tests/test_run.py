@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import MDAnalysis as mda
 import numpy as np
@@ -28,7 +29,8 @@ from rigidmd.measure.observables import observe
 from rigidmd.output import log, progress
 from rigidmd.output.log import columns
 from rigidmd.output.report import summary_text
-from rigidmd.run import Every, Simulation
+from rigidmd.run import Every, Observer, Simulation, body_observers
+from rigidmd.run.body_observers import Figures
 from rigidmd.run.minimise import minimise
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN
@@ -638,6 +640,102 @@ def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
     else:
         assert "74 %: 74 of 100 ps, 00:40, 04:20 left" in shown
         assert shown[-2:] == ["86 %: 86 of 100 ps, 02:40, 02:20 left", "86 %: 86 of 100 ps, 02:40"]
+
+
+class Failing(Observer):
+    """An observer whose method of this name fails, and a picture if it draws."""
+
+    ends = True
+    interval = 0.002
+
+    def __init__(self, method, draws=False):
+        self.draws = draws
+        setattr(self, method, self.fail)
+
+    def fail(self, *given):
+        if not (isinstance(given[0], rigidmd.run.moment.Moment) and given[0].step < 2):
+            raise ValueError("it does not work")
+
+
+FILES_OF = {
+    "argon": {"scene.toml", "topology.gro", "trajectory.xtc", "log.csv", "final.npz", "energy.png", "summary.json"},
+    "top": {"scene.toml", "topology.pdb", "trajectory.xtc", "motion.csv", "motion.npz", "axis.png", "summary.json"},
+}
+
+
+@pytest.fixture(params=["argon", "top"])
+def scene_of_both(request):
+    if request.param == "argon":
+        return "argon", small_scene(
+            {"argon": 10}, 20.0, stages=[{"duration_ps": 0.01}], output={"log_interval_ps": 0.002}
+        )
+    changed = {"run.duration_s": 0.05, "output.npz": True, "output.interval_s": 0.001}
+    return "top", Scene.read(ROOT / "systems" / "heavy_top_3.toml", changed)
+
+
+@pytest.mark.parametrize("method", ["see", "end"])
+def test_an_observer_that_fails_costs_no_file_of_another(tmp_path, scene_of_both, method):
+    kind, scene = scene_of_both
+    seen = []
+    others = [Every(0.002, seen.append), Failing(method), Every(0.002, seen.append)]
+    with pytest.warns(RigidMDWarning, match="Failing failed at .* it does not work"):
+        run = Simulation(scene, tmp_path / "out", observers=others)
+        with pytest.raises(ValueError, match="it does not work"):
+            run.run()
+    there = {path.name for path in (tmp_path / "out").iterdir()}
+    assert there >= FILES_OF[kind]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["interrupted"] == (method == "see")
+    assert sum("Failing failed at" in note for note in summary["notes"]) == 1
+    assert {Path(name).name for name in summary["files"]} <= there
+    assert seen[-1].step == seen[-2].step  # also those after it saw the moment
+    again = Simulation(scene, tmp_path / "out", observers=[Every(0.002, seen.append)] * 3, resume=True, warn=str)
+    if method == "see" and kind == "argon":
+        assert not again.run().interrupted
+
+
+def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
+    kind, scene = scene_of_both
+
+    def fail(*given, **options):
+        raise ValueError("ParseException: no mathematics")
+
+    monkeypatch.setattr("rigidmd.run.molecular_observers.save_figure", fail)
+    monkeypatch.setattr("rigidmd.run.body_observers.draw_motion", fail)
+    pictures = [Failing("see", draws=True), Failing("end", draws=True)]
+    notes = []
+    results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
+    assert not results.interrupted
+    assert [note.split(" cannot be drawn: ValueError: ") for note in notes] == [
+        ["Failing", "it does not work"],
+        [{"argon": "energy.png"}.get(kind, ", ".join(Figures().files())), "ParseException: no mathematics"],
+        ["Failing", "it does not work"],
+    ]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["notes"][-3:] == notes == results.summary["notes"][-3:]
+    there = {path.name for path in (tmp_path / "out").iterdir()}
+    assert there >= {name for name in FILES_OF[kind] if not name.endswith(".png")}
+    assert [path for path in results.files if not path.is_file()] == []
+
+
+def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch):
+    def fails_first(folder, figures, draw=body_observers.draw_motion):
+        if "axis" in figures:
+            raise ValueError("no axis")
+        return draw(folder, figures)
+
+    monkeypatch.setattr(body_observers, "draw_motion", fails_first)
+    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001})
+    results = Simulation(scene, tmp_path / "out", warn=str).run()
+    assert {path.name for path in results.files} >= {"angles.png", "omega.png", "summary.json"}
+    assert "no axis" in results.summary["notes"][-1]
+
+
+def test_a_name_in_a_figure_costs_no_summary(tmp_path):
+    stages = [{"name": "$`$", "duration_ps": 0.01}]
+    scene = small_scene({"argon": 10}, 20.0, stages=stages, output={"log_interval_ps": 0.002})
+    Simulation(scene, tmp_path / "out", warn=str).run()
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["stages"][0]["name"] == "$`$"
 
 
 def test_a_killed_run_leaves_a_readable_log_and_trajectory(tmp_path):
