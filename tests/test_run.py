@@ -211,6 +211,61 @@ def test_a_simulation_runs_twice_alike_and_keeps_true_times():
     assert trajectory.totaltime == pytest.approx(0.102)
 
 
+ASKED = {
+    "log_interval_ps": 0.01,
+    "trajectory_interval_ps": 0.05,
+    "pressure_tensor_interval_ps": 0.002,
+}
+
+
+def test_intervals_that_are_not_whole_steps_are_noted():
+    stages = [
+        {"duration_ps": 0.016, "timestep_fs": 4.0},
+        {"duration_ps": 0.05, "timestep_fs": 2.0},
+        {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0, "duration_ps": 0.022, "timestep_fs": 4.0,
+         "barostat_interval_ps": 0.03},
+    ]  # fmt: skip
+    sections = {"stages": stages, "output": ASKED, "run": {"remove_momentum_interval_ps": 1.001}}
+    scene = small_scene({"argon": 20}, 20.0, **sections)
+    assert scene.rounded_times() == [
+        "output.log_interval_ps = 0.01 is not a whole number of steps of 4 fs (stages.0, stages.2): it is 0.008 ps",
+        "output.trajectory_interval_ps = 0.05 is not a whole number of steps of 4 fs (stages.0, stages.2): it is 0.048 ps",
+        "output.pressure_tensor_interval_ps = 0.002 is not a whole number of steps of 4 fs (stages.0, stages.2): "
+        "it is 0.004 ps",
+        "run.remove_momentum_interval_ps = 1.001 is not a whole number of steps of 4 fs (stages.0, stages.2): it is 1 ps",
+        "run.remove_momentum_interval_ps = 1.001 is not a whole number of steps of 2 fs (stages.1): it is 1 ps",
+        "stages.2.duration_ps = 0.022 is not a whole number of steps of 4 fs (stages.2): it is 0.024 ps",
+        "stages.2.barostat_interval_ps = 0.03 is not a whole number of steps of 4 fs (stages.2): it is 0.032 ps",
+    ]
+    run = Simulation(scene, warn=str)
+    for note in scene.rounded_times():
+        assert note in run.introduction()
+        assert note in describe(scene)
+    results = run.run()
+    assert set(scene.rounded_times()) <= set(results.summary["notes"])
+    times = [frame.time for frame in results._frames]
+    assert times[1] == pytest.approx(0.066)  # the first stage is shorter than the interval
+    assert results["time"][:3] == pytest.approx([0.0, 0.008, 0.016])
+
+
+@pytest.mark.parametrize("thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None])
+def test_one_point_molecule_runs_under_every_thermostat(thermostat):
+    stage = {"duration_ps": 1.0} | (
+        {"ensemble": "nvt", "temperature_K": 100.0, "thermostat": thermostat} if thermostat else {}
+    )
+    run = Simulation(small_scene({"argon": 1}, 20.0, stages=[stage], start={"temperature_K": 100.0}), warn=str)
+    results = run.run()
+    moves = thermostat in ("langevin", "andersen")
+    assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
+    assert f"{3 if moves else 0} degrees of freedom" in run.introduction()
+    assert any("there is no temperature" in note for note in results.summary["notes"]) != moves
+    told = results.summary["stages"][0]["temperature_K"]
+    assert told > 0 if moves else told is None
+    if moves:
+        kinetic = 0.5 * 39.948 * (results.state.velocity**2).sum()
+        assert results["temperature"][-1] == pytest.approx(2 * kinetic / (3 * BOLTZMANN), rel=0.05)
+
+
 def free_flight(name, folder):
     """Two argon atoms far apart in a large box, which cross its sides."""
     scene = small_scene(

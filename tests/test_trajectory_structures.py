@@ -8,6 +8,7 @@ import MDAnalysis as mda
 import numpy as np
 import pytest
 from conftest import small_scene
+from MDAnalysis.analysis.dielectric import DielectricConstant
 from test_resume import NVT, WATER, scene
 
 from rigidmd import cli
@@ -17,8 +18,9 @@ from rigidmd.assemble.structure import read_structure
 from rigidmd.assemble.structure_files import read_atoms, read_geometry
 from rigidmd.assemble.system import build
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.output.frame import Frame
 from rigidmd.output.readers import FORMATS
-from rigidmd.output.trajectory import from_files, read_frames
+from rigidmd.output.trajectory import from_files, in_memory, read_frames
 from rigidmd.output.trajectory_file import open_trajectory, write_topology
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -104,6 +106,30 @@ def test_all_readers_find_the_frames_of_many_steps_and_boxes_that_change(tmp_pat
         assert [line[:6].strip() for line in whole.read_text().splitlines() if line.startswith(("CRYST1", "MODEL", "END"))] == [
             "CRYST1", "MODEL", "ENDMDL",
         ] * len(STEPS)  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "sites"), [("spce", 3), ("tip4p2005", 4), ("tip5p", 5)])
+@pytest.mark.parametrize("kept", ["files", "memory"])
+def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kept):
+    system = build(small_scene({model: 8}, 20.0))
+    state = system.state
+    if kept == "files":
+        file = open_trajectory(tmp_path / "t.xtc", system, 1.0, False, False)
+        for k in range(2):
+            file.write(state, float(k), k)
+        file.close()
+        for name in ("t.gro", "t.pdb"):
+            write_topology(tmp_path / name, system, state, wrapped=True)
+        u = from_files(system, tmp_path / "t.pdb", tmp_path / "t.xtc", [0.0, 1.0])
+        drawn = mda.Universe(str(tmp_path / "t.pdb"))
+        assert len(drawn.bonds) == 2 * 8  # viewers draw none to massless sites
+    else:
+        sites_now = system.site_positions(state, False), state.cell, system.site_velocities(state)
+        u = in_memory(system, [Frame(float(k), *sites_now) for k in range(2)])
+    assert [len(fragment) for fragment in u.atoms.fragments] == [sites] * 8
+    assert {tuple(bond.atoms.resids) for bond in u.bonds} == {(k, k) for k in range(1, 9)}
+    found = DielectricConstant(u.atoms, temperature=300, make_whole=True).run().results
+    assert np.isfinite(found["eps_mean"])
 
 
 def test_times_in_single_precision_are_evened_where_they_can_be():

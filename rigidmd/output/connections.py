@@ -26,7 +26,9 @@ def charges(system: System | BodySystem) -> np.ndarray:
 
 def _bonds_of_molecules(system: System, massless: bool) -> np.ndarray:
     starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
-    links = [np.array([b for b in bonds(m) if massless or m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species]
+    links = [
+        np.array([b for b in bonds(m) if massless or m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species
+    ]
     return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
 
 

@@ -170,13 +170,14 @@ class BodySimulation(Simulation):
         write_scene(folder, self.scene)
 
     def introduction(self) -> str:
-        """One line for the start of a run."""
+        """A few lines for the start of a run."""
         system, run = self.system, self.scene.run
         pinned = "" if system.flies else ", pinned"
-        return (
+        first = (
             f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom} degrees of freedom; "
             f"{run.steps} steps of {run.timestep_s:g} s, {run.integrator.replace('_', ' ')}"
         )
+        return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
         """The summary as text."""
