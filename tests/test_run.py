@@ -551,12 +551,41 @@ def test_from_python_in_five_lines():
         results["T"]
 
 
+def arrays_of(moment):
+    """All arrays that a moment gives."""
+    given = [moment.site_positions, *moment.state, *moment.observation]
+    return [part for part in given if isinstance(part, np.ndarray)]
+
+
+def test_what_an_observer_keeps_does_not_change(scene_of_both):
+    kept, copies = [], []
+
+    def look(moment):
+        kept.append(arrays_of(moment))
+        copies.append([part.copy() for part in kept[-1]])
+
+    Simulation(scene_of_both[1], observers=Every(0.002, look), warn=str).run()
+    assert len(kept) > 2
+    for now, then in zip(kept, copies, strict=True):
+        for array, copy in zip(now, then, strict=True):
+            assert array.tobytes() == copy.tobytes()
+    assert any(not np.array_equal(first, last) for first, last in zip(copies[0], copies[-1], strict=True))
+
+
+def test_results_are_a_mapping_of_their_columns(scene_of_both):
+    results = Simulation(scene_of_both[1], warn=str).run()
+    assert "energy" in results
+    assert "enthalpy" not in results
+    assert list(results) == list(results.units)
+    assert all(len(results[name]) == len(results.samples) for name in results)
+
+
 def test_observers_cannot_write_to_the_state():
     def meddle(moment):
         moment.state.position[:] = 0
 
     with pytest.raises(ValueError, match="read-only"):
-        Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)]).run()
+        Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)], warn=str).run()
 
 
 def command(*arguments, **options):

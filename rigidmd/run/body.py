@@ -136,7 +136,7 @@ class BodySimulation(Simulation):
         return stretches
 
     def _look(self, moment: Moment) -> Pose:
-        return self.system.pose(moment.time, moment.state)
+        return self.system.pose(moment.time, moment._state)
 
     def _own_observers(self) -> list[Observer]:
         output, interval = self.scene.output, settled(self.scene.output.interval_s)

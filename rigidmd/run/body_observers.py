@@ -47,7 +47,7 @@ class Sampler(Observer):
 
     def see(self, moment: Moment) -> None:
         """One more."""
-        self.snapshots.append(Snapshot(moment.time, moment.state.copy()))
+        self.snapshots.append(Snapshot(moment.time, moment.state))
 
 
 class BodyWatch(Observer):
