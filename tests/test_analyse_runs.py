@@ -24,7 +24,7 @@ from rigidmd.analyse.electric import total_dipole
 from rigidmd.analyse.source import _last_stage, of_folder
 from rigidmd.assemble.system import build
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.output.record import read_record
+from rigidmd.output.record import _stage_of, read_record
 from rigidmd.units import DEBYE
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
@@ -563,6 +563,7 @@ def test_stages_of_one_name_are_told_apart(water):
     scene = record.scene.model_copy(
         update={"stages": tuple(s.model_copy(update={"name": "x"}) for s in (first, second))}
     )
-    columns = record.columns | {"stage_name": np.full(len(record.columns["time"]), "x")}
-    stage, begin, end = _last_stage(replace(record.molecules, scene=scene), columns)
+    time = record.columns["time"]
+    columns = record.columns | {"stage": _stage_of(np.full(len(time), "x"), time, scene.stages)}
+    stage, begin, end, _ = _last_stage(replace(record.molecules, scene=scene), columns)
     assert (stage.ensemble, begin, end) == ("nve", pytest.approx(0.02), pytest.approx(0.22))

@@ -7,6 +7,7 @@ from conftest import ROOT, SPRING, small_scene, springs
 from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure.shadow import bias_of_potential, mean_square_rate
+from rigidmd.measure.subjects import _fitted
 from rigidmd.run import Simulation
 from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.scene import Scene
@@ -169,3 +170,22 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
             else:
                 assert error < bias / 4
                 assert 0.5 - error / estimate < bias / estimate < 2 + error / estimate
+
+
+@pytest.mark.parametrize(
+    ("timestep", "duration", "interval", "wanted"),
+    [
+        (0.5, 50.0, 0.3, 0.1),  # their common measure
+        (0.5, 50.0, 1.0, 0.5),
+        (0.4, 50.0, 1.0, 1 / 3),
+        (0.0011, 1.0, None, 1 / 910),  # a default of samples that is shorter than the step does not bind it
+        (0.0003, 1.0, None, 0.00025),
+        (0.3, 1.0, 0.7390851, 0.25),  # no common measure
+        (3.0, 1.0, None, 1.0),
+    ],
+)
+def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(timestep, duration, interval, wanted):
+    found = _fitted(timestep, duration, interval)
+    assert found == pytest.approx(wanted, rel=1e-12)
+    assert round(duration / found) * found == pytest.approx(duration, rel=1e-12)
+    assert found <= timestep * (1 + 1e-9)

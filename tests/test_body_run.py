@@ -187,7 +187,7 @@ def test_a_run_says_what_is_wrong_with_it():
     simulation = Simulation(scene)
     said = simulation.conclusion(simulation.run())
     assert "timestep_s is too long for this motion" in said
-    assert "not a whole number of steps; this run is" in said
+    assert "is not a whole number of steps of" in said
     assert "turns by more than 180° between samples" in said
 
 

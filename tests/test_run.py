@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import MDAnalysis as mda
 import numpy as np
@@ -28,7 +29,8 @@ from rigidmd.measure.observables import observe
 from rigidmd.output import log, progress
 from rigidmd.output.log import columns
 from rigidmd.output.report import summary_text
-from rigidmd.run import Every, Simulation
+from rigidmd.run import Every, Observer, Simulation, body_observers
+from rigidmd.run.body_observers import Figures
 from rigidmd.run.minimise import minimise
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN
@@ -207,6 +209,61 @@ def test_a_simulation_runs_twice_alike_and_keeps_true_times():
     assert times == pytest.approx([0, 0.02, 0.04, 0.06, 0.081, 0.102])  # 20 fs are seven steps of 3 fs
     assert trajectory.dt == pytest.approx(0.02)
     assert trajectory.totaltime == pytest.approx(0.102)
+
+
+ASKED = {
+    "log_interval_ps": 0.01,
+    "trajectory_interval_ps": 0.05,
+    "pressure_tensor_interval_ps": 0.002,
+}
+
+
+def test_intervals_that_are_not_whole_steps_are_noted():
+    stages = [
+        {"duration_ps": 0.016, "timestep_fs": 4.0},
+        {"duration_ps": 0.05, "timestep_fs": 2.0},
+        {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0, "duration_ps": 0.022, "timestep_fs": 4.0,
+         "barostat_interval_ps": 0.03},
+    ]  # fmt: skip
+    sections = {"stages": stages, "output": ASKED, "run": {"remove_momentum_interval_ps": 1.001}}
+    scene = small_scene({"argon": 20}, 20.0, **sections)
+    assert scene.rounded_times() == [
+        "output.log_interval_ps = 0.01 is not a whole number of steps of 4 fs (stages.0, stages.2): it is 0.008 ps",
+        "output.trajectory_interval_ps = 0.05 is not a whole number of steps of 4 fs (stages.0, stages.2): it is 0.048 ps",
+        "output.pressure_tensor_interval_ps = 0.002 is not a whole number of steps of 4 fs (stages.0, stages.2): "
+        "it is 0.004 ps",
+        "run.remove_momentum_interval_ps = 1.001 is not a whole number of steps of 4 fs (stages.0, stages.2): it is 1 ps",
+        "run.remove_momentum_interval_ps = 1.001 is not a whole number of steps of 2 fs (stages.1): it is 1 ps",
+        "stages.2.duration_ps = 0.022 is not a whole number of steps of 4 fs (stages.2): it is 0.024 ps",
+        "stages.2.barostat_interval_ps = 0.03 is not a whole number of steps of 4 fs (stages.2): it is 0.032 ps",
+    ]
+    run = Simulation(scene, warn=str)
+    for note in scene.rounded_times():
+        assert note in run.introduction()
+        assert note in describe(scene)
+    results = run.run()
+    assert set(scene.rounded_times()) <= set(results.summary["notes"])
+    times = [frame.time for frame in results._frames]
+    assert times[1] == pytest.approx(0.066)  # the first stage is shorter than the interval
+    assert results["time"][:3] == pytest.approx([0.0, 0.008, 0.016])
+
+
+@pytest.mark.parametrize("thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None])
+def test_one_point_molecule_runs_under_every_thermostat(thermostat):
+    stage = {"duration_ps": 1.0} | (
+        {"ensemble": "nvt", "temperature_K": 100.0, "thermostat": thermostat} if thermostat else {}
+    )
+    run = Simulation(small_scene({"argon": 1}, 20.0, stages=[stage], start={"temperature_K": 100.0}), warn=str)
+    results = run.run()
+    moves = thermostat in ("langevin", "andersen")
+    assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
+    assert f"{3 if moves else 0} degrees of freedom" in run.introduction()
+    assert any("there is no temperature" in note for note in results.summary["notes"]) != moves
+    told = results.summary["stages"][0]["temperature_K"]
+    assert told > 0 if moves else told is None
+    if moves:
+        kinetic = 0.5 * 39.948 * (results.state.velocity**2).sum()
+        assert results["temperature"][-1] == pytest.approx(2 * kinetic / (3 * BOLTZMANN), rel=0.05)
 
 
 def free_flight(name, folder):
@@ -494,12 +551,41 @@ def test_from_python_in_five_lines():
         results["T"]
 
 
+def arrays_of(moment):
+    """All arrays that a moment gives."""
+    given = [moment.site_positions, *moment.state, *moment.observation]
+    return [part for part in given if isinstance(part, np.ndarray)]
+
+
+def test_what_an_observer_keeps_does_not_change(scene_of_both):
+    kept, copies = [], []
+
+    def look(moment):
+        kept.append(arrays_of(moment))
+        copies.append([part.copy() for part in kept[-1]])
+
+    Simulation(scene_of_both[1], observers=Every(0.002, look), warn=str).run()
+    assert len(kept) > 2
+    for now, then in zip(kept, copies, strict=True):
+        for array, copy in zip(now, then, strict=True):
+            assert array.tobytes() == copy.tobytes()
+    assert any(not np.array_equal(first, last) for first, last in zip(copies[0], copies[-1], strict=True))
+
+
+def test_results_are_a_mapping_of_their_columns(scene_of_both):
+    results = Simulation(scene_of_both[1], warn=str).run()
+    assert "energy" in results
+    assert "enthalpy" not in results
+    assert list(results) == list(results.units)
+    assert all(len(results[name]) == len(results.samples) for name in results)
+
+
 def test_observers_cannot_write_to_the_state():
     def meddle(moment):
         moment.state.position[:] = 0
 
     with pytest.raises(ValueError, match="read-only"):
-        Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)]).run()
+        Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)], warn=str).run()
 
 
 def command(*arguments, **options):
@@ -638,6 +724,102 @@ def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
     else:
         assert "74 %: 74 of 100 ps, 00:40, 04:20 left" in shown
         assert shown[-2:] == ["86 %: 86 of 100 ps, 02:40, 02:20 left", "86 %: 86 of 100 ps, 02:40"]
+
+
+class Failing(Observer):
+    """An observer whose method of this name fails, and a picture if it draws."""
+
+    ends = True
+    interval = 0.002
+
+    def __init__(self, method, draws=False):
+        self.draws = draws
+        setattr(self, method, self.fail)
+
+    def fail(self, *given):
+        if not (isinstance(given[0], rigidmd.run.moment.Moment) and given[0].step < 2):
+            raise ValueError("it does not work")
+
+
+FILES_OF = {
+    "argon": {"scene.toml", "topology.gro", "trajectory.xtc", "log.csv", "final.npz", "energy.png", "summary.json"},
+    "top": {"scene.toml", "topology.pdb", "trajectory.xtc", "motion.csv", "motion.npz", "axis.png", "summary.json"},
+}
+
+
+@pytest.fixture(params=["argon", "top"])
+def scene_of_both(request):
+    if request.param == "argon":
+        return "argon", small_scene(
+            {"argon": 10}, 20.0, stages=[{"duration_ps": 0.01}], output={"log_interval_ps": 0.002}
+        )
+    changed = {"run.duration_s": 0.05, "output.npz": True, "output.interval_s": 0.001}
+    return "top", Scene.read(ROOT / "systems" / "heavy_top_3.toml", changed)
+
+
+@pytest.mark.parametrize("method", ["see", "end"])
+def test_an_observer_that_fails_costs_no_file_of_another(tmp_path, scene_of_both, method):
+    kind, scene = scene_of_both
+    seen = []
+    others = [Every(0.002, seen.append), Failing(method), Every(0.002, seen.append)]
+    with pytest.warns(RigidMDWarning, match="Failing failed at .* it does not work"):
+        run = Simulation(scene, tmp_path / "out", observers=others)
+        with pytest.raises(ValueError, match="it does not work"):
+            run.run()
+    there = {path.name for path in (tmp_path / "out").iterdir()}
+    assert there >= FILES_OF[kind]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["interrupted"] == (method == "see")
+    assert sum("Failing failed at" in note for note in summary["notes"]) == 1
+    assert {Path(name).name for name in summary["files"]} <= there
+    assert seen[-1].step == seen[-2].step  # also those after it saw the moment
+    again = Simulation(scene, tmp_path / "out", observers=[Every(0.002, seen.append)] * 3, resume=True, warn=str)
+    if method == "see" and kind == "argon":
+        assert not again.run().interrupted
+
+
+def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
+    kind, scene = scene_of_both
+
+    def fail(*given, **options):
+        raise ValueError("ParseException: no mathematics")
+
+    monkeypatch.setattr("rigidmd.run.molecular_observers.save_figure", fail)
+    monkeypatch.setattr("rigidmd.run.body_observers.draw_motion", fail)
+    pictures = [Failing("see", draws=True), Failing("end", draws=True)]
+    notes = []
+    results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
+    assert not results.interrupted
+    assert [note.split(" cannot be drawn: ValueError: ") for note in notes] == [
+        ["Failing", "it does not work"],
+        [{"argon": "energy.png"}.get(kind, ", ".join(Figures().files())), "ParseException: no mathematics"],
+        ["Failing", "it does not work"],
+    ]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["notes"][-3:] == notes == results.summary["notes"][-3:]
+    there = {path.name for path in (tmp_path / "out").iterdir()}
+    assert there >= {name for name in FILES_OF[kind] if not name.endswith(".png")}
+    assert [path for path in results.files if not path.is_file()] == []
+
+
+def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch):
+    def fails_first(folder, figures, draw=body_observers.draw_motion):
+        if "axis" in figures:
+            raise ValueError("no axis")
+        return draw(folder, figures)
+
+    monkeypatch.setattr(body_observers, "draw_motion", fails_first)
+    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001})
+    results = Simulation(scene, tmp_path / "out", warn=str).run()
+    assert {path.name for path in results.files} >= {"angles.png", "omega.png", "summary.json"}
+    assert "no axis" in results.summary["notes"][-1]
+
+
+def test_a_name_in_a_figure_costs_no_summary(tmp_path):
+    stages = [{"name": "$`$", "duration_ps": 0.01}]
+    scene = small_scene({"argon": 10}, 20.0, stages=stages, output={"log_interval_ps": 0.002})
+    Simulation(scene, tmp_path / "out", warn=str).run()
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["stages"][0]["name"] == "$`$"
 
 
 def test_a_killed_run_leaves_a_readable_log_and_trajectory(tmp_path):

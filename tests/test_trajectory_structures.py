@@ -3,17 +3,24 @@
 import shutil
 from pathlib import Path
 
+import ase.io
+import MDAnalysis as mda
 import numpy as np
 import pytest
 from conftest import small_scene
+from MDAnalysis.analysis.dielectric import DielectricConstant
 from test_resume import NVT, WATER, scene
 
 from rigidmd import cli
+from rigidmd.analyse.source import _evened
 from rigidmd.assemble import trajectory_formats
 from rigidmd.assemble.structure import read_structure
 from rigidmd.assemble.structure_files import read_atoms, read_geometry
 from rigidmd.assemble.system import build
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.output.frame import Frame
+from rigidmd.output.readers import FORMATS
+from rigidmd.output.trajectory import from_files, in_memory, read_frames
 from rigidmd.output.trajectory_file import open_trajectory, write_topology
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -47,6 +54,92 @@ def make(folder, ending):
     file.close()
     write_topology(folder / "topology.gro", system, moved, wrapped=True)
     return path, system, moved
+
+
+#: Steps beyond 32 bits, signed or not, as far as a scene allows.
+STEPS = [0, 2**31 - 1, 2**31, 2**32 + 5, 10**12]
+EVERY_ENDING = [".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"]
+
+
+@pytest.mark.parametrize("ending", EVERY_ENDING)
+def test_all_readers_find_the_frames_of_many_steps_and_boxes_that_change(tmp_path, ending):
+    _, system, _ = make(tmp_path, ".gsd")
+    states = [system.state.copy() for _ in STEPS]
+    for k, state in enumerate(states):
+        state.position[:] += 0.1 * k
+        state.cell[:] *= 1 + 0.02 * k
+    times = 4.3e6 + 0.1 * np.arange(len(STEPS))  # ps, which single precision rounds to halves
+    whole, parts = tmp_path / f"whole{ending}", tmp_path / f"parts{ending}"
+    file = open_trajectory(whole, system, 0.1, False, False)
+    for state, time, step in zip(states, times, STEPS, strict=True):
+        file.write(state, time, step)
+    file.close()
+    kept = None
+    for first, last in ((0, 2), (2, 5)):  # a run that resumes writes the same bytes
+        file = open_trajectory(parts, system, 0.1, False, False, kept)
+        for k in range(first, last):
+            file.write(states[k], times[k], STEPS[k])
+        kept = file.kept
+        file.close()
+    assert parts.read_bytes() == whole.read_bytes()
+
+    lengths = np.array([np.linalg.norm(state.cell, axis=1) for state in states])
+    sites = np.array([system.site_positions(state, False) for state in states])
+    u = from_files(system, tmp_path / "topology.gro", whole, list(times))
+    assert [frame.time for frame in u.trajectory] == list(times)
+    found = read_frames(whole, len(sites[0]), 100)
+    cells = np.linalg.norm(found.cells, axis=2)
+    if ending != ".xyz":  # MDAnalysis reads no box of it
+        assert np.array([frame.dimensions[:3].copy() for frame in u.trajectory]) == pytest.approx(lengths, abs=6e-4)
+        plain = mda.Universe(str(tmp_path / "topology.gro"), str(whole), format=FORMATS.get(ending))
+        assert np.array([frame.dimensions[:3].copy() for frame in plain.trajectory]) == pytest.approx(lengths, abs=6e-4)
+    assert cells == pytest.approx(lengths, abs=6e-4)
+    assert np.array([frame.positions.copy() for frame in u.trajectory]) == pytest.approx(sites, abs=0.006)
+    assert found.positions == pytest.approx(sites, abs=0.006)
+    if ending in (".xyz", ".pdb", ".traj"):
+        images = ase.io.read(whole, ":")
+        assert len(images) == len(STEPS)
+        assert np.array([image.cell.lengths() for image in images]) == pytest.approx(lengths, abs=6e-4)
+        massive = system.sites.mass > 0 if ending == ".traj" else slice(None)
+        assert np.array([image.positions for image in images]) == pytest.approx(sites[:, massive], abs=0.006)
+    if ending == ".pdb":
+        assert [line[:6].strip() for line in whole.read_text().splitlines() if line.startswith(("CRYST1", "MODEL", "END"))] == [
+            "CRYST1", "MODEL", "ENDMDL",
+        ] * len(STEPS)  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "sites"), [("spce", 3), ("tip4p2005", 4), ("tip5p", 5)])
+@pytest.mark.parametrize("kept", ["files", "memory"])
+def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kept):
+    system = build(small_scene({model: 8}, 20.0))
+    state = system.state
+    if kept == "files":
+        file = open_trajectory(tmp_path / "t.xtc", system, 1.0, False, False)
+        for k in range(2):
+            file.write(state, float(k), k)
+        file.close()
+        for name in ("t.gro", "t.pdb"):
+            write_topology(tmp_path / name, system, state, wrapped=True)
+        u = from_files(system, tmp_path / "t.pdb", tmp_path / "t.xtc", [0.0, 1.0])
+        drawn = mda.Universe(str(tmp_path / "t.pdb"))
+        assert len(drawn.bonds) == 2 * 8  # viewers draw none to massless sites
+    else:
+        sites_now = system.site_positions(state, False), state.cell, system.site_velocities(state)
+        u = in_memory(system, [Frame(float(k), *sites_now) for k in range(2)])
+    assert [len(fragment) for fragment in u.atoms.fragments] == [sites] * 8
+    assert {tuple(bond.atoms.resids) for bond in u.bonds} == {(k, k) for k in range(1, 9)}
+    found = DielectricConstant(u.atoms, temperature=300, make_whole=True).run().results
+    assert np.isfinite(found["eps_mean"])
+
+
+def test_times_in_single_precision_are_evened_where_they_can_be():
+    times = 4.3e6 + 0.1 * np.arange(200)
+    rounded = times.astype(np.float32).astype(float)
+    assert np.diff(rounded).min() == 0
+    assert _evened(rounded) == pytest.approx(times, abs=0.3)
+    assert np.diff(_evened(rounded)) == pytest.approx(np.full(199, 0.1), rel=0.03)
+    for uneven in (np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.0, 1.0]), np.array([2.0]), np.array([])):
+        assert np.array_equal(_evened(uneven), uneven)
 
 
 @pytest.mark.parametrize("ending", [".xtc", ".trr", ".gsd", ".dcd", ".nc"])

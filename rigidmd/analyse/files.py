@@ -14,7 +14,7 @@ from rigidmd.analyse.history import History
 from rigidmd.analyse.registry import ORDER, place
 from rigidmd.core.files import whole_file
 from rigidmd.errors import OutputError
-from rigidmd.output.figure import COLORS, FAINT, INK, few_decades, save_figure, thin_series
+from rigidmd.output.figure import COLORS, FAINT, INK, drawing, few_decades, save_figure, thin_series
 from rigidmd.output.folder import add_to_folder, written_by_runs
 
 ANALYSIS = "analysis.json"
@@ -54,7 +54,7 @@ def write_findings(
             if (folder / name).exists() and not known_there:
                 raise OutputError(f"{folder / name} is there and no file of an analysis; name {finding.name} otherwise")
     add_to_folder(folder, [ANALYSIS, *own])
-    written = []
+    written, pictures = [], {}
     entries = dict(known.get("analyses", {}))
     for finding in findings:
         files = []
@@ -62,8 +62,7 @@ def write_findings(
             path, picture = folder / f"{curve.file}.csv", folder / f"{curve.file}.png"
             with whole_file(path) as temporary:
                 temporary.write_text(_text(curve), encoding="utf-8")
-            with whole_file(picture) as temporary:
-                save_figure(drawn(curve), temporary, dpi=150)
+            pictures[picture] = curve
             written += [path, picture]
             files += [path.name, picture.name]
         entries[finding.name] = {
@@ -79,7 +78,10 @@ def write_findings(
     entries = dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
     with whole_file(folder / ANALYSIS) as temporary:
         temporary.write_text(json.dumps({"analyses": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    return [folder / ANALYSIS, *written]
+    for picture, curve in pictures.items():
+        with drawing(picture) as temporary:
+            save_figure(drawn(curve), temporary, dpi=150)
+    return [folder / ANALYSIS, *(path for path in written if path.is_file())]
 
 
 def _owners(known: dict[str, Any], folder: Path) -> dict[str, str]:

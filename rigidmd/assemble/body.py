@@ -16,7 +16,7 @@ from rigidmd.assemble.body_parts import (
     rotor_of,
     terms_of,
 )
-from rigidmd.assemble.resolve import FORMULATION, resolve_body
+from rigidmd.assemble.resolve import FORMULATION, SAMPLES, resolve_body
 from rigidmd.assemble.room import check_samples
 from rigidmd.assemble.system import Sites
 from rigidmd.core.schemes import RK4, SCHEMES, SOLVERS, Scheme, Solver
@@ -76,6 +76,20 @@ class BodySystem:
 
     def __repr__(self) -> str:
         return f"<BodySystem of {self.scene.in_short}>"
+
+    @property
+    def notes(self) -> list[str]:
+        """A sentence for duration and interval of samples that are not whole numbers of steps."""
+        run, found = self.scene.run, []
+        interval = settled(self.scene.output.interval_s)
+        given = interval != run.duration_s / SAMPLES
+        for key, wanted in (("run.duration_s", run.duration_s), ("output.interval_s", given and interval)):
+            taken = wanted and max(1, round(wanted / run.timestep_s)) * run.timestep_s
+            if not run.is_open and wanted and abs(taken - wanted) > 1e-9 * wanted:
+                found.append(
+                    f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: it is {taken:g} s"
+                )
+        return found
 
     @property
     def turns(self) -> bool:

@@ -76,13 +76,13 @@ def _body(system: BodySystem) -> str:
     how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
     lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
     every = max(1, round(settled(scene.output.interval_s) / run.timestep_s))
-    lines.append(f"a sample every {every * run.timestep_s:g} s")
+    lines += [f"a sample every {every * run.timestep_s:g} s", *system.notes]
     return "\n".join(lines)
 
 
 def _molecules(system: System) -> str:
     """Species, degrees of freedom, terms, stages, memory."""
-    scene, freedom = system.scene, system.freedom
+    scene, freedom = system.scene, system.last_freedom
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())

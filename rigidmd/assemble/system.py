@@ -127,6 +127,12 @@ class System:
             return not getattr(self.thermostat, "changes_momentum", False)
         return self.scene.stages[k].keeps_momentum
 
+    @property
+    def last_freedom(self) -> Freedom:
+        """Degrees of freedom in the last stage in which time passes."""
+        moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
+        return self.freedom_in(moving[-1]) if moving else self.freedom
+
     def freedom_in(self, k: int) -> Freedom:
         """Degrees of freedom in stage k: with the total momentum where its thermostat changes that."""
         if self.keeps_momentum_in(k):
@@ -259,6 +265,13 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
         if faults:
             raise SceneError(scene.source, faults)
     check_room(system)
+    system.notes.extend(scene.rounded_times())
+    system.notes.extend(
+        f"stages.{k}: the total momentum is conserved and zero, so that nothing moves and there is no temperature; "
+        "thermostat = 'langevin' moves it"
+        for k, stage in enumerate(scene.stages)
+        if not stage.is_minimisation and len(index) and system.freedom_in(k).total == 0 and mobile(model).any()
+    )
     system.notes.extend(set_momenta(scene, model, state, arrangement))
     system.notes.extend(
         f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"

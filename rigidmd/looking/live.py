@@ -29,7 +29,7 @@ class LivePlot(Observer):
     pause : least seconds between two pictures; drawing takes at most a fifth of the time
     """
 
-    ends = True
+    ends = draws = True
 
     def __init__(self, *columns: str, interval: float | None = None, pause: float = 0.5):
         self.interval = self._asked = interval

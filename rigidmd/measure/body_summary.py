@@ -50,11 +50,7 @@ def summarise_body(
 
 def _notes(system: BodySystem, motion: Motion) -> list[str]:
     """Warnings about the results."""
-    run, notes = system.scene.run, []
-    if abs(run.steps * run.timestep_s - run.duration_s) > 1e-9 * run.duration_s:
-        notes.append(
-            f"{run.duration_s:g} s is not a whole number of steps; this run is {run.steps * run.timestep_s:g} s long"
-        )
+    notes = system.notes
     if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
         notes.append(
             f"the energy is wrong by {error:.1e} of the largest kinetic energy: timestep_s is too long for this motion"

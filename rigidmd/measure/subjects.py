@@ -5,11 +5,13 @@ Both `rigidmd precision` and `integrator = "auto"` use these.
 
 import re
 from collections.abc import Callable
-from math import inf, sqrt
+from fractions import Fraction
+from math import ceil, gcd, inf, sqrt
 
 import numpy as np
 
 from rigidmd.assemble.body import BodySystem, Pose, build_body
+from rigidmd.assemble.resolve import SAMPLES
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import FORMULATIONS, SCHEMES, SOLVERS, Scheme
 from rigidmd.core.state import State
@@ -218,15 +220,32 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
     return stage.decided(integrator, timestep), reason
 
 
+#: Least share of a chosen step that is left where steps are fitted to the interval of samples.
+SHORTEST = 0.25
+
+
 def decided_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None) -> tuple[BodyScene, str]:
     """A scene with integrator and step chosen, and the reason in words. Raises SimulationError."""
     run = scene.run
     subject, _ = body_subject(scene, applied=applied)
     longest = {name: run.timestep_s for name in subject.methods if name in SCHEMES}
     integrator, timestep, reason = _chosen(subject, longest, run.energy_error, run.trajectory_error)
+    chosen, timestep = timestep, _fitted(timestep, run.duration_s, scene.output.interval_s)
+    fitted = "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
     none = {"energy_error": None, "trajectory_error": None}
     changed = run.model_copy(update={"integrator": integrator, "timestep_s": timestep} | none)
-    return scene.model_copy(update={"run": changed}), f"{integrator} at {timestep:g} s chosen: {reason}"
+    return scene.model_copy(update={"run": changed}), f"{integrator} at {chosen:g} s chosen{fitted}: {reason}"
+
+
+def _fitted(timestep: float, duration: float, interval: float | None) -> float:
+    """A step no longer than this one, of which the duration and the interval of samples are whole numbers; of the
+    duration alone where their common measure would make it much shorter."""
+    if interval is None:
+        interval = duration / SAMPLES if duration / SAMPLES >= timestep else duration
+    (a, b), (c, d) = (Fraction(repr(span)).as_integer_ratio() for span in (duration, interval))
+    common, longest = float(Fraction(gcd(a * d, c * b), b * d)), min(timestep, interval)
+    span = common if common >= SHORTEST * longest else duration
+    return span / ceil(span / longest * (1 - 1e-9))
 
 
 def _chosen(subject: Subject, longest: dict[str, float], energy: float | None, trajectory: float | None):

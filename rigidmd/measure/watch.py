@@ -201,7 +201,9 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     stage, share = system.scene.stages[now.stage], 1.0
     kinetic = since.kinetic
     if stage.has_thermostat:
-        kinetic = max(kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom.total)
+        kinetic = max(
+            kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom_in(now.stage).total
+        )
         share = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     if np.isnan(drift):  # another engine, which does not count the heat of its thermostat

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.bias import SHARE, AverageRun, Averages, Quantity
-from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
+from rigidmd.output.figure import FAINT, INK, curve_style, drawing, save_figure
 from rigidmd.output.report import signed
 
 FILES = ("precision.csv", "precision.json", "averages.png", "averages.html")
@@ -131,9 +131,9 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
     with whole_file(folder / FILES[1]) as temporary:
         temporary.write_text(json.dumps(as_data(found, command), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     draw(folder / FILES[2], found)
-    with whole_file(folder / FILES[3]) as temporary:
+    with drawing(folder / FILES[3]) as temporary:
         temporary.write_text(averages_page(found, command), encoding="utf-8")
-    return [folder / name for name in FILES]
+    return [folder / name for name in FILES if (folder / name).is_file()]
 
 
 def as_data(found: Averages, command: str) -> dict:
@@ -187,10 +187,10 @@ def _told(found: Averages, run: AverageRun) -> dict:
 
 def draw(path: Path, found: Averages) -> None:
     """averages.png."""
-    figure = figure_of(found)
-    figure.suptitle(f"{found.name}: bias of averages over {found.sampled:g} ps", color=INK, x=0.01, ha="left",
-                    fontsize=11)  # fmt: skip
-    with whole_file(path) as temporary:
+    with drawing(path) as temporary:
+        figure = figure_of(found)
+        title = f"{found.name}: bias of averages over {found.sampled:g} ps"
+        figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
         save_figure(figure, temporary, dpi=150)
 
 

@@ -11,9 +11,10 @@ from rigidmd.output.molecule_report import bonds
 FLAT, THIN = 1e-6, 1e-9
 
 
-def connections(system: System | BodySystem) -> np.ndarray:
-    """Pairs (b, 2) of sites that are joined."""
-    return _edges_of_body(system) if isinstance(system, BodySystem) else _bonds_of_molecules(system)
+def connections(system: System | BodySystem, massless: bool = False) -> np.ndarray:
+    """Pairs (b, 2) of sites that are joined; of molecules also massless sites to their nearest atoms if asked for, so
+    that each molecule is in one piece."""
+    return _edges_of_body(system) if isinstance(system, BodySystem) else _bonds_of_molecules(system, massless)
 
 
 def charges(system: System | BodySystem) -> np.ndarray:
@@ -23,10 +24,11 @@ def charges(system: System | BodySystem) -> np.ndarray:
     return np.concatenate([system.species[kind].charges for kind in system.model.species])
 
 
-def _bonds_of_molecules(system: System) -> np.ndarray:
-    """Between atoms of a molecule; none to massless sites."""
+def _bonds_of_molecules(system: System, massless: bool) -> np.ndarray:
     starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
-    links = [np.array([b for b in bonds(m) if m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species]
+    links = [
+        np.array([b for b in bonds(m) if massless or m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species
+    ]
     return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
 
 

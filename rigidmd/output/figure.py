@@ -1,12 +1,16 @@
 """Shared by all figures: writing, and styles for many curves."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
+from rigidmd.core.files import whole_file
 from rigidmd.core.process import ONE_AT_A_TIME
+from rigidmd.errors import RigidMDError, RigidMDWarning
 
 #: Points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
 AT_ONCE = 5000
@@ -47,6 +51,20 @@ def settings(changed: dict) -> Iterator[None]:
 
     with ONE_AT_A_TIME, rc_context(changed):
         yield
+
+
+@contextmanager
+def drawing(path: Path) -> Iterator[Path]:
+    """A file to draw into, which takes its place when it is complete. Results do not depend on pictures and pages: an
+    error becomes a warning. Raises OutputError if it cannot be written."""
+    try:
+        with whole_file(path) as temporary:
+            yield temporary
+    except RigidMDError:
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        warnings.warn(f"{path} cannot be drawn: {reason}", RigidMDWarning, stacklevel=2)
 
 
 def save_figure(figure, target, **options) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.trials import Precision, Trial
-from rigidmd.output.figure import FAINT, INK, curve_style, few_decades, save_figure
+from rigidmd.output.figure import FAINT, INK, curve_style, drawing, few_decades, save_figure
 from rigidmd.output.report import signed
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
@@ -252,16 +252,16 @@ def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
             writer.writerow(average_headers(found))
             writer.writerows(average_row(found, trial) for trial in sampled)
     draw(folder / FILES[1], found)
-    with whole_file(folder / FILES[2]) as temporary:
+    with drawing(folder / FILES[2]) as temporary:
         temporary.write_text(precision_page(found, command), encoding="utf-8")
-    return [folder / name for name in written]
+    return [folder / name for name in written if (folder / name).is_file()]
 
 
 def draw(path: Path, found: Precision) -> None:
     """precision.png."""
-    figure = figure_of(found)
-    figure.suptitle(f"{found.subject.name}: error against run time", color=INK, x=0.01, ha="left", fontsize=11)
-    with whole_file(path) as temporary:
+    with drawing(path) as temporary:
+        figure = figure_of(found)
+        figure.suptitle(f"{found.subject.name}: error against run time", color=INK, x=0.01, ha="left", fontsize=11)
         save_figure(figure, temporary, dpi=150)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.core.files import whole_file
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
-from rigidmd.output.figure import INK, curve_style, few_decades
+from rigidmd.output.figure import INK, curve_style, drawing, few_decades
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
@@ -105,11 +105,11 @@ def write_stability(folder: Path, findings: list[Finding], command: str, machine
              "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]
         )  # fmt: skip
         writer.writerows(line for finding in findings for line in _csv_lines(finding))
-    with whole_file(folder / FILES[1]) as temporary:
-        temporary.write_text(stability_page(findings, command, machine), encoding="utf-8")
     with whole_file(folder / FILES[2]) as temporary:
         temporary.write_text(markdown(findings, command, machine), encoding="utf-8")
-    return [folder / name for name in FILES]
+    with drawing(folder / FILES[1]) as temporary:
+        temporary.write_text(stability_page(findings, command, machine), encoding="utf-8")
+    return [folder / name for name in FILES if (folder / name).is_file()]
 
 
 def _csv_lines(finding: Finding) -> list[list]:

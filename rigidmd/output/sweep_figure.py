@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
-from rigidmd.output.figure import FAINT, INK, curve_style, save_figure
+from rigidmd.output.figure import FAINT, INK, curve_style, drawing, save_figure
 
 #: Inches of a panel; panels beside each other; curves in the legend.
 WIDTH, HEIGHT, ACROSS, MOST_NAMED = 4.4, 3.0, 2, 20
@@ -59,7 +58,7 @@ def draw_sweep(path: Path, title: str, axis: Axis, panels: list[Panel]) -> None:
             *grid.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8,
             labelcolor=INK,
         )  # fmt: skip
-    with whole_file(path) as temporary:
+    with drawing(path) as temporary:
         save_figure(figure, temporary, dpi=150)
 
 

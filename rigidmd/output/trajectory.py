@@ -49,15 +49,17 @@ def universe(system: System | BodySystem, state: State, velocities: bool = False
     u.add_TopologyAttr("masses", system.sites.mass)
     u.add_TopologyAttr("resnames", names)
     u.add_TopologyAttr("resids", np.arange(1, len(names) + 1))
-    _connect(u, system)
+    _connect(u, system, massless=False)  # viewers would draw these bonds
     set_frame(u, system, state, 0.0, 0, velocities, wrapped)
     return u
 
 
-def _connect(u: mda.Universe, system: System | BodySystem) -> None:
-    """Add charges and bonds."""
+def _connect(u: mda.Universe, system: System | BodySystem, massless: bool = True) -> None:
+    """Add charges, and bonds in place of those that there are."""
+    if hasattr(u.atoms, "bonds"):
+        u.del_TopologyAttr("bonds")
     u.add_TopologyAttr("charges", charges(system))
-    u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system).tolist()])
+    u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system, massless).tolist()])
 
 
 def set_frame(
@@ -76,6 +78,7 @@ def set_frame(
 def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
     """A Universe that holds frames in memory, each with its own time and box."""
     u = universe(system, system.state)
+    _connect(u, system)
     times, positions = _checked([frame.time for frame in frames]), np.array([frame.positions for frame in frames])
     boxes = (
         None
@@ -92,8 +95,6 @@ def from_files(system: System | BodySystem, topology: Path, trajectory: Path, ti
     u = mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
     u.add_TopologyAttr("elements", system.sites.element)
     u.add_TopologyAttr("masses", system.sites.mass)
-    if hasattr(u.atoms, "bonds"):  # a .pdb's
-        u.del_TopologyAttr("bonds")
     _connect(u, system)
     return u
 

@@ -106,6 +106,8 @@ class TrajectoryFile:
 
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
+        if self._format in (".xtc", ".trr"):  # as GROMACS does: 32 bits of the step, the time is what counts
+            step = (step + 2**31) % 2**32 - 2**31
         if self._format == ".xtc":
             self._file.append(self._xtc_frame(state, time, step))
         else:
@@ -119,8 +121,6 @@ class TrajectoryFile:
 
     def close(self) -> None:
         """Finish the file."""
-        if self._format == ".pdb":
-            self._file.append(PDB_END)
         self._file.close()
 
     def _xtc_frame(self, state: State, time: float, step: int) -> bytes:
@@ -147,16 +147,19 @@ class TrajectoryFile:
                     writer.REMARK(f"TIME {time:.6f} PS")
                 writer.write(self._universe.atoms)
                 if self._format == ".pdb" and (box := dimensions(state.cell)):
-                    writer.CRYST1(box)  # MDAnalysis assigns lines between two models to the first
+                    writer.CRYST1(box)
             return _content(path)
 
     def _part_of(self, whole: bytes) -> bytes:
         """What is added to the trajectory: the frame, before the first one with the head of the file."""
         n, first = len(self._system.sites.name), self._frames == 0
         if self._format == ".pdb":
-            lines = whole.removesuffix(PDB_END)
-            model = lines.index(b"MODEL ")
-            return lines if first else lines[: lines.index(b"\n") + 1] + lines[model:]
+            # the time, the box, the model; no END, which readers take for the end of a further frame
+            lines = whole.removesuffix(b"END\n").splitlines(keepends=True)
+            model = next(k for k, line in enumerate(lines) if line.startswith(b"MODEL "))
+            box = [line for line in lines[-1:] if line.startswith(b"CRYST1")]
+            head = [line for line in lines[: model if first else 1] if not line.startswith(b"CRYST1")]
+            return b"".join([*head, *box, *lines[model : len(lines) - len(box)]])
         if self._format == ".xyz":
             return whole.removesuffix(b"\n\n") + b"\n"
         if first or self._format not in COUNTER:
@@ -168,7 +171,6 @@ class TrajectoryFile:
 
 #: Where a format counts its frames: offset and how the number is packed.
 COUNTER = {".dcd": (8, "<i"), ".nc": (4, ">i")}
-PDB_END = b"END\n"
 
 
 @contextlib.contextmanager

@@ -137,7 +137,7 @@ class BodySimulation(Simulation):
         return stretches
 
     def _look(self, moment: Moment) -> Pose:
-        return self.system.pose(moment.time, moment.state)
+        return self.system.pose(moment.time, moment._state)
 
     def _own_observers(self) -> list[Observer]:
         output, interval = self.scene.output, settled(self.scene.output.interval_s)
@@ -171,13 +171,14 @@ class BodySimulation(Simulation):
         write_scene(folder, self.scene)
 
     def introduction(self) -> str:
-        """One line for the start of a run."""
+        """A few lines for the start of a run."""
         system, run = self.system, self.scene.run
         pinned = "" if system.flies else ", pinned"
-        return (
+        first = (
             f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom} degrees of freedom; "
             f"{run.steps} steps of {run.timestep_s:g} s, {run.integrator.replace('_', ' ')}"
         )
+        return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
         """The summary as text."""

@@ -47,7 +47,7 @@ class Sampler(Observer):
 
     def see(self, moment: Moment) -> None:
         """One more."""
-        self.snapshots.append(Snapshot(moment.time, moment.state.copy()))
+        self.snapshots.append(Snapshot(moment.time, moment.state))
 
 
 class BodyWatch(Observer):
@@ -105,6 +105,8 @@ class MotionFiles(Observer):
 class Figures(Observer):
     """Figures of the axis, angles, omega and errors."""
 
+    draws = True
+
     def files(self) -> list[str]:
         """As PNG and SVG."""
         return [f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "svg")]
@@ -112,4 +114,11 @@ class Figures(Observer):
     def end(self, run: "BodySimulation", results: "Results") -> None:
         """Draw them if there are enough samples."""
         if isinstance(results.samples, Motion):
-            results.files += draw_motion(run.path(""), body_figures(run.system, results.samples))
+            failed = None
+            for stem, figure in body_figures(run.system, results.samples).items():
+                try:
+                    results.files += draw_motion(run.path(""), {stem: figure})
+                except Exception as error:
+                    failed = failed or error
+            if failed is not None:
+                raise failed

@@ -139,6 +139,8 @@ class Simulation(Base):
         self._warn = warn
         self._warnings: list[str] = []
         self._interrupted = False
+        self._failed_before: list[Observer] = []
+        self._error: Exception | None = None  # of an observer
         self._signal: int | None = None
         self._resume = resume
         self._deadline = None if walltime is None else clock.monotonic() + checked_walltime(walltime)
@@ -185,6 +187,7 @@ class Simulation(Base):
                 if not stays:
                     check_folder(self.folder, self._force, inputs)
             self._interrupted, self._signal, self._out_of_time = False, None, False
+            self._failed_before, self._error = [], None
             scene = cast(MolecularScene | BodyScene, self.scene)
             self._keeper = Keeper(self.folder, scene.output.checkpoint_minutes, self._deadline)
             if hasattr(signal, "SIGUSR1"):
@@ -226,6 +229,11 @@ class Simulation(Base):
                 return self._finished(observers, Costs(prepared, clock.perf_counter() - began, computing))
             except (SimulationError, OutputError) as error:
                 raise self._failed(error, observers) from None
+            except Exception as error:  # of a force, or of an observer, after which all files are complete
+                if error is not self._error:
+                    for observer in observers:
+                        observer.failed(self)
+                raise
 
     def _finished(self, observers: list[Observer], costs: Costs) -> Results:
         """The results, with all files written. Raises OutputError."""
@@ -235,12 +243,20 @@ class Simulation(Base):
         results.summary = provenance(self.scene, self.threads, self._inputs, self.made_by) | self._summary(
             results.samples, costs
         )
-        for observer in observers:
-            observer.end(self, results)
-        if self.folder is not None:
-            results.files.append(self.path(SUMMARY))
-            results.summary["files"] = [str(path) for path in results.files]
-            write_summary(self.path(SUMMARY), results.summary)
+        noted = len(self._warnings)
+        for draws in (False, True):  # results first, pictures after
+            for observer in observers:
+                if observer.draws == draws:
+                    self._let(observer, observer.end, self, results)
+            files = [*results.files, *([self.path(SUMMARY)] if self.folder is not None else [])]
+            results.summary["notes"] += self._warnings[noted:]
+            noted = len(self._warnings)
+            if self.folder is not None:
+                results.summary["files"] = [str(path) for path in files]
+                write_summary(self.path(SUMMARY), results.summary)
+        results.files = files
+        if self._error is not None:
+            raise self._error
         return results
 
     # Implemented for molecules and for bodies.
@@ -366,8 +382,8 @@ class Simulation(Base):
 
     def _checkpoint(self, observers: list[Observer], place: Place) -> None:
         """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
-        if not self._keeper.keeps or (memory := self.engine.memory()) is None:
-            return
+        if not self._keeper.keeps or self._error is not None or (memory := self.engine.memory()) is None:
+            return  # a run that resumes after an error calls the observer again
         of, arrays = {}, {}
         for k, observer in enumerate(observers):
             owner = _owner(k, observer)
@@ -445,7 +461,25 @@ class Simulation(Base):
     def _show(self, observers: list[Observer], moment: Moment, due: list[bool]) -> None:
         for observer, now in zip(observers, due, strict=True):
             if now and not (observer.once and self._is_replaced(moment)):
-                observer.see(moment)
+                self._let(observer, observer.see, moment)
+
+    def _let(self, observer: Observer, act: Callable[..., None], *given: Any) -> None:
+        """Let an observer act, unless it has failed before. Its error ends the run, which raises it when all files are
+        complete; an error of a picture is noted and ends nothing. Raises errors of this package but at the end."""
+        if observer in self._failed_before:
+            return
+        try:
+            act(*given)
+        except Exception as error:
+            if isinstance(error, RigidMDError) and act == observer.see:
+                raise
+            self._failed_before.append(observer)
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            if observer.draws:
+                self.note(f"{', '.join(observer.files()) or type(observer).__name__} cannot be drawn: {reason}")
+                return
+            self.note(f"{type(observer).__name__} failed at {self.state.time[NOW]:g} {self.time_unit}: {reason}")
+            self._interrupted, self._error = True, self._error or error
 
     def ask_for_checkpoint(self, number: int | None = None) -> None:
         """Write a checkpoint at the next look. number : of the signal that asks for it"""

@@ -223,6 +223,8 @@ class FinalState(Observer):
 class EnergyFigure(Observer):
     """energy.png: drift, energies and temperatures."""
 
+    draws = True
+
     def files(self) -> list[str]:
         """One."""
         return [ENERGY]

@@ -352,6 +352,8 @@ class MolecularSimulation(Simulation):
         stages[k] = decided
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
         self.system = replace(self.system, scene=self.scene)
+        for sentence in self.scene.rounded_times([k]):
+            self.note(sentence)
         if self.folder is not None:
             self.write_scene(self.folder)
 
@@ -495,7 +497,7 @@ class MolecularSimulation(Simulation):
         more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
         first = (
             f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
-            f"{system.freedom.total} degrees of freedom; {self.threads} threads{more}"
+            f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"
         )
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 
 class Moment:
-    """The argument of observers: position in the run, state (read-only) and observation.
+    """The argument of observers: position in the run, state and observation. What it gives may be kept: it stays as it
+    is when the run continues.
 
     step : steps since the start; time : ps, or s for a single body; stage : index of the stage that led here
     state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in SI units
@@ -31,8 +32,8 @@ class Moment:
 
     @cached_property
     def state(self) -> State:
-        """The state of the run."""
-        return State(*(_read_only(array) for array in self._state))
+        """A copy of the state of the run, read-only."""
+        return State(*map(_read_only, self._state.copy()))
 
     @cached_property
     def _seen(self) -> Any:
@@ -52,10 +53,9 @@ class Moment:
     @property
     def site_positions(self) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å, not wrapped."""
-        return self._run.system.site_positions(self.state)
+        return self._run.system.site_positions(self._state)
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    view = array.view()
-    view.flags.writeable = False
-    return view
+    array.flags.writeable = False
+    return array

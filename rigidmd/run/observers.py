@@ -40,6 +40,7 @@ class Observer:
     steps: int | None = None
     ends = False
     once = False  # whether it sees one moment of each time: none before a minimisation
+    draws = False  # whether it only draws: it ends after the others, and its errors are notes
     reads_energies = False  # whether it always reads forces or energies: the last step then computes them too
 
     def files(self) -> list[str]:

@@ -1,5 +1,6 @@
 """Results of a run."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, overload
@@ -64,6 +65,13 @@ class Results:
     def _told(self) -> str:
         files = f"{len(self.files)} files in {self.files[0].parent}" if self.files else "no files"
         return f"{'interrupted, ' if self.interrupted else ''}{len(self.samples)} samples, {files}"
+
+    def __contains__(self, column: object) -> bool:
+        return column in self.samples.described
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the columns."""
+        return iter(self.samples.described)
 
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of the samples as an array (n,), in its unit of `units`: results["energy"].

@@ -290,6 +290,29 @@ class MolecularScene(Scene):
                 faults.append(f"{where} but fields.restraints fix positions: keep the volume")
         return faults
 
+    def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
+        """A sentence for each interval and duration that is not a whole number of steps, of all stages or these."""
+        output, found = self.output, {}
+        of_run = [
+            ("output.log_interval_ps", output.log_interval_ps),
+            ("output.trajectory_interval_ps", output.trajectory and output.trajectory_interval_ps),
+            ("output.pressure_tensor_interval_ps", output.pressure_tensor_interval_ps),
+            ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps),
+        ]
+        for k in range(len(self.stages)) if stages is None else stages:
+            stage = self.stages[k]
+            if stage.is_minimisation or stage.is_open:
+                continue
+            of_stage = [(f"stages.{k}.{key}", getattr(stage, key)) for key in ("duration_ps", "barostat_interval_ps")]
+            for key, wanted in [*of_run, *of_stage]:
+                taken = wanted and max(1, round(wanted * 1000 / stage.timestep_fs)) * stage.timestep_fs / 1000
+                if wanted and abs(taken - wanted) > 1e-9 * wanted:
+                    found.setdefault((key, wanted, stage.timestep_fs, taken), []).append(f"stages.{k}")
+        return [
+            f"{key} = {wanted:g} is not a whole number of steps of {step:g} fs ({', '.join(where)}): it is {taken:g} ps"
+            for (key, wanted, step, taken), where in found.items()
+        ]
+
     def _uneven_frames(self) -> list[str]:
         """DCD stores one interval for all frames: stages that would make them uneven."""
         if not self.output.trajectory or not self.output.trajectory.endswith(".dcd"):

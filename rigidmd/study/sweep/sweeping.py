@@ -185,7 +185,7 @@ def collected(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
     if not any(row.runs for row in table.rows):
         return table, []
     files = [write_table(table), write_figure(table, manifest.name)]
-    return table, [path for path in files if path is not None]
+    return table, [path for path in files if path is not None and path.is_file()]
 
 
 def run_point(
