@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -21,6 +22,7 @@ from rigidmd.core.state_file import Saved, write_state
 from rigidmd.core.toml_text import line_of
 from rigidmd.errors import MoleculeError, SceneError, StructureError
 from rigidmd.forces.waves import vectors
+from rigidmd.measure.samples import COLUMNS, Sample, Samples
 from rigidmd.molecules import read_molecule
 from rigidmd.scene import Scene
 from rigidmd.scene.molecules import MolecularScene
@@ -279,6 +281,79 @@ def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tm
     text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace("interval_s = 0.1", "interval_s = 1e-8")
     message = refusal(capsys, tmp_path, text)
     assert "not enough memory: a run with 1e+08 samples needs 270 GB of memory, and this machine has 8 GB" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "lines", "gigabytes"),
+    [
+        ({"stages.0.duration_ps": 2e5, "output.log_interval_ps": 0.002}, "1e+08", "87.1 GB"),
+        ({"stages.0.duration_ps": 2e5, "output.log_interval_ps": 1e-6}, "2e+08", "174 GB"),  # a line each step
+        ({"stages.0.duration_ps": 2e6, "output.trajectory_interval_ps": 0.002}, "2e+07", "167 GB"),
+        ({"stages.0.duration_ps": 2e7, "stages.0.timestep_fs": "", "stages.0.integrator": "auto",
+          "stages.0.energy_error_kT": 1e-3}, "2e+08", "180 GB"),
+    ],
+)  # fmt: skip
+def test_molecules_with_more_samples_than_there_is_room_for(changes, lines, gigabytes, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "free_memory", lambda: 8e9)
+    options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
+    message = refusal(capsys, tmp_path, GOOD, *options)
+    assert f"a run with {lines} lines in its log needs {gigabytes} of memory, and this machine has 8 GB" in message
+    assert "lengthen output.log_interval_ps" in message
+
+
+def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
+    values = {name: k + column / 64 for column, name in enumerate(COLUMNS)}
+    return Sample(**values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]}, own=own)
+
+
+def test_samples_give_back_what_was_added():
+    samples = Samples(["a", "b"], ("spring", "field"))
+    assert len(samples["time"]) == 0
+    added = [a_sample(k, (k / 3, -k)) for k in range(10)]
+    for sample in added:
+        samples.append(sample)
+    assert samples.rows == list(Samples(["a", "b"], samples.own, samples.table())) == added
+    assert samples.row(-1) == added[-1]
+    for name in COLUMNS:
+        assert samples[name].tolist() == [getattr(sample, name) for sample in added]
+    assert samples["field"].tolist() == [0, -1, -2, -3, -4, -5, -6, -7, -8, -9]
+    assert samples.of_stage(1).rows == added[5:]
+    assert len(samples.of_stage(2)) == 0
+    for since in range(10):
+        for time in np.arange(-0.1, 2.6, 0.05):
+            assert samples.latest(time, since) == max([k for k in range(since, 10) if k / 4 <= time], default=since)
+    column = samples["time"]
+    samples.append(a_sample(9, (0.0, 0.0)))  # columns are copies
+    assert len(column) == 10
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda table: table[:, 1:], "shape"),
+        (lambda table: table.ravel(), "shape"),
+        (lambda table: np.where(table == 1.0, 7.0, table), "of stages that the scene does not have"),
+        (lambda table: np.where(table == 1.0, np.nan, table), "of stages that the scene does not have"),
+        (lambda table: np.where(table == 6.0, 6.5, table), "steps that are not whole numbers"),
+        (lambda table: np.where(table == 6.0, 1e300, table), "steps that are not whole numbers"),
+        (lambda table: np.where(table == 6.0, np.inf, table), "steps that are not whole numbers"),
+    ],
+)
+def test_rows_that_are_no_samples_are_refused(change, expected):
+    samples = Samples(["a", "b"])
+    samples.append(a_sample(6))
+    with pytest.raises(ValueError, match=expected):
+        Samples(["a", "b"], (), change(samples.table()))
+
+
+def test_a_sample_takes_no_more_than_its_numbers():
+    samples = Samples(["a", "b"], ("spring",))
+    tracemalloc.start()
+    for k in range(5000):
+        samples.append(a_sample(k % 10, (0.0,)))
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert size < 5000 * 1.2 * 8 * len(COLUMNS)
 
 
 def test_what_is_free_is_no_more_than_the_limits():

@@ -127,7 +127,7 @@ def _molecules(system: System) -> str:
     for k, stage in enumerate(scene.stages):
         how, law = stage_in_words(stage)
         lines += [f"  {k}: {how}", f"     {law}"]
-    lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces and neighbour lists")
+    lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
     if not scene.engine.is_other:
         threads = threads_for(scene.threads)
         lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {PRECISIONS[scene.precision]}")

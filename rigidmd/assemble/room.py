@@ -14,6 +14,7 @@ from rigidmd.core.memory import free_memory, in_words, memory_fault
 from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene
+from rigidmd.units import FEMTOSECOND
 from rigidmd.validation import settled
 
 if TYPE_CHECKING:
@@ -25,6 +26,9 @@ FOR_MOLECULE, FOR_SITE = 200, 130
 FOR_TRAJECTORY = 430
 #: Of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85 kB.
 FOR_SAMPLE = 2700
+#: Of a line of log.csv, which the run keeps as numbers; measured: 300 while it runs, 870 when it is summarised. Of a
+#: frame in a file, whose time is kept.
+FOR_LINE, FOR_FRAME = 870, 150
 FEWER = "take fewer molecules, a smaller box or a shorter cut-off"
 
 
@@ -52,17 +56,42 @@ def check_room(system: "System") -> None:
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
         fault = f"a single array of it needs {in_words(needed)}, and this machine has {in_words(free_memory())} free"
         raise SceneError(system.scene.source, [f"not enough memory: {fault}: {FEWER}"]) from None
+    kept, count = bytes_of_samples(system), count_of(system, system.scene.output.log_interval_ps)
+    if fault := memory_fault(kept, f"a run with {count:.3g} lines in its log"):
+        longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
+        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {longer}"])
     if fault := memory_fault(needed, "the run"):
         raise SceneError(system.scene.source, [f"not enough memory: {fault}: {FEWER}"])
 
 
+def count_of(system: "System", interval: float) -> float:
+    """How often a run is observed at an interval (ps) and at the ends of its stages."""
+    return sum(
+        2 + stage.duration / (interval if stage.is_open else max(interval, stage.timestep_fs * FEMTOSECOND))
+        for stage in system.scene.stages
+    )
+
+
+def bytes_of_samples(system: "System") -> float:
+    """Bytes that the lines of the log and the times of frames take by the end of a run."""
+    output = system.scene.output
+    frames = count_of(system, output.trajectory_interval_ps) if output.trajectory else 0
+    return FOR_LINE * count_of(system, output.log_interval_ps) + FOR_FRAME * frames
+
+
 def bytes_of(system: "System") -> int:
     """Bytes of the arrays of a run. There are three states, the start, the one that moves and the last good one, and
-    two loads, of steps and of looks."""
+    two loads, of steps and of looks; and there are the samples."""
     state = system.state
     written = FOR_TRAJECTORY * system.site_count if system.scene.output.trajectory else 0
     fixed = (system.engine().room(state), system.model)
-    return 3 * array_bytes(state) + 2 * array_bytes(no_load(state)) + array_bytes(fixed) + written
+    return (
+        3 * array_bytes(state)
+        + 2 * array_bytes(no_load(state))
+        + array_bytes(fixed)
+        + written
+        + round(bytes_of_samples(system))
+    )
 
 
 def array_bytes(value: tuple) -> int:

@@ -1,7 +1,9 @@
-"""Samples of a run of molecules, kept as rows and read as columns."""
+"""Samples of a run of molecules: added one by one, read as columns."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from array import array
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from operator import attrgetter
 from typing import Annotated, NamedTuple, get_args, get_type_hints
 
 import numpy as np
@@ -55,10 +57,6 @@ class Sample(NamedTuple):
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
     own: tuple[float, ...] = ()  # energies of the user's own forces, kJ/mol
 
-    def value(self, name: str, own: Sequence[str]) -> float | int | str:
-        """The value of a column; `own` are the names of the user's own forces."""
-        return self.own[own.index(name)] if name in own else getattr(self, name)
-
 
 COLUMNS: dict[str, Column] = {
     name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items() if name != "own"
@@ -73,45 +71,84 @@ def own_columns(own: Sequence[str]) -> dict[str, Column]:
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
 
 
-@dataclass
 class Samples:
-    """The rows of a run, in order."""
+    """The samples of a run in order, kept as a row of float64 each.
 
-    rows: list[Sample] = field(default_factory=list)
-    own: tuple[str, ...] = ()  # names of the user's own forces, whose energies are columns too
+    stages : names of all stages
+    own : names of the user's own forces, whose energies are columns too
+    table : of an earlier `table()`; raises ValueError if it is none
+    """
+
+    def __init__(self, stages: Sequence[str], own: tuple[str, ...] = (), table: np.ndarray | None = None):
+        self.stages, self.own = tuple(stages), own
+        self._numbers = [*NUMBERS, *own]
+        self._values = array("d")  # it grows in place, in the machine's memory as NumPy has it
+        if table is not None:
+            if table.ndim != 2 or table.shape[1] != len(self._numbers) or table.dtype != np.float64:
+                raise ValueError(f"samples have the shape {table.shape}")
+            self._values.frombytes(np.ascontiguousarray(table).reshape(-1).view(np.uint8))
+            if not np.isin(self._column("stage"), np.arange(len(self.stages))).all():
+                raise ValueError("samples are of stages that the scene does not have")
+            step = self._column("step")
+            if not ((np.abs(step) < 2**53) & (np.floor(step) == step)).all():
+                raise ValueError("samples have steps that are not whole numbers")
+
+    def append(self, sample: Sample) -> None:
+        """Add a sample at the end."""
+        self._values.extend((*_VALUES(sample), *sample.own))
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self._values) // len(self._numbers)
 
     def __getitem__(self, column: str) -> np.ndarray:
         """A column as an array (rows,), by the name of a field of `Sample`, in the unit of the log."""
         if column not in self.described:
             raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
-        return np.array([row.value(column, self.own) for row in self.rows])
+        if column == "stage_name":
+            return np.array(self.stages)[self["stage"]]
+        return self._column(column).astype(int if column in ("step", "stage") else float)  # a copy
+
+    def __iter__(self) -> Iterator[Sample]:
+        return map(self.row, range(len(self)))
+
+    @property
+    def rows(self) -> list[Sample]:
+        """All samples, which take five times the memory of the table."""
+        return list(self)
+
+    def row(self, k: int) -> Sample:
+        """Sample k; -1 is the last one."""
+        first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
+        values = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
+        values |= {name: int(values[name]) for name in ("step", "stage")}
+        own = self._values[first + width : first + len(self._numbers)]
+        return Sample(**values, stage_name=self.stages[values["stage"]], own=tuple(own))
+
+    def latest(self, time: float, since: int) -> int:
+        """The last row from `since` on that is not later than a time (ps); `since` if there is none."""
+        width, at = len(self._numbers), self._numbers.index("time")
+        rows = range(len(self))
+        return max(since, bisect_right(rows, time, lo=since, key=lambda k: self._values[k * width + at]) - 1)
+
+    def of_stage(self, k: int) -> "Samples":
+        """The samples of stage k, which follow one another."""
+        found, width = Samples(self.stages, self.own), len(self._numbers)
+        if len(rows := np.flatnonzero(self._column("stage") == k)):
+            found._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
+        return found
 
     def table(self) -> np.ndarray:
-        """All numbers (rows, columns) as float64, which holds every one of them; for `of_table`."""
-        numbers = [*NUMBERS, *self.own]
-        return np.array([[float(row.value(name, self.own)) for name in numbers] for row in self.rows]).reshape(
-            -1, len(numbers)
-        )
+        """All numbers (rows, columns) as float64, which holds every one of them: a copy."""
+        return np.array(self._values, float).reshape(-1, len(self._numbers))
 
-    @classmethod
-    def of_table(cls, table: np.ndarray, stages: Sequence[str], own: tuple[str, ...] = ()) -> "Samples":
-        """The rows of a table; `stages` are the names of all stages, `own` those of the user's own forces.
-
-        Raises ValueError if it is no such table.
-        """
-        if table.ndim != 2 or table.shape[1] != len(NUMBERS) + len(own):
-            raise ValueError(f"samples have the shape {table.shape}")
-        rows = []
-        for values in table.tolist():
-            row = dict(zip(NUMBERS, values[: len(NUMBERS)], strict=True))
-            row |= {name: int(row[name]) for name in ("step", "stage")}
-            rows.append(Sample(**row, stage_name=stages[int(row["stage"])], own=tuple(values[len(NUMBERS) :])))
-        return cls(rows, own)
+    def _column(self, name: str) -> np.ndarray:
+        """A view, which must be gone before the next sample comes."""
+        return np.asarray(self._values)[self._numbers.index(name) :: len(self._numbers)]
 
     @property
     def described(self) -> dict[str, Column]:
         """Name -> column."""
         return COLUMNS | own_columns(self.own)
+
+
+_VALUES = attrgetter(*NUMBERS)

@@ -55,16 +55,15 @@ def summarise(
     minima : results of the stages that are minimisations
     """
     scene = system.scene
-    momentum = samples.rows[-1].momentum
+    last = samples.row(-1)
     stages = [
         (
-            _stage(system, samples.rows, k, computing[k], moves.get(k, (0, 0)))
+            _stage(system, samples, k, computing[k], moves.get(k, (0, 0)))
             if k not in minima
-            else _minimised(system, samples.rows, k, computing[k], minima[k])
+            else _minimised(system, samples, k, computing[k], minima[k])
         )
         | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
-        for k in range(len(computing))
-        if any(sample.stage == k for sample in samples.rows)
+        for k in np.unique(samples["stage"]).tolist()
     ]
     return {
         "interrupted": interrupted,
@@ -81,18 +80,18 @@ def summarise(
         "relief_steps": relief_steps,
         "preparing_s": preparing,
         "wall_s": wall,
-        "largest_orthogonality_error": max(sample.orthogonality for sample in samples.rows),
-        "momentum_u_A_ps": momentum,
-        "momentum_relative": _relative_momentum(system, state, momentum),
+        "largest_orthogonality_error": float(samples["orthogonality"].max()),
+        "momentum_u_A_ps": last.momentum,
+        "momentum_relative": _relative_momentum(system, state, last.momentum),
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
         "own_forces": dict(system.own),
         "momentum_removed": _removed(system, state),
         "stages": stages,
         "notes": [
             *system.notes,
-            *_drifting(system, state, samples.rows[-1]),
+            *_drifting(system, state, last),
             *outgrown_sums(system, state),
-            *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples.rows, k)),
+            *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples, k)),
             *warnings,
         ],
     }
@@ -140,18 +139,18 @@ def outgrown_sums(system: System, state: State) -> list[str]:
     ]
 
 
-def _doubts(system: System, samples: list[Sample], k: int) -> list[str]:
+def _doubts(system: System, samples: Samples, k: int) -> list[str]:
     """What tells that the averages of stage k are wrong: energy that drifts, temperatures that differ.
 
     A thermostat hides the energy that a long step adds: it takes it out again, faster from some motions than from
     others.
     """
-    own = [sample for sample in samples if sample.stage == k]
-    if not own:
+    own = samples.of_stage(k)
+    if not len(own):
         return []
     found, stage = [], system.scene.stages[k]
-    line = slope([s.time for s in own], [s.drift for s in own])
-    thermal = BOLTZMANN / KJ_PER_MOL * (mean([s.temperature for s in own])[0] or 0.0) * system.freedom_in(k).total
+    line = slope(own["time"], own["drift"])
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean(own["temperature"])[0] or 0.0) * system.freedom_in(k).total
     limit = DRIFTS * thermal / 1000  # kJ/mol/ps
     if thermal > 0 and abs(line.value) > limit + SURE * line.error:
         found.append(
@@ -159,16 +158,16 @@ def _doubts(system: System, samples: list[Sample], k: int) -> list[str]:
             "freedom: timestep_fs is too long, or forces jump at the cut-off; a thermostat hides this and leaves "
             "temperatures wrong"
         )
-    late = own[len(own) // 2 :]
-    apart, error = mean([s.temperature_translation - s.temperature_rotation for s in late])
-    if stage.has_thermostat and len(late) >= LEAST and apart is not None and error is not None:
-        level = mean([s.temperature for s in late])[0] or 0.0
+    moving, turning, whole = (
+        own[name][len(own) // 2 :] for name in ("temperature_translation", "temperature_rotation", "temperature")
+    )
+    apart, error = mean(moving - turning)
+    if stage.has_thermostat and len(whole) >= LEAST and apart is not None and error is not None:
+        level = mean(whole)[0] or 0.0
         if abs(apart) > DIFFER * level + SURE * error:
-            moving = mean([s.temperature_translation for s in late])[0]
-            turning = mean([s.temperature_rotation for s in late])[0]
             found.append(
-                f"stages.{k}: in its second half T_trans is {moving:.4g} K and T_rot {turning:.4g} K, which sampling "
-                "does not explain: timestep_fs is too long, or translation and rotation hardly exchange energy"
+                f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {turning.mean():.4g} K, which "
+                "sampling does not explain: timestep_fs is too long, or translation and rotation hardly exchange energy"
             )
     return found
 
@@ -180,18 +179,18 @@ def _relative_momentum(system: System, state: State, momentum: float) -> float:
     return momentum / total if total else 0.0
 
 
-def _stage(system: System, samples: list[Sample], k: int, computing: float, moves: tuple[int, int]) -> dict:
+def _stage(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
     """Values of one stage. Its drift is counted from the last sample before it."""
-    own = [sample for sample in samples if sample.stage == k]
-    before = [sample for sample in samples if sample.stage == k - 1][-1:]
+    own, before = samples.of_stage(k), samples.of_stage(k - 1)
+    first = before.row(-1) if len(before) else own.row(0)
     stage = system.scene.stages[k]
     n = len(system.model.species)
-    steps = own[-1].step - (before or own)[0].step
+    steps = own.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
-    line = slope([s.time for s in before + own], [0.0] * len(before) + [s.drift for s in own])
-    mean_t, error_t = mean([s.temperature for s in own])
-    kinetic = np.array([s.kinetic for s in own])
-    spread = float(kinetic.std())
+    time, drift = own["time"], own["drift"]
+    line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
+    mean_t, error_t = mean(own["temperature"])
+    spread = float(own["kinetic"].std())
     per_molecule = line.value * 1000 / n
     thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom_in(k).total
     per_kt = line.value * 1000 / thermal if thermal > 0 else None
@@ -208,13 +207,13 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float, move
         "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
         "temperature_K": mean_t,
         "temperature_error_K": error_t,
-        "temperature_translation_K": mean([s.temperature_translation for s in own])[0],
-        "temperature_rotation_K": mean([s.temperature_rotation for s in own])[0],
-        "temperature_translation_unbiased_K": mean([s.temperature_translation_unbiased for s in own])[0],
-        "temperature_rotation_unbiased_K": mean([s.temperature_rotation_unbiased for s in own])[0],
-        "potential_kJ_mol_per_molecule": float(np.mean([s.potential for s in own])) / n,
-        "pressure_bar": mean([s.pressure_bar for s in own])[0],
-        "pressure_error_bar": mean([s.pressure_bar for s in own])[1],
+        "temperature_translation_K": mean(own["temperature_translation"])[0],
+        "temperature_rotation_K": mean(own["temperature_rotation"])[0],
+        "temperature_translation_unbiased_K": mean(own["temperature_translation_unbiased"])[0],
+        "temperature_rotation_unbiased_K": mean(own["temperature_rotation_unbiased"])[0],
+        "potential_kJ_mol_per_molecule": float(np.mean(own["potential"])) / n,
+        "pressure_bar": mean(own["pressure_bar"])[0],
+        "pressure_error_bar": mean(own["pressure_bar"])[1],
         **(_of_box(own) if stage.has_barostat else {}),
         "moves_tried": moves[0],
         "moves_accepted": moves[1],
@@ -230,10 +229,11 @@ def _stage(system: System, samples: list[Sample], k: int, computing: float, move
     }
 
 
-def _minimised(system: System, samples: list[Sample], k: int, computing: float, found: Minimum) -> dict:
+def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
     """Figures of a minimisation, at its end; None for those of OF_MOTION."""
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
-    end = [sample for sample in samples if sample.stage == k][-1:]
+    own = samples.of_stage(k)
+    end = Samples(samples.stages, samples.own, own.table()[-1:])
     return dict.fromkeys(OF_MOTION) | {
         "name": stage.label,
         "ensemble": stage.ensemble,
@@ -249,11 +249,11 @@ def _minimised(system: System, samples: list[Sample], k: int, computing: float, 
     }
 
 
-def _of_box(own: list[Sample]) -> dict:
+def _of_box(own: Samples) -> dict:
     """Means of what a barostat changes, with their errors."""
     found = {}
     for name, key in (("density", "density{}_g_cm3"), ("a", "a{}_A"), ("b", "b{}_A"), ("c", "c{}_A")):
-        value, error = mean([getattr(sample, name) for sample in own])
+        value, error = mean(own[name])
         found |= {key.format(""): value, key.format("_error"): error}
     return found
 

@@ -130,7 +130,7 @@ class Sampler(Observer):
 
     def __init__(self, run: "MolecularSimulation", interval: float, check: watch.StepCheck):
         self.interval = interval
-        self.samples = Samples(own=tuple(run.system.own))
+        self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.own))
         self.last_good: Good | None = None
         self._run, self._check = run, check
         self._begins: dict[int, int] = {}  # stage -> row of the sample at which it began
@@ -141,20 +141,18 @@ class Sampler(Observer):
 
     def see(self, moment: Moment) -> None:
         """Raise a `Finding` if the sample or the next step exceeds a limit."""
-        run, now, rows = self._run, moment.sample, self.samples.rows
-        since = self._begins.setdefault(now.stage, max(0, len(rows) - 1))
-        rows.append(now)
+        run, now, samples = self._run, moment.sample, self.samples
+        since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))
+        samples.append(now)
         stage = run.scene.stages[now.stage]
         if stage.has_thermostat:
-            begin, since = since, len(rows) - 1
-            while since > begin and rows[since].time > now.time - stage.thermostat_time:
-                since -= 1
+            since = samples.latest(now.time - stage.thermostat_time, since)
         seen = moment._seen
         if not self._check.thermal:
             self._check.rescale(seen.kinetic)
         if finding := self._check.finding(run.state, seen.load, stage, run.extent):
             raise finding
-        if finding := watch.sample_finding(run.system, run.scene.watch, rows[since], now):
+        if finding := watch.sample_finding(run.system, run.scene.watch, samples.row(since), now):
             raise finding
         self._check.rescale(seen.kinetic)
         self._keep(moment.step, moment.time)
@@ -176,9 +174,8 @@ class Sampler(Observer):
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
         """Restore them. The state of the checkpoint is the last good one."""
-        stages = [stage.label for stage in run.scene.stages]
-        self.samples = Samples.of_table(kept.arrays["samples"], stages, tuple(run.system.own))
-        self._begins = {int(stage): int(row) for stage, row in kept.told["begins"]}
+        self.samples = Samples(self.samples.stages, self.samples.own, kept.arrays["samples"])
+        self._begins = {int(stage): range(len(self.samples))[row] for stage, row in kept.told["begins"]}
         self._check.thermal = kept.told["thermal"]
         self._keep(int(run.state.step[NOW]), float(run.state.time[NOW]))
 
