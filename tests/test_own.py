@@ -226,7 +226,7 @@ def test_any_text_is_read_or_refused_soon(monkeypatch):
 
     of_text(LJ)  # imports SymPy
     monkeypatch.setattr(formulas, "module_of", module)
-    for seed in range(200):
+    for seed in range(300):
         chosen = random.Random(seed)
         text, calls = a_text(chosen, chosen.choice((3, 6, 10, 14, 19))), 0
         sys.setprofile(count)
@@ -241,7 +241,7 @@ def test_any_text_is_read_or_refused_soon(monkeypatch):
             found["refused"] += 1
         finally:
             sys.setprofile(None)
-    assert min(found.values()) > 40
+    assert min(found.values()) > 30
 
 
 def test_a_table_is_as_good_as_it_says():
