@@ -14,6 +14,7 @@ from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import Kind, principal_frame, rotational_freedom
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 from rigidmd.validation import (
+    Line,
     NonNegative,
     Number,
     Positive,
@@ -95,7 +96,7 @@ GROUPS = ("water", "ion", "noble gas", "gas", "organic", "other")
 class MoleculeFile(Section):
     """A file of `models/`."""
 
-    name: str = Field(min_length=1)
+    name: Line = Field(min_length=1)
     title: str = ""
     group: Literal[GROUPS] = "other"  # type: ignore[valid-type]
     """Group in the list of `rigidmd models`"""

@@ -36,6 +36,10 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
+#: A name or a path: without line ends and other characters that no terminal shows.
+Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max_length=4096)]
+
+
 def settled(value: T | None) -> T:
     """A value that may be left out of a scene, but is there where it is used: in a validated and resolved one."""
     assert value is not None, "the scene is not validated or not resolved"
@@ -152,6 +156,8 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
             return f"is {shown}, must not be more than {context['le']:g}"
         case "string_pattern_mismatch" if "!-~" in context["pattern"]:
             return f"is {shown}, must be one to five visible ASCII characters without spaces"
+        case "string_pattern_mismatch" if "x1f" in context["pattern"]:
+            return f"is {shown}, must be one line without control characters"
         case "value_error":
             return str(context["error"])
     return f"is {shown}: {detail['msg']}"

@@ -2,8 +2,13 @@
 
 import functools
 import math
+import random
+import re
 import runpy
+import sys
+from collections import Counter
 from math import cos, exp, log, sin
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numba
@@ -20,6 +25,7 @@ from rigidmd.compile import kernel, lanes
 from rigidmd.compile.numba_private import Index
 from rigidmd.core import own_code
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.forces.laws import formulas
 from rigidmd.forces.laws.endings import NAMES, Plain, ending
 from rigidmd.forces.laws.formulas import FormulaError, of_function, of_table, of_text
 from rigidmd.forces.laws.lennard_jones import energy_and_force as of_built_in
@@ -143,17 +149,99 @@ def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
         ("r.real", "no place in a formula"),
         ("tan(r)", "not a function of one number"),
         ("A + B", "does not depend on the distance"),
-        ("r**9**9**9", "beyond 200"),
+        ("r**9**9**9", "9 ** 9 ** 9 is no finite real number"),
         ("r/0", "divides by 0"),
-        ("1e999*r", "no finite number"),
+        ("1e999*r", "no real number"),
+        ("((((9**200)**200)**200)**200)/r", "(9 ** 200) ** 200 is no finite real number"),
+        ("sin((1e8**200)**200)/r", "100000000.0 ** 200 is no finite real number"),
+        ("((9**200*r)**200)**200", "has numbers of more than 300 digits"),
+        ("exp(999999999*log(9*r))", "has numbers of more than 300 digits"),
+        ("((r**200)**200)**200", "beyond 200"),
+        ("sin(exp(exp(exp(9))))/r", "exp(exp(9)) is no finite real number"),
+        ("(-8)**(1/3)*r", "no real number"),
+        ("r*log(0)", "no finite real number"),
+        ("9" * 4500 + "*r", "characters"),
+        ("9" * 400 + "*r", "no finite real number"),
+        ("log(" * 21 + "r" + ")" * 21, "more than 20 functions"),
+        ("1/(r+" * 11 + "r" + ")" * 11, "more than 20 functions"),
         ("+".join(["r"] * 2000), "characters"),
         ("(" * 150 + "r" + ")" * 150 + "**", "not a formula"),
         ("*".join(f"(r+{k})" for k in range(100)), "more than 200"),
     ],
 )
 def test_a_text_that_is_no_formula_is_told(energy, word):
-    with pytest.raises(FormulaError, match=word.replace("(", r"\(")):
+    with pytest.raises(FormulaError, match=re.escape(word)):
         of_text(energy)
+
+
+@pytest.mark.parametrize(
+    ("energy", "given", "r"),
+    [
+        ("(r - 20)**0.5", {}, 3.3),
+        ("log(r - 20)", {}, 3.3),
+        ("sqrt(eps)/r", {"eps": -1.0}, 3.3),
+        ("eps**0.5/r", {"eps": -1.0}, 3.3),
+        ("exp(r**3)", {}, 20.0),
+        ("1/(r - 2)", {}, 2.0),
+    ],
+)
+def test_an_energy_that_is_not_real_is_refused_where_it_is_asked_for(energy, given, r):
+    with pytest.raises(FormulaError, match=f"no finite real value at r = {r:g}"):
+        of_text(energy).radial(given)(r)
+
+
+NUMBERS = ("0", "1", "2", "0.5", "1/3", "9", "200", "199", "1e8", "1e-8", "1e200", "999999999", "1" * 20, "1e-300", "pi",
+           "-1", "-7.5", "1e308", "9" * 300)  # fmt: skip
+#: Calls of Python that reading and differentiating a text may take: two seconds or so.
+MOST_CALLS = 5_000_000
+
+
+def a_text(chosen: random.Random, depth: int) -> str:
+    """A text that may be a formula, with numbers and nesting that hurt."""
+    if depth <= 0 or chosen.random() < 0.1:
+        return chosen.choice(NUMBERS if chosen.random() < 0.4 else ("r", "r", "r", "A", "sig"))
+    first = a_text(chosen, depth - 1)
+    match chosen.randrange(9):
+        case 0 | 1 | 2:
+            return f"{chosen.choice(('exp', 'log', 'sqrt', 'sin', 'cos'))}({first})"
+        case 3 | 4:
+            return f"({first})**({chosen.choice(NUMBERS) if chosen.random() < 0.7 else a_text(chosen, depth // 3)})"
+        case 5:
+            return f"1/(r + {first})"
+    return f"({first}){chosen.choice('+-*/')}({a_text(chosen, chosen.choice((depth - 1, depth // 3, 1)))})"
+
+
+def test_any_text_is_read_or_refused_soon(monkeypatch):
+    found, calls = Counter(), 0
+
+    def module(source, name):  # nothing is kept
+        compile(source, name, "exec")
+        return SimpleNamespace(Formula=tuple)
+
+    def count(frame, event, argument):
+        nonlocal calls
+        calls += event == "call"
+        if calls > MOST_CALLS:
+            raise TimeoutError
+
+    of_text(LJ)  # imports SymPy
+    monkeypatch.setattr(formulas, "module_of", module)
+    for seed in range(300):
+        chosen = random.Random(seed)
+        text, calls = a_text(chosen, chosen.choice((3, 6, 10, 14, 19))), 0
+        sys.setprofile(count)
+        try:
+            formula = of_text(text)
+            for r in (0.3, 3.0, 30.0):
+                values = [*formula.radial(dict.fromkeys(formula.parameters, 1.5))(r)]
+                values += formula.numbers(dict.fromkeys(formula.parameters, -1.5))
+                assert all(type(value) is float for value in values)
+            found["read"] += 1
+        except FormulaError:
+            found["refused"] += 1
+        finally:
+            sys.setprofile(None)
+    assert min(found.values()) > 30
 
 
 def test_a_table_is_as_good_as_it_says():

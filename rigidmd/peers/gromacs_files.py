@@ -4,7 +4,6 @@ GROMACS keeps distances: of two points by a constraint, and of three by SETTLE, 
 linear bodies and for those whose mass is in a plane, with all other sites virtual. Its units are nm, ps, u, e, kJ/mol.
 """
 
-import re
 from math import inf
 from pathlib import Path
 from shlex import quote
@@ -18,6 +17,7 @@ from rigidmd.forces.laws.coulomb import ReactionField
 from rigidmd.forces.laws.screened import ScreenedCoulomb
 from rigidmd.forces.waves.mesh import Pme
 from rigidmd.molecules import Molecule, of_each
+from rigidmd.output.plain_text import as_word, distinct, in_comment
 from rigidmd.peers.bodies import Bodies, Points
 from rigidmd.peers.mass_points import SAME, MassPoints, mass_points
 from rigidmd.peers.portrait import Portrait, strange
@@ -107,7 +107,7 @@ def write_gromacs(folder: Path, portrait: Portrait, state: State) -> list[str]:
     """Write the files for a system that begins at a state; their names. Raises OutputError."""
     bodies = [_body(m) for m in portrait.system.species]
     stages = [(k, stage) for k, stage in enumerate(portrait.system.scene.stages) if not stage.is_minimisation]
-    names = [f"{n}_{re.sub('[^A-Za-z0-9]+', '_', stage.label)}" for n, (_, stage) in enumerate(stages, 1)]
+    names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
     text = {
         COORDINATES: _coordinates(portrait, bodies, state),
         TOPOLOGY: _topology(portrait, bodies),
@@ -154,11 +154,11 @@ def _coordinates(portrait: Portrait, bodies: list[MassPoints], state: State) -> 
     for n, k in enumerate(species):
         m = system.species[k]
         count, added = len(m.masses), _extra(m, bodies[k])
-        names = [*m.site_names, *(f"P{j + 1}" for j in range(added))]
+        names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
         place = np.concatenate([at[s : s + count], more[e : e + added]])
         speed = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
         for name, x, v in zip(names, place, speed, strict=True):
-            head = f"{(n + 1) % 100000:5d}{m.residue_names[0]:<5}{name:>5}{(len(rows) + 1) % 100000:5d}"
+            head = f"{(n + 1) % 100000:5d}{as_word(m.residue_names[0]):<5}{name:>5}{(len(rows) + 1) % 100000:5d}"
             where = "".join(f"{value * NM:{width}.{DECIMALS}f}" for value in x)
             rows.append(head + where + "".join(f"{value * NM:{width}.{DECIMALS + 1}f}" for value in v))
         s, e = s + count, e + added
@@ -179,11 +179,17 @@ def _points_at(portrait: Portrait, points: Points, state: State) -> tuple[np.nda
 def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
     """The .top file: kinds of sites, all parameters between them, molecules."""
     system, kinds = portrait.system, portrait.kinds
-    lines = [f"; {system.scene.in_short}", "; Written by rigidmd.", "", "[ defaults ]", "; nbfunc comb-rule gen-pairs"]
+    lines = [
+        f"; {in_comment(system.scene.in_short)}",
+        "; Written by rigidmd.",
+        "",
+        "[ defaults ]",
+        "; nbfunc comb-rule gen-pairs",
+    ]
     lines += ["1 2 no", "", "[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
     rows = [(portrait.sigma[k, k] * NM, portrait.epsilon[k, k] / KJ_PER_MOL) for k in range(len(kinds))]
     lines += [
-        f"K{k + 1} {kind.mass:.10g} 0 A {sigma:.12g} {epsilon:.12g} ; {kind.name}"
+        f"K{k + 1} {kind.mass:.10g} 0 A {sigma:.12g} {epsilon:.12g} ; {in_comment(kind.name)}"
         for k, (kind, (sigma, epsilon)) in enumerate(zip(kinds, rows, strict=True))
     ]
     if any(_extra(m, body) for m, body in zip(system.species, bodies, strict=True)):
@@ -194,23 +200,17 @@ def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
         for i in range(len(kinds))
         for j in range(i, len(kinds))
     ]
-    index = system.model.species
+    index, names = system.model.species, distinct([m.name for m in system.species])
     for k in sorted(set(index.tolist())):
         first = int(np.flatnonzero(index == k)[0])
         start = int(np.searchsorted(system.sites.molecule, first))
         own = portrait.kind[start : start + len(system.species[k].masses)]
-        lines += ["", *_molecule(portrait, system.species[k], bodies[k], own, _name(system.species, k))]
+        lines += ["", *_molecule(portrait, system.species[k], bodies[k], own, names[k])]
     lines += ["", "[ system ]", f"{system.scene.name}", "", "[ molecules ]"]
     ends = np.flatnonzero(np.diff(index, append=-1)) + 1
     for begin, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
-        lines.append(f"{_name(system.species, int(index[begin]))} {end - begin}")
+        lines.append(f"{names[index[begin]]} {end - begin}")
     return "\n".join(lines) + "\n"
-
-
-def _name(species: list[Molecule], k: int) -> str:
-    """Name of a species as one word, its own."""
-    names = [re.sub("[^A-Za-z0-9_]", "_", m.name) for m in species]
-    return names[k] if names.count(names[k]) == 1 else f"{names[k]}_{k + 1}"
 
 
 def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
@@ -221,10 +221,10 @@ def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarra
     mass = np.zeros(count + _extra(m, body))
     mass[where] = body.mass
     types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra(m, body)]
-    names = [*m.site_names, *(f"P{j + 1}" for j in range(_extra(m, body)))]
+    names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra(m, body)))]
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     lines += [
-        f"{i + 1} {types[i]} 1 {m.residue_names[0]} {names[i]} 1 {charges[i] if i < count else 0.0:.12g} {mass[i]:.12g}"
+        f"{i + 1} {types[i]} 1 {as_word(m.residue_names[0])} {names[i]} 1 {charges[i] if i < count else 0.0:.12g} {mass[i]:.12g}"
         for i in range(len(mass))
     ]
     at = [int(p) + 1 for p in where]

@@ -12,6 +12,7 @@ from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
 from rigidmd.forces.laws.endings import Plain
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
+from rigidmd.output.plain_text import in_comment
 from rigidmd.peers.formulas import coulomb_formula, lennard_jones_formula
 from rigidmd.peers.portrait import Portrait, strange
 from rigidmd.peers.tables import table
@@ -116,7 +117,7 @@ def write_data(path: Path, portrait: Portrait, state: State) -> None:
     else:
         lines += _bounds(position.min(axis=0) - 1, position.max(axis=0) + 1)
     lines += ["", "Masses", ""]
-    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {kind.name}" for k, kind in enumerate(portrait.kinds)]
+    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(portrait.kinds)]
     lines += ["", "Atoms # full", ""]
     charge = portrait.charge
     rows = zip(system.sites.molecule + 1, portrait.kind + 1, charge, position, image, strict=True)
@@ -349,7 +350,7 @@ def input_script(portrait: Portrait) -> str:
     """The whole run: settings, and every stage that is not a minimisation."""
     system, output = portrait.system, portrait.system.scene.output
     lines = [
-        f"# {system.scene.in_short}",
+        f"# {in_comment(system.scene.in_short)}",
         "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps",
         "",
         f"include {SETTINGS}",
@@ -363,7 +364,12 @@ def input_script(portrait: Portrait) -> str:
         every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
         frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
         fixes = movers(portrait, k)
-        lines += ["", f"# {stage.label}: {stage.duration:g} ps", f"timestep {_n(stage.timestep_fs)}", *fixes]
+        lines += [
+            "",
+            f"# {in_comment(stage.label)}: {stage.duration:g} ps",
+            f"timestep {_n(stage.timestep_fs)}",
+            *fixes,
+        ]
         lines += [f"thermo {every}"]
         if output.trajectory:
             lines += [f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"]

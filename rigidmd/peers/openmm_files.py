@@ -1,10 +1,12 @@
 """A folder with which OpenMM runs a system by itself: system, integrators and state as XML, and a script."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigidmd.core.files import whole_file
 from rigidmd.core.state import State
+from rigidmd.output.plain_text import in_comment
 from rigidmd.peers import openmm_system as parts
 from rigidmd.peers.openmm import Held, held
 from rigidmd.peers.openmm_stages import KICK, MOVES, TOLERANCES, integrator_of, movers
@@ -20,6 +22,7 @@ TEXT = '''"""{title}
 Written by rigidmd. It needs OpenMM alone:  python run.py [CPU|CUDA|OpenCL|HIP|Reference]
 """
 
+import csv
 import sys
 
 import openmm as mm
@@ -50,7 +53,8 @@ platform = mm.Platform.getPlatformByName(sys.argv[1] if len(sys.argv) > 1 else "
 topology, state = app.PDBFile("{topology}").topology, load("{state}")
 trajectory = None
 with open("log.csv", "w") as log, open("trajectory.dcd", "wb") as frames:
-    print("stage,step,potential_kJ_mol,kinetic_kJ_mol,volume_A3", file=log)
+    lines = csv.writer(log, lineterminator="\\n")
+    lines.writerow(["stage", "step", "potential_kJ_mol", "kinetic_kJ_mol", "volume_A3"])
     for name, steps, every, frame, file, others in STAGES:
         system, integrator = load("{system}"), load(file)
         for other in others:
@@ -70,7 +74,8 @@ with open("log.csv", "w") as log, open("trajectory.dcd", "wb") as frames:
             if done % every == 0:
                 energies = [e._value for e in (state.getPotentialEnergy(), state.getKineticEnergy())]
                 volume = state.getPeriodicBoxVolume()._value * 1e3
-                print(name, done, *energies, volume, sep=",", file=log, flush=True)
+                lines.writerow([name, done, *energies, volume])
+                log.flush()
             if done % frame == 0:
                 trajectory.writeModel(state.getPositions(), periodicBoxVectors=state.getPeriodicBoxVectors())
 with open("final.xml", "w") as file:
@@ -110,9 +115,8 @@ def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
         )
         rows.append(f"    {(stage.label, stage.steps, every, frame, file, others)!r},")
     names = {"system": SYSTEM, "state": STATE, "topology": TOPOLOGY, "kick": KICK, "moves": MOVES}
-    text[SCRIPT] = TEXT
-    for name, value in {"title": scene.in_short, "stages": "\n".join(rows), **names}.items():
-        text[SCRIPT] = text[SCRIPT].replace(f"{{{name}}}", value)
+    values = {"title": in_comment(scene.in_short), "stages": "\n".join(rows), **names}
+    text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda found: values[found[1]], TEXT)
     for name, content in text.items():
         with whole_file(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")

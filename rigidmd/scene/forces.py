@@ -7,7 +7,7 @@ from pydantic import Field, Strict, model_validator
 
 from rigidmd.core.toml_text import shortened
 from rigidmd.molecules import Mixing
-from rigidmd.validation import MOST_TABLES, Count, Flag, NonNegative, Number, Positive, Section
+from rigidmd.validation import MOST_TABLES, Count, Flag, Line, NonNegative, Number, Positive, Section
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
@@ -60,7 +60,7 @@ class CustomForce(Section):
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
     """Name in the log; with `module` also that of the object in it"""
-    module: str | None = None
+    module: Line | None = None
     """Python file in the scene's folder. It is code, and runs only with --trust FILE"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
     """Without a module: energy of a pair of sites (kJ/mol) of their distance r (Å) and named parameters, such as

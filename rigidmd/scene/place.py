@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, Strict, model_validator
 
 from rigidmd.molecules import SiteName
-from rigidmd.validation import Count, Flag, NonNegative, Positive, Section
+from rigidmd.validation import Count, Flag, Line, NonNegative, Positive, Section
 
 #: Endings of LAMMPS' data files.
 LAMMPS_DATA = (".data", ".lmp", ".lammps")
@@ -23,10 +23,10 @@ Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 class Structure(Section):
     """Positions at the start from a file."""
 
-    file: str
+    file: Line
     """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, a trajectory (.xtc .trr
     .gsd .traj .dcd .nc), or `final.npz` of an earlier run; beside or below the scene"""
-    topology: str | None = None
+    topology: Line | None = None
     """Of a trajectory that has no names (all but .gsd): a structure file with the names of its atoms, in their order.
     Default: topology.gro or topology.pdb beside it, as in the folder of a run"""
     frame: Annotated[int, Strict()] | None = None

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.molecules import Site, SiteName, model_fault
-from rigidmd.validation import Count, Flag, Positive, Section
+from rigidmd.validation import Count, Flag, Line, Positive, Section
 
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
@@ -20,13 +20,13 @@ class Molecules(Section):
 
     model: str | None = None
     """A shipped model; `rigidmd models` lists them"""
-    file: str | None = None
+    file: Line | None = None
     """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with `sites` for its atoms"""
-    name: str | None = None
+    name: Line | None = None
     """Name of the species; default: that of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
     """Sites of your own molecule; with a geometry `file`, their parameters by atom name or element"""
-    parameters: str | None = None
+    parameters: Line | None = None
     """A .toml file with entries like those of `sites`, which several molecules may share. It supplies missing keys by
     atom name or element"""
     masses_u: dict[str, Positive] | None = Field(default=None, min_length=1)

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.schemes import AUTO, SCHEMES, WITH_BATH, Rotor, Scheme, auto_faults, rotor_fault
-from rigidmd.validation import Count, Number, Positive, Section
+from rigidmd.validation import Count, Line, Number, Positive, Section
 
 MOST_STEPS = 1e12
 
@@ -70,7 +70,7 @@ REFUSED = {
 class Stage(Section):
     """A part of a run with one ensemble and one time step."""
 
-    name: str | None = None
+    name: Line | None = None
     """Name of the stage; default: that of the ensemble"""
     ensemble: Ensemble = "nve"
     """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and

@@ -1,6 +1,7 @@
 """The commands `export` and `verify`, by which a scene goes to another engine. They print and never compute."""
 
 import argparse
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def _export(options: argparse.Namespace) -> int:
     print(f"{scene.name} for {done.title} in {folder}: {', '.join(done.files)}")
     for note in done.notes:
         print(f"  {note}")
-    print(f"next:\n  cd {folder} && {done.command}")
+    print(f"next:\n  cd {shlex.quote(str(folder))} && {done.command}")
     return 0
 
 

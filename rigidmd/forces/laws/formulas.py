@@ -11,7 +11,8 @@ import itertools
 import keyword
 import re
 from collections.abc import Callable, Mapping, Sequence
-from math import inf, isfinite
+from math import copysign, cos, exp, inf, isfinite, log, log10, pi, sin, sqrt
+from operator import add, mul, sub, truediv
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.interpolate import CubicSpline
 from rigidmd.compile import implements, is_a
 from rigidmd.compile.own import foreign
 from rigidmd.core.own_code import module_of
+from rigidmd.core.toml_text import cut
 from rigidmd.errors import told
 from rigidmd.forces.laws.own import Table, Tabulated, of_distance
 from rigidmd.units import KJ_PER_MOL
@@ -27,10 +29,13 @@ from rigidmd.units import KJ_PER_MOL
 if TYPE_CHECKING:
     import sympy
 
-#: Functions that the text of an energy may name.
-FUNCTIONS = ("exp", "log", "sqrt", "sin", "cos")
+#: Functions and operators that the text of an energy may have.
+FUNCTIONS = {"exp": exp, "log": log, "sqrt": sqrt, "sin": sin, "cos": cos}
+OPERATORS = {ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.Pow: pow}
 DISTANCE = "r"
-LONGEST_TEXT, LARGEST_POWER, MOST_NODES = 2000, 200, 200
+LONGEST_TEXT, LARGEST_POWER, MOST_NODES, DEEPEST = 2000, 200, 200, 20
+#: Decimal digits that numbers of a formula may have before or behind the point, powers of them multiplied out.
+MOST_DIGITS = 300
 #: Function of a distance (Å) that gives the energy v, -v' and -v'', in u Å²/ps².
 Radial = Callable[[float], tuple[float, float, float]]
 #: Values of r² in a table, equally spaced.
@@ -63,37 +68,104 @@ def of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formul
     """
     import sympy
 
-    found = _parsed(energy, constants or {})
-    r = sympy.Symbol(DISTANCE, positive=True)
-    if r not in found.free_symbols:
-        raise FormulaError(f"{energy!r} does not depend on the distance {DISTANCE}")
-    symbols = sorted(found.free_symbols - {r}, key=str)
-    u = sympy.Add(*(round(KJ_PER_MOL) * term for term in _terms(found, r)))
-    hoisted, total = _hoisted(u, r)
-    force = sympy.Add(*(-r * sympy.diff(term, r) for term in sympy.Add.make_args(total)))  # force/r is 1/r² times this
-    fields = sorted((total.free_symbols | force.free_symbols) - {r}, key=str)
-    module = module_of(_source(energy, total, force, fields, r).encode(), f"<law {energy}>")
-    of_pair = sympy.lambdify([symbols], [hoisted.get(symbol, symbol) for symbol in fields], "math")
-    at = sympy.lambdify([symbols, r], [u, -sympy.diff(u, r), -sympy.diff(u, r, 2)], "math")
-    names = tuple(symbol.name[len(OWN) :] for symbol in symbols)
+    try:
+        found = _parsed(energy, constants or {})
+        r = sympy.Symbol(DISTANCE, positive=True)
+        if r not in found.free_symbols:
+            raise FormulaError(f"{energy!r} does not depend on the distance {DISTANCE}")
+        symbols = sorted(found.free_symbols - {r}, key=str)
+        u = sympy.Add(*(round(KJ_PER_MOL) * term for term in _terms(found, r)))
+        hoisted, total = _hoisted(u, r)
+        of: dict[sympy.Expr, sympy.Expr] = {}
+        terms = sympy.Add.make_args(total)
+        force = sympy.Add(*(-r * _derivative(term, r, of) for term in terms))  # force/r is 1/r² times this
+        fields = sorted((total.free_symbols | force.free_symbols) - {r}, key=str)
+        source = _source(energy, total, force, fields, r)
+    except FormulaError:
+        raise
+    except (ArithmeticError, ValueError, TypeError, RecursionError, MemoryError) as error:  # of SymPy and mpmath
+        raise FormulaError(f"{energy!r} cannot be differentiated: {told(error)}") from None
+    module = module_of(source.encode(), f"<law {energy}>")
+    names = {symbol.name[len(OWN) :]: symbol for symbol in symbols}
 
     def numbers(given: Mapping[str, float]) -> tuple[float, ...]:
-        return tuple(float(x) for x in of_pair([given[name] for name in names])) or (0.0,)
+        values = {symbol: given[name] for name, symbol in names.items()}
+        return tuple(_jet(hoisted.get(symbol, symbol), values, r, 0.0)[0] for symbol in fields) or (0.0,)
 
     def radial(given: Mapping[str, float]) -> Radial:
-        values = [given[name] for name in names]
+        values = {symbol: given[name] for name, symbol in names.items()}
 
         def value(distance: float) -> tuple[float, float, float]:
-            v, f, slope = at(values, float(distance))
-            return float(v), float(f), float(slope)
+            v, first, second = _jet(u, values, r, float(distance))
+            return v, -first, -second
 
         return value
 
-    return Formula(energy, names, numbers, radial, module.Formula)
+    return Formula(energy, tuple(names), numbers, radial, module.Formula)
 
 
 #: Before the names of a formula's own parameters, which then differ from all others.
 OWN, HOISTED = "own_", "whole_"
+
+
+def _derivative(e: "sympy.Expr", r: "sympy.Symbol", known: "dict[sympy.Expr, sympy.Expr]") -> "sympy.Expr":
+    """The derivative by r. SymPy's own asks for signs of all that it makes, which takes 2**depth."""
+    import sympy
+
+    if e not in known:
+        args, inner = e.args, [_derivative(part, r, known) for part in e.args]
+        if not inner:
+            found = sympy.Integer(e == r)
+        elif e.is_Add:
+            found = sympy.Add(*inner)
+        elif e.is_Mul:
+            found = sympy.Add(*(sympy.Mul(*args[:k], d, *args[k + 1 :]) for k, d in enumerate(inner) if d != 0))
+        elif e.is_Pow and inner[1] == 0:
+            found = args[1] * args[0] ** (args[1] - 1) * inner[0]
+        elif e.is_Pow:
+            found = e * (inner[1] * sympy.log(args[0]) + inner[0] * args[1] / args[0])
+        else:
+            found = e.fdiff(1) * inner[0]
+        known[e] = found
+    return known[e]
+
+
+def _jet(e: "sympy.Expr", values: "Mapping[sympy.Symbol, float]", r: "sympy.Symbol", x: float) -> tuple:
+    """An expression at r = x with its first and second derivative. Raises FormulaError where it is not real."""
+    if e.is_Symbol:
+        return (x, 1.0, 0.0) if e == r else (values[e], 0.0, 0.0)
+    if not e.args:
+        return float(e), 0.0, 0.0
+    parts = [_jet(part, values, r, x) for part in e.args]
+    if e.is_Add:
+        return tuple(map(sum, zip(*parts, strict=True)))
+    a, b, c = parts[0]
+    if e.is_Mul:
+        for u, v, w in parts[1:]:
+            a, b, c = a * u, b * u + a * v, c * u + 2 * b * v + a * w
+        return a, b, c
+    try:
+        if e.is_Pow and parts[1][1:] == (0.0, 0.0):
+            n = parts[1][0]
+            f = [a**n, n * a ** (n - 1) if n else 0.0, n * (n - 1) * a ** (n - 2) if n * (n - 1) else 0.0]
+        elif e.is_Pow:  # the exponential of n log(a)
+            n, m, k = parts[1]
+            a, b, c = n * log(a), m * log(a) + n * b / a, k * log(a) + 2 * m * b / a + n * (c / a - (b / a) ** 2)
+            f = [exp(a)] * 3
+        else:
+            f = {
+                "exp": lambda: [exp(a)] * 3,
+                "log": lambda: [log(a), 1 / a, -1 / a**2],
+                "sin": lambda: [sin(a), cos(a), -sin(a)],
+                "cos": lambda: [cos(a), -sin(a), -cos(a)],
+                "Abs": lambda: [abs(a), copysign(1.0, a), 0.0],  # SymPy makes it of (sig**2)**x
+            }[e.func.__name__]()
+        if any(isinstance(value, complex) for value in f):
+            raise ValueError
+    except (ArithmeticError, ValueError, KeyError):
+        where = f" at {DISTANCE} = {x:g} Å" if x else ""
+        raise FormulaError(f"it has no finite real value{where}") from None
+    return f[0], f[1] * b, f[2] * b * b + f[1] * c
 
 
 def _terms(u: "sympy.Expr", r: "sympy.Symbol") -> "list[sympy.Expr]":
@@ -242,57 +314,105 @@ def _parsed(energy: str, constants: Mapping[str, float]) -> "sympy.Expr":
         reserved = [word for word in re.findall(r"[^\W\d]\w*", energy) if keyword.iskeyword(word)]
         why = f": {reserved[0]} is a reserved word of Python" if reserved else ""
         raise FormulaError(f"{energy!r} is not a formula such as A*exp(-B*r) - C/r**6{why}") from None
-    operators = {ast.Add: "__add__", ast.Sub: "__sub__", ast.Mult: "__mul__", ast.Div: "__truediv__"}
-    functions = {name: getattr(sympy, name) for name in FUNCTIONS}
-
-    def number(x: float) -> "sympy.Expr":
-        if not isfinite(x):
-            raise FormulaError(f"{x} is no finite number")
-        return sympy.Integer(int(x)) if x == int(x) and abs(x) < 1e9 else sympy.Float(x)
-
-    def read(node: ast.AST) -> "sympy.Expr":
-        match node:
-            case ast.Constant(value=int() | float() as x) if not isinstance(x, bool):
-                return number(x)
-            case ast.Name(id=name) if name == DISTANCE:
-                return sympy.Symbol(DISTANCE, positive=True)
-            case ast.Name(id="pi"):
-                return sympy.pi
-            case ast.Name(id=name) if name in constants:
-                return number(constants[name])
-            case ast.Name(id=name):
-                return sympy.Symbol(f"{OWN}{name}", real=True)
-            case ast.UnaryOp(op=ast.USub(), operand=of):
-                return -read(of)
-            case ast.UnaryOp(op=ast.UAdd(), operand=of):
-                return read(of)
-            case ast.BinOp(op=ast.Pow(), left=left, right=right):
-                base, exponent = read(left), read(right)
-                if exponent.is_number and not abs(float(exponent)) <= LARGEST_POWER:
-                    raise FormulaError(f"{ast.unparse(node)} is a power beyond {LARGEST_POWER}")
-                return base**exponent
-            case ast.BinOp(op=op, left=left, right=right) if type(op) in operators:
-                first, second = read(left), read(right)
-                if isinstance(op, ast.Div) and second == 0:
-                    raise FormulaError(f"{ast.unparse(node)} divides by 0")
-                return getattr(first, operators[type(op)])(second)
-            case ast.Call(func=ast.Name(id=name), args=[of], keywords=[]) if name in functions:
-                return functions[name](read(of))
-            case ast.BinOp(op=ast.BitXor()):
-                raise FormulaError(f"{ast.unparse(node)}: powers are written **, as in r**6")
-            case ast.Call(func=ast.Name(id=name)):
-                raise FormulaError(f"{name} is not a function of one number among {', '.join(FUNCTIONS)}")
-        raise FormulaError(f"{ast.unparse(node)} has no place in a formula")
-
     if sum(1 for _ in ast.walk(tree)) > MOST_NODES:
         raise FormulaError(f"it has more than {MOST_NODES} numbers, names and operations")
-    try:
-        found = read(tree.body)
-    except (RecursionError, OverflowError):
-        raise FormulaError("it is too deep") from None
+    found = _read(tree.body, constants, 0).value
     if found.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         raise FormulaError(f"{energy!r} is not finite")
     return found
+
+
+class _Part(NamedTuple):
+    """A part of a formula."""
+
+    value: "sympy.Expr"
+    number: float | None  # of a part that is a number
+    digits: float  # most decimal digits that a number in it may have, before or behind the point
+    power: float = 1.0  # largest product of whole exponents
+    has_log: bool = False  # exponentials of logarithms become powers
+
+
+def _number(x: float, what: str) -> _Part:
+    """A number of a formula. Raises FormulaError."""
+    import sympy
+
+    if isinstance(x, complex) or not isfinite(x) or (x and not abs(log10(abs(x))) <= MOST_DIGITS):
+        raise FormulaError(f"{what} is no real number between 1e-{MOST_DIGITS} and 1e{MOST_DIGITS}")
+    whole = 2 * x == int(2 * x) and abs(x) < 1e9  # and halves, for square roots
+    return _Part(sympy.Rational(int(2 * x), 2) if whole else sympy.Float(x), x, abs(log10(abs(x))) if x else 0.0)
+
+
+def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
+    """A node of a formula as SymPy has it. Numbers are computed here: those of SymPy are exact, and may be too long for
+    any memory. Raises FormulaError."""
+    import sympy
+
+    def inner(of: ast.AST, more: int = 1) -> _Part:
+        return _read(of, constants, depth + more)
+
+    if depth > DEEPEST:
+        raise FormulaError(f"it has more than {DEEPEST} functions, powers and brackets inside one another")
+    what = cut(ast.unparse(node))
+    try:
+        match node:
+            case ast.Constant(value=int() | float() as x) if not isinstance(x, bool):
+                return _number(float(x), what)
+            case ast.Name(id=name) if name == DISTANCE:
+                return _Part(sympy.Symbol(DISTANCE, positive=True), None, 0.0)
+            case ast.Name(id="pi"):
+                return _number(pi, what)
+            case ast.Name(id=name) if name in constants:
+                return _number(constants[name], what)
+            case ast.Name(id=name):
+                return _Part(sympy.Symbol(f"{OWN}{name}", real=True), None, 0.0)
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd() as op, operand=of):
+                part, sign = inner(of, 0), 1 if isinstance(op, ast.UAdd) else -1
+                return part._replace(value=sign * part.value, number=part.number and sign * part.number)
+            case ast.BinOp(op=ast.BitXor()):
+                raise FormulaError(f"{what}: powers are written **, as in r**6")
+            case ast.BinOp(op=op, left=left, right=right) if type(op) in OPERATORS:
+                is_power = isinstance(op, ast.Pow)
+                return _combined(OPERATORS[type(op)], inner(left, int(is_power)), inner(right), is_power, what)
+            case ast.Call(func=ast.Name(id=name), args=[of], keywords=[]) if name in FUNCTIONS:
+                part = inner(of)
+                if part.number is not None:
+                    return _number(FUNCTIONS[name](part.number), what)
+                if name == "sqrt":
+                    return part._replace(value=sympy.sqrt(part.value))
+                digits = part.digits * (10 ** min(part.digits, 9) if name == "exp" and part.has_log else 1)
+                _check(digits, part.power, what)
+                value = getattr(sympy, name)(part.value)
+                return _Part(value, None, digits, part.power, part.has_log or name == "log")
+            case ast.Call(func=ast.Name(id=name)):
+                raise FormulaError(f"{name} is not a function of one number among {', '.join(FUNCTIONS)}")
+    except ZeroDivisionError:
+        raise FormulaError(f"{what} divides by 0") from None
+    except (OverflowError, ValueError) as error:
+        if isinstance(error, FormulaError):
+            raise
+        raise FormulaError(f"{what} is no finite real number") from None
+    raise FormulaError(f"{what} has no place in a formula")
+
+
+def _combined(function: Callable, first: _Part, second: _Part, is_power: bool, what: str) -> _Part:
+    """Two parts under an operator. Raises FormulaError."""
+    if first.number is not None and second.number is not None:
+        return _number(function(first.number, second.number), what)
+    digits, power = first.digits + second.digits + 1, max(first.power, second.power)
+    if is_power and second.number is not None:
+        digits, power = first.digits * abs(second.number), first.power * max(1.0, abs(second.number))
+    _check(digits, power, what)
+    if function is truediv and second.value == 0:
+        raise ZeroDivisionError
+    return _Part(function(first.value, second.value), None, digits, power, first.has_log or second.has_log)
+
+
+def _check(digits: float, power: float, what: str) -> None:
+    """Raise FormulaError if numbers of a part or its powers are too large."""
+    if not power <= LARGEST_POWER:
+        raise FormulaError(f"{what} is a power beyond {LARGEST_POWER}")
+    if not digits <= MOST_DIGITS:
+        raise FormulaError(f"{what} has numbers of more than {MOST_DIGITS} digits")
 
 
 # --- from a function -------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rigidmd.core.files import whole_file
+from rigidmd.output.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.output.sweep_folder import FINISHED, SCRIPT, Manifest
 
 #: Of the wall time of a job: what its run leaves for the end, at most so many seconds and this share.
@@ -41,16 +42,18 @@ def write_script(
     words = ["rigidmd", "sweep", manifest.scene, "-o", str(folder.absolute())]
     for trusted in trust:
         words += ["--trust", str(Path(trusted).absolute())]
+    here = str(Path.cwd())
+    check_script_paths([*words, str(path), here])
     text = JOB.format(
         count=len(left),
-        name=manifest.name,
-        job=f"{manifest.name}-sweep",
+        name=in_comment(manifest.name),
+        job=f"{as_word(manifest.name)}-sweep",
         array=in_ranges(left),
         time=in_hours(walltime),
         inner=in_hours(walltime - min(SPARE, SPARE_SHARE * walltime)),
         threads=threads,
-        folder=folder.absolute(),
-        here=shlex.quote(str(Path.cwd())),
+        folder=str(folder.absolute()).replace("%", "%%"),  # Slurm replaces %j and others
+        here=shlex.quote(here),
         point=shlex.join(words),
         collect=shlex.join([*words, "--collect"]),
         script=shlex.quote(str(path)),

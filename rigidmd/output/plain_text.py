@@ -1,0 +1,41 @@
+"""Names and paths of users in generated files that are code: there they are data, whatever they hold."""
+
+import re
+from collections.abc import Sequence
+
+from rigidmd.errors import OutputError
+
+#: Characters of lines and of terminals, which no path in a script may have, and what Slurm obeys between quotes.
+UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\"\\]")
+
+
+def in_comment(text: str) -> str:
+    """A text in one line for comments and titles: what some language obeys there becomes an underscore."""
+    return re.sub(r"[^\w .,:;=()+/@-]", "_", text)
+
+
+def as_word(text: str) -> str:
+    """A text as a word of a file with columns."""
+    return re.sub(r"[^A-Za-z0-9_.+*'-]", "_", text) or "_"
+
+
+def distinct(texts: Sequence[str]) -> list[str]:
+    """Texts as identifiers, each another one."""
+    found: list[str] = []
+    for text in texts:
+        name, n = re.sub("[^A-Za-z0-9_]", "_", text) or "_", 1
+        stem = name
+        while name in found:
+            name, n = f"{stem}_{n + 1}", n + 1
+        found.append(name)
+    return found
+
+
+def check_script_paths(paths: Sequence[str]) -> None:
+    """Raise OutputError if a path cannot stand in the script of a job."""
+    for path in paths:
+        if UNSAFE.search(path):
+            raise OutputError(
+                f"{path!r} has a control character, a quotation mark or a backslash in its name, which the script of a "
+                "job cannot have; rename it, or name another folder with -o"
+            )
