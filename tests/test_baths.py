@@ -194,6 +194,13 @@ def test_degrees_of_freedom_follow_the_thermostat():
         ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "berendsen"}, "samples no"),
         ({"ensemble": "nph", "pressure_bar": 1.0, "integrator": "srkn_4"}, "made of Verlet steps"),
         ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat_time_ps": 0.0}, "greater than 0"),
+        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "thermostat": "langevin",
+          "barostat": "monte_carlo", "barostat_time_ps": 1.0}, "barostat_time_ps would do nothing with monte_carlo$"),
+        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "nose_hoover_links": 4},
+         "nose_hoover_links would do nothing with velocity_rescaling$"),
+        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "monte_carlo",
+          "barostat_time_ps": 1.0, "nose_hoover_links": 4},
+         "nose_hoover_links, barostat_time_ps would do nothing with velocity_rescaling and monte_carlo$"),
     ],
 )  # fmt: skip
 def test_stages_that_cannot_be(stage, message):

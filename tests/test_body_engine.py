@@ -8,7 +8,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
 
 from rigidmd.assemble.body import build_body
-from rigidmd.core.schemes import SCHEMES
+from rigidmd.core.schemes import DRIFT, KICK, SCHEMES, WITH_BATH, Flow, Scheme, composed, split
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.body import Body
 from rigidmd.engines.cpu import Engine
@@ -78,6 +78,36 @@ def test_orders_on_a_torqued_asymmetric_body(name):
             for steps in (n, 2 * n)]  # fmt: skip
     errors = [np.abs(q - exact).max() for q in ends]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2 if order == 8 else 0.1)
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda: split("mine", (0.4, 0.5), (1.0,), 2, ""), "mine: its kicks sum to 0.9, not to 1"),
+        (lambda: split("mine", (0.5, 0.5), (1.1,), 2, ""), "mine: its drifts sum to 1.1, not to 1"),
+        (lambda: split("mine", (0.5, 0.5), (float("nan"),), 2, ""), "mine: its drifts sum to nan"),
+        (lambda: split("mine", (0.4, 0.6), (1.0,), 2, ""), "flows 1 and 3 of 3 differ .kick 0.4 and kick 0.6."),
+        (lambda: split("mine", (1.0, 0.0), (1.0,), 1, ""), "flows 1 and 2 of 2 differ .kick 1 and drift 1."),
+        (lambda: split("mine", (0.2, 0.6, 0.2), (0.4, 0.6), 2, ""), "flows 2 and 4 of 5 differ"),
+        (lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1, 0.2)), "differ .kick 0.5, gradient 0.1 and kick 0.5, "),
+        (lambda: split("mine", (0.5, 0.5), (0.5, 0.5), 2, ""), "2 kicks, 2 drifts: kicks must be one more than drifts"),
+        (lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1,)), "1 gradients: .* gradients as many as kicks"),
+        (lambda: composed("mine", (0.6, -0.3, 0.6), 4, ""), "mine: its drifts sum to 0.9"),
+        (lambda: composed("mine", (0.3, 0.7), 2, ""), "not time-reversible"),
+        (lambda: composed("mine", (), 2, ""), "mine: its drifts sum to 0, not to 1"),
+        (lambda: Scheme("mine", (Flow(KICK, 0.5), Flow(DRIFT, 1.0)), 2, True, ""), "mine: its kicks sum to 0.5"),
+    ],
+)
+def test_a_row_that_is_inconsistent_or_not_reversible_is_refused_when_it_is_made(make, error):
+    with pytest.raises(ValueError, match=f"integrator .*{error}"):
+        make()
+
+
+def test_rows_in_print_have_rounded_coefficients_and_shipped_ones_are_made_anew():
+    rounded = split("mine", (0.1931833275, 0.613633345, 0.1931833275), (0.5, 0.5), 2, "in print")
+    assert rounded.force_evaluations == 2
+    for scheme in (SCHEMES | WITH_BATH).values():
+        assert Scheme(*scheme) == scheme  # the checks of a new row
 
 
 def test_what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one():

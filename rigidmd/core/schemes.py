@@ -15,6 +15,10 @@ from typing import Literal, NamedTuple
 KICK, DRIFT, BATH, REST, BOX, STRETCH = 0, 1, 2, 3, 4, 5
 
 
+#: Error of sums and mirrored fractions of a row, from coefficients in print.
+ROUNDING = 1e-10
+
+
 class Flow(NamedTuple):
     """One flow of a step."""
 
@@ -23,17 +27,47 @@ class Flow(NamedTuple):
     gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.gradient)
     every: int = 1  # it is taken in every so many steps of a stretch
 
+    @property
+    def in_words(self) -> str:
+        """Of a kick or drift."""
+        gradient = f", gradient {self.gradient:.12g}" if self.gradient else ""
+        return f"{'kick' if self.kind == KICK else 'drift'} {self.fraction:.12g}{gradient}"
 
-class Scheme(NamedTuple):
-    """A step as a row of flows, with its name, order and needs."""
+
+class _Row(NamedTuple):
+    """The fields of a scheme."""
 
     name: str
-    flows: tuple[Flow, ...]  # kicks add up to 1, drifts too
+    flows: tuple[Flow, ...]  # kicks sum to 1, drifts too
     order: int
     exact_rotor: bool  # whether its order needs one
     source: str
     bath: tuple | None = None  # whose flow BATH is (dynamics.baths)
     box: tuple | None = None  # whose flows BOX and STRETCH are (dynamics.boxes)
+
+
+class Scheme(_Row):
+    """A step as a row of flows, with its name, order and needs.
+
+    Raises ValueError unless kicks and drifts each sum to 1 and read the same from both ends, so that the step is
+    consistent and time-reversible.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *args, **kwargs):
+        made = super().__new__(cls, *args, **kwargs)
+        for what, fractions in (("drifts", made.drifts), ("kicks", made.kicks)):
+            if not abs(sum(fractions) - 1) <= ROUNDING:
+                wrong = f"its {what} sum to {sum(fractions):.12g}, not to 1"
+                raise ValueError(f"integrator {made.name}: {wrong}; odd() and even() complete a sum")
+        moving = [flow for flow in made.flows if flow.kind in (KICK, DRIFT)]
+        for k, (one, other) in enumerate(zip(moving, reversed(moving), strict=True)):
+            if not max(abs(a - b) for a, b in zip(one[:3], other[:3], strict=True)) <= ROUNDING:
+                n, pair = len(moving), f"{one.in_words} and {other.in_words}"
+                wrong = f"its flows {k + 1} and {n - k} of {n} differ ({pair}), so that it is not time-reversible"
+                raise ValueError(f"integrator {made.name}: {wrong}; odd() and even() mirror fractions")
+        return made
 
     def with_rotor(self, rotor: str | None) -> "Scheme":
         """This scheme with the named rotor ("split" or "exact"); unchanged for None."""
@@ -100,7 +134,7 @@ class Scheme(NamedTuple):
 
 def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Scheme:
     """Velocity Verlet steps of these lengths in succession; neighbouring kicks are merged."""
-    kicks = (steps[0] / 2, *((a + b) / 2 for a, b in pairwise(steps)), steps[-1] / 2)
+    kicks = tuple((a + b) / 2 for a, b in pairwise((0.0, *steps, 0.0)))
     return Scheme(name, _alternating(kicks, steps), order, False, source)
 
 
@@ -116,6 +150,10 @@ def split(
 
     gradients : of each kick, see `Flow.gradient`
     """
+    if len(kicks) != len(drifts) + 1 or (gradients is not None and len(gradients) != len(kicks)):
+        given = f"{len(kicks)} kicks, {len(drifts)} drifts" + (f", {len(gradients)} gradients" if gradients else "")
+        wrong = f"{given}: kicks must be one more than drifts, and gradients as many as kicks"
+        raise ValueError(f"integrator {name}: {wrong}; a fraction may be 0")
     return Scheme(name, _alternating(kicks, drifts, gradients), order, True, source)
 
 

@@ -209,8 +209,9 @@ class Stage(Section):
         )
         if of_ensemble:
             return f"in an {self.ensemble} stage"
-        kinds = [kind for kind in (self.thermostat_kind, self.barostat_kind) if kind]
-        return f"with {' and '.join(kinds)}"
+        concerned = set().union(*known)  # a key of the barostat does not depend on the thermostat
+        kinds = ((self.thermostat_kind, Thermostat.__args__), (self.barostat_kind, Barostat.__args__))
+        return f"with {' and '.join(kind for kind, among in kinds if kind and concerned & set(among))}"
 
     def _pressure_faults(self) -> list[str]:
         faults, given, coupling = [], self.pressure_bar, self.pressure_coupling
