@@ -536,7 +536,7 @@ def _precision(options: argparse.Namespace) -> int:
             options.averages,
             lambda share: bar.update(share - bar.n),
         )
-    print(table_text(found), "", *advice(found), sep="\n")
+    print(*advice(found), "", table_text(found), sep="\n")
     make_folder(folder, options.force, FILES)
     written = write_precision(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")

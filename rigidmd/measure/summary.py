@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from rigidmd.assemble.system import System
 from rigidmd.core.state import TAKEN, State
-from rigidmd.measure.drift import inefficiency, slope
+from rigidmd.measure.drift import OF_ENERGY, inefficiency, slope
 from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
@@ -62,7 +62,10 @@ def summarise(
             if k not in minima
             else _minimised(system, samples.rows, k, computing[k], minima[k])
         )
-        | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
+        | {
+            "choice": _choice(system, samples.rows, k, choices.get(k)),
+            "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None,
+        }
         for k in range(len(computing))
         if any(sample.stage == k for sample in samples.rows)
     ]
@@ -96,6 +99,16 @@ def summarise(
             *warnings,
         ],
     }
+
+
+def _choice(system: System, samples: list[Sample], k: int, text: str | None) -> str | None:
+    """The choice for a stage; one for an error of the energy with the error that the stage has."""
+    own = [sample for sample in samples if sample.stage == k]
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean([s.temperature for s in own])[0] or 0.0) * system.freedom_in(k).total
+    if text is None or OF_ENERGY not in text or len(own) < 2 or thermal == 0:
+        return text
+    rms = float(np.sqrt(np.mean(np.square([s.drift for s in own])))) / thermal
+    return f"{text}. In the {own[-1].time - own[0].time:.4g} ps that ran it was {rms:.1e}"
 
 
 def _removed(system: System, state: State) -> dict | None:
