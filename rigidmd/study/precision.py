@@ -55,6 +55,7 @@ def precision(
     if isinstance(scene, MolecularScene) and (refused := [name for name in integrators if name in COMPARATORS]):
         reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
         raise SceneError(scene.source, reasons)
+    say(0.0)
     subject, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
     if averages and subject.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])
