@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -559,22 +559,26 @@ def _precision(options: argparse.Namespace) -> int:
         return _averages(options, scene, folder, integrators, timesteps)
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it goes with --averages that has no PS of its own"])
-    say("compiling and running the reference")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
-        found = precision(
-            scene,
-            integrators,
-            timesteps,
-            options.span,
-            options.repeats,
-            options.averages,
-            lambda share: bar.update(share - bar.n),
-        )
-    print(table_text(found), "", *advice(found), sep="\n")
+        told = _progress(bar, "compiling and running the reference")
+        found = precision(scene, integrators, timesteps, options.span, options.repeats, options.averages, told)
+    print(*advice(found), "", table_text(found), sep="\n")
     make_folder(folder, options.force, FILES)
     written = write_precision(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
+
+
+def _progress(bar, begins: str) -> Callable[[float], None]:
+    """A callback that moves a bar; at 0, when all arguments are known to be good, it reports what begins."""
+
+    def progress(share: float) -> None:
+        if share == 0:
+            bar.clear()
+            say(begins)
+        bar.update(share - bar.n)
+
+    return progress
 
 
 def _averages(
@@ -588,9 +592,9 @@ def _averages(
     from rigidmd.study.averages import SAMPLE_PS, averages
 
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
-    say("compiling, and running what comes before the last stage")
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
-        found = averages(scene, methods, timesteps, sample, lambda share: bar.update(share - bar.n))
+        told = _progress(bar, "compiling, and running what comes before the last stage")
+        found = averages(scene, methods, timesteps, sample, told)
     print(table_text(found), "", *advice(found), sep="\n")
     make_folder(folder, options.force, FILES)
     written = write_averages(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import itertools
 import json
+import re
 import tomllib
 
 import numpy as np
@@ -169,14 +170,84 @@ def test_the_front_and_the_advice_follow_from_the_numbers(top):
         assert any(better.time <= trial.time and better.energy_rms <= trial.energy_rms for better in front)
     own = trials(top, "velocity_verlet")
     target = np.sqrt(own[0].energy_rms * own[1].energy_rms)
-    seconds, step = top.time_for("velocity_verlet", "energy_rms", target)
-    assert own[1].timestep < step < own[0].timestep
-    assert min(own[0].time, own[1].time) <= seconds <= max(own[0].time, own[1].time)
+    at = top.time_for("velocity_verlet", "energy_rms", target)
+    assert own[1].timestep < at.step < own[0].timestep
+    assert min(own[0].time, own[1].time) <= at.seconds <= max(own[0].time, own[1].time)
     assert top.time_for("velocity_verlet", "energy_rms", 1e-30) is None
-    said = "\n".join(advice(top))
-    assert "for an error of Q of 1e-06 the cheapest is srkn_" in said
+    timed = [dataclasses.replace(trial, seconds=[float(trial.forces)] * 3) for trial in top.trials]
+    said = "\n".join(advice(dataclasses.replace(top, trials=timed)))
+    assert re.search("for an error of Q of (1e-0[024] to )?1e-0[46] over 0.4 s the cheapest is srkn_", said)
     assert "times faster than velocity_verlet" in said
-    assert table_text(top).count("srkn_4") == 6
+    assert "within the spread" not in said
+    assert table_text(top).count("srkn_4") == len(trials(top, "srkn_4")) > 6
+
+
+def made(*rows, span=0.1):
+    """A body's trials (integrator, step, seconds of three timings or a reason to fail, energy and Q error)."""
+    subject, _ = body_subject(Scene.read(TOP), span)
+    trials = []
+    for name, step, seconds, error in rows:
+        n = round(span / step)
+        trial = Trial(name, step, n, n, rotation_error=error, energy_rms=error)
+        if isinstance(seconds, str):
+            trial.fault = seconds
+        else:
+            trial.seconds = list(seconds)
+        trials.append(trial)
+    return Precision(subject, trials, 1000, 1e-14)
+
+
+def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a_longest_step_keeps():
+    found = made(
+        ("velocity_verlet", 1e-3, (2.0, 2.0, 2.0), 2e-9), ("srkn_4", 5e-3, (1.0, 1.0, 1.0), 5e-7),
+        ("srkn_4", 2.5e-3, (1.9, 1.9, 1.9), 5e-9), ("pefrl", 2e-3, (9.0, 9.0, 9.0), 1e-1),
+    )  # fmt: skip
+    said, most = advice(found), "times the largest kinetic energy over 0.1 s the cheapest is srkn_4 at"
+    assert said[0] == (
+        f"for an energy error of 1e-02 to 1e-06 {most} 0.005 s (its longest step tried): 2.0 times faster than "
+        "velocity_verlet at 0.001 s"
+    )
+    assert said[1].startswith(f"for an energy error of 1e-08 {most} 0.0028 s: 1.2 times faster than velocity_verlet")
+    assert [line.startswith("for an error of Q") for line in said[2:5]] == [True, True, False]
+
+
+@pytest.mark.parametrize(("next_step", "step", "limit"), [("diverges", 4e-3, "kept from its longest stable step"),
+                                                          ((0.5,) * 3, 5e-3, "")])  # fmt: skip
+def test_no_step_at_the_edge_of_stability_is_recommended(next_step, step, limit):
+    found = made(
+        ("kahan_li_6", 1e-2, next_step, 1.0), ("kahan_li_6", 5e-3, (1.0, 1.0, 1.0), 1e-6),
+        ("kahan_li_6", 2.5e-3, (2.0, 2.0, 2.0), 1e-8),
+    )  # fmt: skip
+    at = found.time_for("kahan_li_6", "energy_rms", 1e-6)
+    assert at.step == pytest.approx(step)
+    assert at.seconds == pytest.approx(5e-3 / step, rel=1e-6)
+    assert at.limit == limit
+
+
+@pytest.mark.parametrize(("slow", "fast"), [((1.0, 1.2, 1.4), False), ((1.19, 1.2, 1.21), True)])
+def test_no_advantage_is_claimed_within_the_spread_of_the_timings(slow, fast):
+    found = made(("velocity_verlet", 1e-3, slow, 1e-5), ("srkn_4", 5e-3, (0.99, 1.0, 1.01), 1e-5),
+                 ("pefrl", 2e-3, (1.0, 1.0, 1.0), 1e-1))  # fmt: skip
+    (line,) = (line for line in advice(found) if line.startswith("for an energy error"))
+    assert ("1.2 times faster than velocity_verlet" in line) == fast
+    assert ("as fast within the spread of the timings: velocity_verlet at 0.001 s" in line) != fast
+
+
+@pytest.mark.parametrize(("longest", "steps"), [(0.05, [12, 25, 50, 100]), (1.0, [6, 12, 25, 50, 100])])
+def test_ladders_continue_to_longer_steps_until_one_fails_or_is_too_long_for_the_span(longest, steps, monkeypatch):
+    def look(subject, trial, exact):
+        trial.energy_rms = 1e-9
+        trial.fault = "diverges" if trial.timestep > longest else ""
+
+    subject, _ = body_subject(Scene.read(TOP), 1.0)
+    monkeypatch.setattr(measuring, "look", look)
+    monkeypatch.setattr(measuring, "end_of", lambda *_: subject.state)
+    monkeypatch.setattr(measuring, "timing", lambda *_: 1.0)
+    for extend, expected in ((True, steps), (False, [50, 100])):
+        trials = measuring.plan(subject, {"velocity_verlet": [0.02, 0.01]})
+        found = measure(subject, trials, 1, extend=extend).trials
+        assert [trial.steps for trial in found] == expected
+        assert [trial.diverged for trial in found] == [trial.timestep > longest for trial in found]
 
 
 def test_a_step_that_is_too_long_diverges_and_is_stopped():
@@ -253,6 +324,23 @@ def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     assert main(command) == 2  # nothing is overwritten
     assert main([*command, "--force"]) == 0
     assert main(["precision", str(TOP), "--timesteps", "a"]) == 2
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(("arguments", "error"), [
+    (["--integrators", "rk5"], "there is no rk5"),
+    (["--integrators", "rk4"], "rk4 does not suit this scene: it is for single bodies"),
+    (["--span", "inf"], "must be finite"),
+    (["--timesteps", "nan"], "must be finite"),
+    (["--averages", "--integrators", "rk5"], "there is no rk5"),
+])  # fmt: skip
+def test_arguments_are_refused_before_anything_is_compiled_or_run(arguments, error, capsys, tmp_path):
+    water = ["precision", str(ROOT / "systems" / "water.toml"), "-o", str(tmp_path / "p")]
+    thermal = ["--set", "stages.1.ensemble=nvt", "--set", "stages.1.temperature_K=298.15"]
+    assert main([*water, *thermal, *arguments]) == 2
+    said = capsys.readouterr()
+    assert error in said.err
+    assert "compiling" not in said.out + said.err
 
 
 @pytest.fixture(scope="module")
@@ -562,8 +650,8 @@ def test_orders_cost_and_temperatures_of_512_waters():
     for trial in found.trials:
         trial.seconds = [float(trial.forces)]  # in forces, which no noise can touch
     target = 1e-5 / unit
-    verlet, _ = found.time_for("velocity_verlet", "energy_rms", target)
-    best = min(at[0] for name in ("two_stage", "chin_4a", "srkn_4", "srkn_6")
+    verlet = found.time_for("velocity_verlet", "energy_rms", target).seconds
+    best = min(at.seconds for name in ("two_stage", "chin_4a", "srkn_4", "srkn_6")
                if (at := found.time_for(name, "energy_rms", target)))  # fmt: skip
     assert verlet / best > 2
     found = precision(scene, ["velocity_verlet"], [4.0, 2.0], span=0.02, repeats=1, averages=40.0)

@@ -27,7 +27,7 @@ def stage_in_words(stage: Stage) -> list[str]:
     if stage.is_open:
         asked = f"{stage.trajectory_error or 0:g} of Q or X"
         if stage.energy_error_kT:
-            asked = f"{stage.energy_error_kT:g} kT"
+            asked = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
         elif stage.bias_kT:
             asked = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
         text = (

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+#: In the reason of a choice: what it keeps. A summary adds the error that the run had.
+OF_ENERGY = "error of the energy"
 FEW, MANY = 8, 64  # numbers of blocks that separate slow noise from fast
 
 

@@ -104,6 +104,7 @@ def molecular_subject(system: System, start: State, rotor: str | None, span: flo
         refused={name: "it is for single bodies" for name in COMPARATORS},
         observe=(lambda engine, now, step: observe(system, engine, now, step)) if boxed else None,
         molecules=len(system.model.species),
+        freedom=freedom,
     )
 
 
@@ -215,8 +216,9 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
     natural = natural_time(system, state)
     step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
     subject = molecular_subject(system, state, None, PILOT_SPAN * natural if natural else SPAN_PS)
-    longest = {name: 4 * step * SCHEMES[name].force_evaluations for name in SCHEMES}
-    integrator, timestep, reason = _chosen(subject, longest, stage.energy_error_kT, stage.trajectory_error)
+    longest = {name: float(f"{4 * step * SCHEMES[name].force_evaluations:.3g}") for name in SCHEMES}
+    asked = stage.energy_error_kT, stage.trajectory_error
+    integrator, timestep, reason = _chosen(subject, longest, *asked, stage.duration)
     return stage.decided(integrator, timestep), reason
 
 
@@ -248,9 +250,15 @@ def _fitted(timestep: float, duration: float, interval: float | None) -> float:
     return span / ceil(span / longest * (1 - 1e-9))
 
 
-def _chosen(subject: Subject, longest: dict[str, float], energy: float | None, trajectory: float | None):
+def _chosen(
+    subject: Subject,
+    longest: dict[str, float],
+    energy: float | None,
+    trajectory: float | None,
+    duration: float | None = None,
+) -> tuple[str, float, str]:
     if energy is not None:
-        found = choose(subject, energy, "energy_rms", longest)
+        found = choose(subject, energy, "energy_rms", longest, duration)
     elif trajectory is not None:
         found = choose(subject, trajectory, "trajectory_error", longest)
     else:

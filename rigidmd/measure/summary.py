@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from rigidmd.assemble.system import System
 from rigidmd.core.state import TAKEN, State
-from rigidmd.measure.drift import inefficiency, slope
+from rigidmd.measure.drift import OF_ENERGY, inefficiency, slope
 from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
@@ -62,7 +62,10 @@ def summarise(
             if k not in minima
             else _minimised(system, samples, k, computing[k], minima[k])
         )
-        | {"choice": choices.get(k), "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None}
+        | {
+            "choice": _choice(system, samples.of_stage(k), k, choices.get(k)),
+            "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None,
+        }
         for k in np.unique(samples["stage"]).tolist()
     ]
     return {
@@ -95,6 +98,15 @@ def summarise(
             *warnings,
         ],
     }
+
+
+def _choice(system: System, samples: Samples, k: int, text: str | None) -> str | None:
+    """The choice for a stage; one for an error of the energy with the error that the stage has."""
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean(samples["temperature"])[0] or 0.0) * system.freedom_in(k).total
+    if text is None or OF_ENERGY not in text or len(samples) < 2 or thermal == 0:
+        return text
+    rms, time = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal, samples["time"]
+    return f"{text}. In the {time[-1] - time[0]:.4g} ps that ran it was {rms:.1e}"
 
 
 def _removed(system: System, state: State) -> dict | None:

@@ -8,7 +8,7 @@ potential energy and pressure.
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import groupby, pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -32,6 +32,10 @@ LOOKS = 40
 DIVERGED = 0.5
 #: Time between looks for averages, ps: about the correlation time of the kinetic energy of water.
 LOOK_PS = 0.02
+#: Part of an integrator's longest stable step that is recommended, where a longer one diverges.
+STABLE_SHARE = 0.8
+#: Least steps in a span of a trial that extends a ladder.
+FEWEST = 4
 #: Steps that warm up an engine: they build lists, grow buffers and touch memory. The first 25 steps of 216 waters took
 #: 40 ms, the next 25 took 20 ms.
 WARM_UP = 10
@@ -95,6 +99,7 @@ class Subject:
     singular: tuple[str, ...] = ()
     observe: Callable[[Engine, State, float], Observation] | None = None
     molecules: int = 1
+    freedom: int = 1
     rounding: tuple[float, float] | None = None
 
 
@@ -117,6 +122,7 @@ class Trial:
     tolerance: float | None = None  # of a method that chooses its steps
     fault: str = ""  # why it failed or diverged
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
+    energies: list[float] = field(default_factory=list, repr=False)  # errors in the subject's unit, from 0 at the start
 
     @property
     def diverged(self) -> bool:
@@ -171,23 +177,39 @@ class Precision:
                 found.append(trial)
         return found
 
-    def time_for(self, integrator: str, error: str, target: float) -> tuple[float, float] | None:
-        """(seconds, time step) at which an integrator reaches an error, between its trials.
+    def time_for(self, integrator: str, error: str, target: float) -> "Reached | None":
+        """Where an integrator reaches an error, between its trials; None if its shortest step is not exact enough.
 
-        Its longest step if that is exact enough; None if its shortest is not.
+        At most its longest step, or `STABLE_SHARE` of it where a longer one diverges.
         """
         own = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
         own.sort(key=lambda t: -t.timestep)
-        if own and getattr(own[0], error) <= target:
-            return own[0].time, own[0].timestep
+        if not own:
+            return None
+        unstable = any(t.diverged for t in self.trials if t.integrator == integrator)
+        step = own[0].timestep if getattr(own[0], error) <= target else None
         for coarse, fine in pairwise(own):
             a, b = np.log(getattr(coarse, error)), np.log(getattr(fine, error))
-            if b <= np.log(target) <= a:
+            if step is None and b <= np.log(target) <= a:
                 share = (np.log(target) - a) / (b - a)
-                seconds = np.exp(np.log(coarse.time) + share * np.log(fine.time / coarse.time))
-                step = np.exp(np.log(coarse.timestep) + share * np.log(fine.timestep / coarse.timestep))
-                return float(seconds), float(step)
-        return None
+                step = coarse.timestep * (fine.timestep / coarse.timestep) ** share
+        if step is None:
+            return None
+        longest = max((STABLE_SHARE if unstable else 1.0) * own[0].timestep, own[-1].timestep)
+        limit = "" if step < longest else "kept from its longest stable step" if unstable else "its longest step tried"
+        step, up = float(min(step, longest)), own[::-1]
+        seconds = np.exp(np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up])))
+        near = min(own, key=lambda t: abs(np.log(t.timestep / step)))
+        return Reached(float(seconds), step, near.spread or 0.0, limit)
+
+
+class Reached(NamedTuple):
+    """Where an integrator reaches an error."""
+
+    seconds: float  # of computing in a span
+    step: float  # in the subject's unit
+    spread: float  # range of the nearest trial's seconds over their median
+    limit: str  # in words, where stability or the steps tried, and not the error, set the step
 
 
 def measure(
@@ -196,10 +218,12 @@ def measure(
     repeats: int,
     averages: float | None = None,
     say: Callable[[float], object] = lambda share: None,
+    extend: bool = False,
 ) -> Precision:
     """Run all trials and the reference; time the trials alternately `repeats` times; report progress by say(share).
 
-    averages : ps over which every trial is also averaged; None for no averages
+    averages : ps over which every trial is also averaged; None for no averages. extend : whether longer steps follow
+    the longest one of each integrator, doubled until one fails
     """
     most = max((trial.forces for trial in trials), default=0) or LOOKS * LOOKS
     reference = subject.methods[subject.reference]
@@ -209,6 +233,8 @@ def measure(
     result = Precision(subject, trials, steps, max(gap for gap in own_error if not np.isnan(gap)), averages)
     for trial in trials:  # compile and measure errors
         look(subject, trial, exact)
+    if extend:
+        result.trials = trials = _extended(subject, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
     done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / subject.span)
     for _ in range(repeats):
@@ -222,6 +248,22 @@ def measure(
             done += averages / subject.span
             say(done / whole)
     return result
+
+
+def _extended(subject: Subject, trials: list[Trial], exact: State) -> list[Trial]:
+    """Trials with longer steps before those of each integrator, doubled until one fails."""
+    found = []
+    for name, own in groupby(trials, key=lambda trial: trial.integrator):
+        ladder = list(own)
+        longest = max(ladder, key=lambda trial: trial.timestep)
+        while not longest.diverged and longest.tolerance is None and longest.steps >= 2 * FEWEST:
+            n = longest.steps // 2
+            per_step = subject.methods[name].force_evaluations
+            longest = Trial(name, subject.span / n / subject.time_size, n, n * per_step)
+            look(subject, longest, exact)
+            ladder.insert(0, longest)
+        found += ladder
+    return found
 
 
 def timing(subject: Subject, trial: Trial) -> float:
@@ -322,12 +364,12 @@ def _furthest(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.abs(x - y).max()) if len(x) else np.nan
 
 
-def look(subject: Subject, trial: Trial, exact: State | None) -> None:
+def look(subject: Subject, trial: Trial, exact: State | None, looks: int = LOOKS) -> None:
     """One run that measures all errors of a trial. Its end is compared with `exact`."""
     engine, state = _begun(subject, trial)
     first = subject.energy(engine, state)
     times, energies = [0.0], [0.0]
-    every, done = max(1, trial.steps // LOOKS), 0
+    every, done = max(1, trial.steps // looks), 0
     while done < trial.steps:
         now = min(every, trial.steps - done)
         try:
@@ -346,6 +388,7 @@ def look(subject: Subject, trial: Trial, exact: State | None) -> None:
         energies.append(energy / subject.energy_size)
         for name, error in subject.kept(state).items():
             trial.kept[name] = max(abs(error), trial.kept.get(name, 0.0))
+    trial.energies = energies
     trial.energy_rms = float(np.sqrt(np.mean(np.square(energies[1:]))))
     line = slope(times, energies)
     trial.energy_drift, trial.energy_drift_error = float(line.value), float(line.error)

@@ -16,17 +16,20 @@ def precision_page(found: Precision, command: str) -> str:
 
     unit = found.subject.time_unit
     rows = [
-        [c.error, named(c.integrator), f"{c.step:.2g}", f"{c.seconds / found.subject.span:.2g}",
-         f"{c.times_faster:.1f} (at {c.common_step:.2g})" if c.common else ""]
+        [c.error, named(c.integrator), f"{c.at.step:.2g}" + (f" ({c.at.limit})" if c.at.limit else ""),
+         f"{c.at.seconds / found.subject.span:.2g}",
+         f"{c.times_faster:.1f} (at {c.common_step:.2g})" if c.common else "",
+         ", ".join(f"{name} at {at.step:.2g}" for name, at in c.rivals)]
         for c in report.cheapest(found)
     ]  # fmt: skip
     per = "ps" if unit == "fs" else "s"
     titles = [
-        "for",
+        f"for, over {found.subject.span:g} {per}",
         "the cheapest is",
         f"at a step of ({unit})",
         f"seconds per {per}",
         "times faster than velocity_verlet",
+        "as fast within the spread of the timings",
     ]
     trials = [[named(t.integrator), *map(report.short, report.row(found, t)[1:])] for t in found.trials]
     parts = [

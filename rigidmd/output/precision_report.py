@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.files import whole_file
-from rigidmd.measure.trials import Precision, Trial
+from rigidmd.measure.trials import Precision, Reached, Trial
 from rigidmd.output.figure import FAINT, INK, curve_style, drawing, few_decades, save_figure
 from rigidmd.output.report import signed
 
@@ -124,8 +124,8 @@ def short(cell) -> str:
 
 
 def advice(found: Precision) -> list[str]:
-    """Sentences on the reference, the longest stable steps, and the cheapest integrator for each accuracy."""
-    return [*remarks(found), *_cheapest_words(found)]
+    """Sentences: the cheapest integrator for each accuracy, then the reference and the longest stable steps."""
+    return [*cheapest_words(found), *remarks(found)]
 
 
 def remarks(found: Precision) -> list[str]:
@@ -189,20 +189,20 @@ def _temperature_words(found: Precision) -> list[str]:
 
 
 class Cheapest(NamedTuple):
-    """The integrator that reaches an error in the least run time."""
+    """The integrator that reaches an error, or each of several errors, in the least run time."""
 
     error: str  # what error this is, with its unit
-    target: float
+    target: float  # the largest
     integrator: str
-    step: float  # in the subject's unit, where its error is the target
-    seconds: float
+    at: Reached
     common: str  # integrator to compare with; empty if it is the same or does not reach the target
     times_faster: float
     common_step: float
+    rivals: tuple[tuple[str, Reached], ...]  # others, as fast within the spread of the timings
 
 
 def cheapest(found: Precision) -> list[Cheapest]:
-    """The cheapest integrator for each accuracy: of the energy, and of Q or X."""
+    """The cheapest integrator for each accuracy: of the energy, and of Q or X; one line for all that have the same."""
     s = found.subject
     turning = any(not np.isnan(t.rotation_error) for t in found.trials)
     kinds = {
@@ -212,27 +212,47 @@ def cheapest(found: Precision) -> list[Cheapest]:
     names, common, lines = list(dict.fromkeys(t.integrator for t in found.trials)), "velocity_verlet", []
     for error, (what, unit) in kinds.items():
         worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
+        same = None
         for target in 10.0 ** np.arange(0, -15, -2):
             reached = {name: at for name in names if (at := found.time_for(name, error, target))}
             blind = error == "trajectory_error" and target < 3 * found.reference_error
             if target > worst or len(reached) < 2 or blind:
                 continue
-            best = min(reached, key=lambda name: reached[name][0])
-            seconds, step = reached[best]
-            other, its_step = reached.get(common, (np.nan, np.nan))
-            against = common if common in reached and best != common else ""
+            best = min(reached, key=lambda name: reached[name].seconds)
+            at, other = reached.pop(best), reached.get(common)
+            slow = at.seconds * (1 + at.spread / 2)
+            rivals = tuple((name, r) for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow)
             told = f"{what} of {target:.0e} {unit}".rstrip()
-            lines.append(Cheapest(told, float(target), best, step, seconds, against, other / seconds, its_step))
+            faster, its_step = (other.seconds / at.seconds, other.step) if other else (0.0, 0.0)
+            line = Cheapest(told, float(target), best, at, common if other else "", faster, its_step, rivals)
+            if same is not None and line[2:] == same[2:]:
+                told = f"{what} of {same.target:.0e} to {target:.0e} {unit}".rstrip()
+                line = line._replace(error=told, target=same.target)
+                lines.pop()
+            lines.append(line)
+            same = line
     return lines
 
 
-def _cheapest_words(found: Precision) -> list[str]:
-    unit, lines = found.subject.time_unit, []
+def cheapest_words(found: Precision) -> list[str]:
+    """Sentences: the cheapest integrator for each accuracy, over the span that was run."""
+    s, lines = found.subject, []
+    per, unit = "ps" if s.time_unit == "fs" else "s", s.time_unit
+
     for c in cheapest(found):
-        line = f"for {c.error} the cheapest is {c.integrator} at {c.step:.2g} {unit}"
-        if c.common:
+        limit = f" ({c.at.limit})" if c.at.limit else ""
+        line = f"for {c.error} over {s.span:g} {per} the cheapest is {c.integrator} at {c.at.step:.2g} {unit}{limit}"
+        if c.common and c.common not in [name for name, _ in c.rivals]:
             line += f": {c.times_faster:.1f} times faster than {c.common} at {c.common_step:.2g} {unit}"
+        if c.rivals:
+            rivals = ", ".join(f"{name} at {at.step:.2g} {unit}" for name, at in c.rivals)
+            line += f"; as fast within the spread of the timings: {rivals}"
         lines.append(line)
+    if lines and s.time_unit == "fs":
+        lines.append(
+            f"energy errors grow over longer runs, by a random walk where forces are truncated: --span measures them "
+            f"over more than {s.span:g} ps"
+        )
     return lines
 
 
@@ -265,8 +285,23 @@ def draw(path: Path, found: Precision) -> None:
         save_figure(figure, temporary, dpi=150)
 
 
+def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
+    """Label points (time, error, step) in this order, each that is far enough from the one labelled before."""
+    if not points:
+        return
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    size = np.array([np.log(right / left), np.log(high / low)])
+    before = None
+    for time, error, step in points:
+        at = np.log([time, error]) / size
+        if before is None or np.abs(at - before)[0] > 0.06 or np.abs(at - before)[1] > 0.04:
+            axis.annotate(f"{step:.2g}", (time, error), xytext=(-6, -6), textcoords="offset points", fontsize=7,
+                          color=INK, ha="right", va="top")  # fmt: skip
+            before = at
+
+
 def figure_of(found: Precision):
-    """Log error against log run time, one curve an integrator with its steps; the best trials are ringed.
+    """Log error against log run time, one curve an integrator; the best trials are ringed and have their steps.
 
     A bar shows the spread of the run times.
     """
@@ -289,19 +324,17 @@ def figure_of(found: Precision):
             axis.loglog(times, errors, ms=3.5, lw=1.2, label=name, **style)
             low, high = ([abs(end(t.seconds) - t.time) / s.span for t in own] for end in (min, max))
             axis.errorbar(times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7)
-            for time, value, trial in zip(times, errors, own, strict=True):
-                axis.annotate(f"{trial.timestep:.2g}", (time, value), xytext=(3, 3), textcoords="offset points",
-                              fontsize=5.5, color=style["color"])  # fmt: skip
-        front = found.front(error)
-        ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": "none is both faster and better"}
+        front = [t for t in found.front(error) if getattr(t, error) > 0]
+        ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": f"best, with its step ({s.time_unit})"}
         axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
+        _label_steps(axis, [(t.time / s.span, getattr(t, error), t.timestep) for t in front])
         axis.set_title(title, loc="left", fontsize=9, color=INK)
-        axis.set_xlabel(f"seconds of computing per {per}; at the points: the step ({s.time_unit})", color=INK)
         axis.tick_params(colors=INK, which="both")
         axis.spines[:].set_color(INK)
         axis.spines[["top", "right"]].set_visible(False)
         few_decades(axis.xaxis)
         few_decades(axis.yaxis)
+    figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)
     left.axhline(found.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate("error of the reference", (1, found.reference_error), xycoords=("axes fraction", "data"), fontsize=8,
                   color=FAINT, ha="right", va="bottom")  # fmt: skip

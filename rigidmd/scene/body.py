@@ -267,7 +267,7 @@ class Run(Section):
     """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest force evaluations; or
     a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None
-    """With auto: rms error of the energy, as a fraction of the largest kinetic energy"""
+    """With auto: rms error of the energy over the run, as a fraction of the largest kinetic energy"""
     trajectory_error: Positive | None = None
     """With auto: largest error of Q at the end; for a point that of X in m"""
     rotor: Rotor | None = None

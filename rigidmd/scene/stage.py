@@ -114,7 +114,7 @@ class Stage(Section):
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
     scheme and step that keep the requested error with the fewest force evaluations"""
     energy_error_kT: Positive | None = None
-    """With auto: rms error of the energy, in kT per degree of freedom"""
+    """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per degree of freedom"""
     trajectory_error: Positive | None = None
     """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten radians of libration"""
     bias_kT: Positive | None = None

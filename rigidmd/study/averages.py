@@ -64,6 +64,7 @@ def averages(
         raise SceneError("precision", ["time steps and --sample-ps must be finite and greater than 0"])
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
         raise SceneError("--timesteps", [f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"])
+    say(0.0)
     simulation, state = start_of_last_stage(scene)
     remove_momentum(simulation.system.model, state.velocity)
     found = stiffest(simulation.system, state)

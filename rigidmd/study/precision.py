@@ -17,7 +17,7 @@ USUAL = (
     "velocity_verlet", "two_stage", "suzuki_4", "pefrl", "chin_4a", "srkn_4", "kahan_li_6", "srkn_6", "kahan_li_8",
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
 )  # fmt: skip
-#: Time steps per force evaluation, relative to the scene's.
+#: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 #: Rotation of a spinning body per force evaluation in the middle of the ladder.
 RADIANS = 0.1
@@ -52,6 +52,10 @@ def precision(
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
         raise SceneError("precision", ["time steps, span, averages and repeats must be finite and greater than 0"])
+    if isinstance(scene, MolecularScene) and (refused := [name for name in integrators if name in COMPARATORS]):
+        reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
+        raise SceneError(scene.source, reasons)
+    say(0.0)
     subject, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
     if averages and subject.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])
@@ -69,7 +73,7 @@ def precision(
         name: timesteps or [base * rung * subject.methods[name].force_evaluations for rung in LADDER]
         for name in integrators
     }
-    found = measure(subject, plan(subject, steps), repeats, averages, say)
+    found = measure(subject, plan(subject, steps), repeats, averages, say, not timesteps)
     found.left_out = left_out
     return found
 

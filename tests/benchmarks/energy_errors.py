@@ -1,0 +1,101 @@
+"""Whether `integrator = "auto"` keeps the error of the energy that it is asked for: rms error over the target.
+
+    python tests/benchmarks/energy_errors.py --scenes water,smooth --targets 1e-4,1e-6 --ps 10
+
+The error is that of the whole stage and of its first 0.1 and 1 ps, in the target; beside them the force evaluations of the
+pilots in those of the stage.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd import Scene, Simulation
+from rigidmd.core.schemes import SCHEMES
+from rigidmd.errors import SimulationError
+from rigidmd.measure import choice, walk
+
+WATER = {"box": {"lengths_A": 12.42}, "molecules": [{"model": "spce", "count": 64}], "start": {"temperature_K": 300.0}}
+CO2 = {
+    "box": {"lengths_A": 17.0},
+    "molecules": [{"model": "co2_trappe", "count": 50}],
+    "start": {"temperature_K": 250.0},
+}
+ARGON = {"box": {"lengths_A": 17.0}, "molecules": [{"model": "argon", "count": 100}], "start": {"temperature_K": 120.0}}
+SCENES = {
+    "water": WATER | {"forces": {"cutoff_A": 6.0}},
+    "smooth": WATER | {"forces": {"cutoff_A": 6.0, "truncation": "smooth_switch"}},
+    "pme": WATER | {"forces": {"cutoff_A": 6.0, "electrostatics": "pme"}},
+    "co2": CO2 | {"forces": {"cutoff_A": 8.0, "electrostatics": "pme"}},
+    "argon": ARGON | {"forces": {"cutoff_A": 8.0}},
+}
+TOP = Path(__file__).parents[2] / "systems" / "heavy_top_3.toml"
+
+
+def counted(made: Callable[[], Simulation]) -> tuple:
+    """A simulation, its results, and the force evaluations of its pilots."""
+    forces, look = [0], choice.look
+
+    def counting(subject, trial, *more):
+        forces[0] += trial.steps * subject.methods[trial.integrator].force_evaluations
+        return look(subject, trial, *more)
+
+    choice.look = walk.look = counting
+    try:
+        simulation = made()
+        return simulation, simulation.run(), forces[0]
+    finally:
+        choice.look = walk.look = look
+
+
+def of_molecules(name: str, target: float, duration: float) -> list[str]:
+    """A line of the table."""
+    temperature = SCENES[name]["start"]["temperature_K"]
+    warm = {"ensemble": "nvt", "temperature_K": temperature, "duration_ps": 3.0}
+    stages = [warm, {"duration_ps": duration, "integrator": "auto", "energy_error_kT": target}]
+    output = {"trajectory": False, "figure": False, "log_interval_ps": 0.02}
+    scene = Scene.from_dict(SCENES[name] | {"stages": stages, "output": output})
+    _, results, forces = counted(lambda: Simulation(scene))
+    own = results["stage"] == 1
+    time, error = results["time"][own] - 3.0, results["drift"][own] / (2 * results["kinetic"][own].mean())
+    stage = results.summary["stages"][1]
+    ratios = [float(np.sqrt(np.mean(error[time <= end + 1e-9] ** 2))) / target for end in (0.1, 1.0, duration)]
+    of_stage = stage["steps"] * SCHEMES[stage["integrator"]].force_evaluations
+    return [
+        f"{stage['integrator']} {stage['timestep_fs']:.3g} fs",
+        *(f"{r:.2f}" for r in ratios),
+        f"{forces / of_stage:.2f}",
+    ]
+
+
+def of_top(target: float) -> list[str]:
+    """The same of a heavy top, over its run of 4 s."""
+    changes = {"run.integrator": "auto", "run.energy_error": target, "run.timestep_s": 0.05, "output.interval_s": 0.01}
+    simulation, results, forces = counted(lambda: Simulation(Scene.read(TOP, changes)))
+    run = simulation.scene.run
+    error = float(np.sqrt(np.mean(results["energy_error"] ** 2))) / target
+    of_run = run.duration_s / run.timestep_s * SCHEMES[run.integrator].force_evaluations
+    return [f"{run.integrator} {run.timestep_s:.3g} s", "", "", f"{error:.2f}", f"{forces / of_run:.2f}"]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--scenes", default=",".join([*SCENES, "top"]), help=f"of {','.join(SCENES)},top; all")
+    parser.add_argument("--targets", default="1e-3,1e-4,1e-5,1e-6,1e-7", help="1e-3,1e-4,1e-5,1e-6,1e-7")
+    parser.add_argument("--ps", type=float, default=10.0, help="length of the stage; 10")
+    asked = parser.parse_args()
+    print("| scene | target | chosen | 0.1 ps | 1 ps | whole stage | pilots |\n|---|---|---|---|---|---|---|")
+    for name in asked.scenes.split(","):
+        for target in map(float, asked.targets.split(",")):
+            try:
+                cells = of_top(target) if name == "top" else of_molecules(name, target, asked.ps)
+            except SimulationError as error:
+                cells = [str(error)]
+            print("|", " | ".join([name, f"{target:.0e}", *cells]), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
