@@ -2,10 +2,12 @@
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from math import inf
 from pathlib import Path
 
 import ase
+import ase.build
 import ase.io
 import numpy as np
 import pytest
@@ -82,9 +84,9 @@ SPECIES = {
 class Truth:
     """Molecules that are known: on a lattice so wide that none touch, turned at random."""
 
-    def __init__(self, kinds: list[str], seed: int = 0, edges=(14.0, 15.0, 16.0), cell=None):
+    def __init__(self, kinds: Sequence[str | Molecule], seed: int = 0, edges=(14.0, 15.0, 16.0), cell=None):
         rng = np.random.default_rng(seed)
-        self.species = [SPECIES[kind] for kind in kinds]
+        self.species = [SPECIES[kind] if isinstance(kind, str) else kind for kind in kinds]
         self.cell = np.diag(edges) if cell is None else np.array(cell)
         side = int(np.ceil(np.cbrt(len(kinds))))
         grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)[: len(kinds)]
@@ -383,6 +385,88 @@ def test_ions_among_waters(ending, tmp_path):
         "xyz": xyz(oxygens_of_all_first(truth), truth.cell),
     }
     same_molecules(read(tmp_path, text[ending], f"a.{ending}", species), truth, species, 0.02)
+
+
+def alike_by_name(molecule: Molecule, naming: str) -> Molecule:
+    """The molecule with names that some of its sites share."""
+    names = {
+        "elements": molecule.elements,
+        "hydrogens": [f"{e}{k}" if e not in ("H", "Cl") else e for k, e in enumerate(molecule.elements)],
+        "one": ["A"] * len(molecule.elements),
+    }[naming]
+    return dataclasses.replace(molecule, site_names=tuple(names))
+
+
+@pytest.mark.parametrize("naming", ["elements", "hydrogens", "one"])
+@pytest.mark.parametrize("order", ["as in the template", "shuffled within", "shuffled"])
+@pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
+def test_sites_that_share_names(naming, order, ending, tmp_path):
+    """Names decide only where they are unique; elements and geometry decide among the rest."""
+    species = [alike_by_name(SPECIES[k], naming) for k in ("benzene", "tip4p2005", "tetrachloromethane", "chiral")]
+    truth = Truth(3 * species, 21, edges=(27.0, 28.0, 29.0))
+    atoms, rng = truth.atoms(order == "as in the template"), np.random.default_rng(2)
+    if order == "shuffled":
+        rng.shuffle(atoms)
+    elif order == "shuffled within":
+        atoms = [atoms[i] for i in sorted(range(len(atoms)), key=lambda i: (atoms[i][2], rng.random()))]
+    called = {m.name: m.residue_names[0][:4] for m in species}
+    if ending == "gro":  # only names give the element here
+        if naming == "one":
+            atoms = [(e, e, *rest) for _, e, *rest in atoms]
+        residues = {k: called[m.name] for k, m in enumerate(truth.species)}
+        text, error = gro(atoms, box_of(truth.cell), 6, residue_names=residues), 2e-5
+    elif ending == "pdb":
+        text, error = pdb(atoms, cryst1(truth.cell), residue="MIX"), 2e-3
+    else:
+        text, error = xyz(atoms, truth.cell), 1e-8
+    same_molecules(read(tmp_path, text, f"a.{ending}", species), truth, species, error)
+
+
+@pytest.mark.parametrize("named", ["A", "B"])
+def test_a_unique_name_decides_between_sites_that_look_alike(named, tmp_path):
+    """Whichever of the two ends of a symmetric molecule has the name of the charged end."""
+    x = {"A": 1.16, "B": -1.16}
+    sites = [Site(name=n, element="O", mass_u=16.0, position_A=(at, 0.0, 0.0)) for n, at in x.items()]
+    sites += [Site(name="C", element="C", mass_u=12.0, position_A=(0.0, y, 0.0)) for y in (0.7, -0.7)]
+    other = "B" if named == "A" else "A"
+    rows = [("C", 5, 5.7, 5), (named, 6.16, 5, 5), ("C", 5, 4.3, 5), (other, 3.84, 5, 5)]
+    atoms = [(name, "", 0, np.array(place, float), None) for name, *place in rows]
+    found = read(tmp_path, gro(atoms, "2 2 2", 6), "a.gro", [molecule("m", tuple(sites), residue_names=("SOL",))])
+    assert found.residual_max < 1e-4
+    model = molecule("m", tuple(sites))
+    a = found.position[0] + found.rotation[0] @ model.positions_body[model.site_names.index("A")]
+    assert a == pytest.approx([6.16 if named == "A" else 3.84, 5, 5], abs=1e-4)
+
+
+@pytest.mark.parametrize("pair", [("isobutane", "trans-butane"), ("CH3CH2OH", "CH3OCH3"), ("left", "right")])
+def test_isomers_and_mirror_images_among_each_other(pair, tmp_path):
+    """Of one composition, without names but the elements, every molecule in an order of its own."""
+
+    def isomer(name):
+        known = ase.build.molecule("isobutane" if name in ("left", "right") else name)
+        if name in ("left", "right"):  # a twist makes it chiral
+            x, _, z = known.positions.T
+            known.positions[:, :2] += 0.35 * np.sin(np.stack([1.3 * z, 1.3 * z + x], axis=1))
+            known.positions[:, 0] *= 1 if name == "left" else -1
+        columns = zip(known.symbols, known.get_masses().tolist(), known.positions.tolist(), strict=True)
+        sites = tuple(Site(name=e, element=e, mass_u=m, position_A=(x, y, z)) for e, m, (x, y, z) in columns)
+        return molecule(name, sites)
+
+    species = [isomer(name) for name in pair]
+    truth = Truth(30 * species, 22, edges=(30.0, 31.0, 32.0))
+    rng = np.random.default_rng(4)
+    atoms = sorted(truth.atoms(), key=lambda atom: (atom[2], rng.random()))
+    found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", species)
+    assert found.species.tolist() == 30 * [0, 1]
+    same_molecules(found, truth, species, 1e-8)
+
+
+def test_the_deviation_of_sites_that_share_names_is_that_of_their_best_order(tmp_path):
+    truth = Truth([alike_by_name(SPECIES["benzene"], "elements")] * 2)
+    atoms = [(n, e, k, x + ([0.5, 0, 0] if i == 11 else 0), v) for i, (n, e, k, x, v) in enumerate(truth.atoms())]
+    text = gro(atoms[::-1], box_of(truth.cell), residue_names={0: "BNZ", 1: "BNZ"})
+    with pytest.raises(StructureError, match=r"molecule 2 .* is no benzene: an atom is 0\.[34]\d\d Å from the rigid"):
+        read(tmp_path, text, "a.gro", truth.species[:1])
 
 
 # a property: nothing that leaves the molecules what they are changes what is read
