@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.atoms import SAME_MASS, Atoms, element_of
+from rigidmd.assemble.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
 from rigidmd.assemble.cells import pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
@@ -114,6 +114,9 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     open_names = {name for name, labels in by_name.items() if len(labels) > 1}
     by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
     own_names = set(by_name) - vocabulary
+    points = {name: _labels(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names}
+    shared = {name for m in species if len(m.masses) > 1 for name in m.residue_names}
+    virtual = CHARMM_WATER[1] if set(CHARMM_WATER) <= set(atoms.names) else None
     known = {}
     hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
 
@@ -136,19 +139,24 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
                 return guess
         if name in own_names and (not element or element == "X"):
             return by_name[name]
+        if name == virtual:
+            return "X"
         if element:
             return isotope(element)
         if name in open_names:
             return f"{name}?"
-        if residue and residue[1] == name:  # an ion or a noble gas: NA, CL, AR
-            name = name.capitalize()
+        if residue and residue[1] in points and residue[1] not in shared:
+            return points[residue[1]]
+        if not residue or residue[1] == name:  # an ion or a noble gas: NA, CL, AR, SOD
+            ion = CHARMM_IONS.get(name.upper())
+            name = ion if ion in vocabulary else name.capitalize() if residue else name
         guess = isotope(element_of(name, vocabulary))
         return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
 
     found = []
     masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
     for name, element, mass, residue in zip(atoms.names, atoms.elements, masses, atoms.residue, strict=True):
-        key = (name, element, mass, bool(residue) and residue[1] == name)
+        key = (name, element, mass, residue[1:2])
         if key not in known:
             known[key] = kind(name, element, mass, residue)
         found.append(known[key])
