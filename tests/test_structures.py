@@ -1229,6 +1229,9 @@ def test_lammps_data_as_people_write_it(case, name, tmp_path):
         (data_of(WATER_DATA).replace("2 1.008", "2 light"), "line 12: expected a type and its mass, found 'light'"),
         (data_of(WATER_DATA, masses=""), "has no section Masses"),
         (data_of(WATER_DATA) + "25 9 1\n", "line 3 promises 24 atoms, the section Atoms has 25"),
+        (data_of(WATER_DATA, header="Atoms # bond\n\n"), "line 16: an atom of style 'bond' has 6 columns .*, found 7"),
+        (data_of(WATER_DATA).replace("\n3 1 2 ", "\n3 x 2 "), r"line 17: expected an atom .id mol type q x y z., found '3 x 2"),
+        (data_of(WATER_DATA).replace("xlo xhi", "xlo"), "there is no line 'LOW HIGH xlo xhi'"),
     ],
 )  # fmt: skip
 def test_lammps_data_that_cannot_be_read_say_where(text, message, tmp_path):
@@ -1603,6 +1606,14 @@ DAMAGED = {
     ),
     "empty.pdb": ("END\n", "holds no atoms"),
     "cut.xyz": (cut(xyz(WATERS.atoms(), WATERS.cell), 9), "line 1 promises 12 atoms, 7 are there"),
+    "lattice.xyz": (
+        '3\nLattice="9 0 0 0 9 0 0"\nO 0 0 0\nH 0 0 0\nH 0 0 0\n',
+        "line 2: expected nine numbers of Lattice",
+    ),
+    "columns.xyz": ("1\nProperties=species:S:1:pos:R:3:vel:R:3\nO 0 0 0\n", "line 3: expected 7 columns, species:S:1"),
+    "decimals.xyz": ("1\n\nO 0,1 0,2 0,3\n", "line 3: expected an atom of an .xyz: name, x, y, z, found"),
+    "nameless.xyz": ('1\nLattice="9 0 0 0 9 0 0 0 9" Properties=pos:R:3\n0 0 0\n', "holds no atoms with mass"),
+    "empty.cif": (" \n", "holds no atoms: it is empty"),
     "words.xyz": ("3\n\nO a b c\nH 0 0 0\nH 0 0 0\n", "line 3: expected an atom of an .xyz: .* found 'a b c'"),
     "cut.arc": (cut(arc(WATERS.atoms(), None), 9), r"promises 12 atoms, 8 are there"),
     "words.arc": (cut(arc(WATERS.atoms(), None), 12) + "x y\n", "line 13: expected an atom of Tinker's format"),
@@ -1610,7 +1621,7 @@ DAMAGED = {
     "short.cssr": ("a\nb\n", "too short for a .cssr"),
     "cut.data": (cut(lammps(WATERS, "x", 1.0), 24), r"line 3 promises 12 atoms, 7 are there: truncated\?"),
     "no_masses.data": (lammps(WATERS, "x", 1.0).replace("Masses", "Madness"), "no section Masses"),
-    "cut.cif": (cut(cif(), 8), "holds no atoms|cannot be read by ASE .*: is it complete"),
+    "cut.cif": (cut(cif(), 8), "holds no atoms|ASE, which reads this format, ends with"),
     "binary.gro": ("\x00\x01", "line 2: expected the number of atoms"),
     "strange.foo": ("x", "format is unknown to ASE"),
 }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, is_element
-from rigidmd.assemble.own_formats import numbers, promised_atoms
+from rigidmd.assemble.own_formats import numbers, promised_atoms, without_fortran
 from rigidmd.core.process import quiet
 from rigidmd.core.toml_text import whole_number
 from rigidmd.errors import StructureError
@@ -37,11 +37,10 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
         told = "its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"
         raise StructureError(str(path), [told]) from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
-        why = " ".join(str(error).split()) or "something is missing or out of place"
-        told = (
-            f"cannot be read by ASE ({type(error).__name__}: {why}): is it complete, and does its name tell its format?"
-        )
-        raise StructureError(str(path), [f"{told} Errors in .gro, .pdb and .xyz have a line"]) from None
+        why = " ".join(str(error).split()).rstrip(".") or "something is missing or out of place"
+        told = f"ASE, which reads this format, ends with {type(error).__name__}: {why}"
+        hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
+        raise StructureError(str(path), [f"{told}. {hint}"]) from None
     return [atoms for atoms in found if len(atoms)]
 
 
@@ -98,21 +97,22 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
             at += 1
             continue
         count = promised_atoms(path, at + 1, lines[at].strip(), len(lines) - at - 2)
-        clean += [lines[at], re.sub(r"(?<=\d)[dD](?=[-+]?\d)", "e", lines[at + 1])]
+        clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
-        column, place = _columns(properties.group(1)) if properties else (0, 1)
+        column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
+        what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
+        lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
+        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
+            raise StructureError(str(path), [f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}"])
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
+            if len(words) < width:
+                raise StructureError(str(path), [f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}"])
             if place is not None:
-                what = "an atom of an .xyz: name, x, y, z" if column == 0 and place == 1 else "the position of an atom"
-                given = words[place : place + 3]
-                values = numbers(path, k + 1, given if len(given) == 3 else [lines[k]], what)
-                words[place : place + 3] = [
-                    w if w[-1:] in ".0123456789" and "d" not in w.lower() else repr(x)
-                    for w, x in zip(given, values, strict=True)
-                ]
+                numbers(path, k + 1, words[place : place + 3], what)
+            words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
             labels.append(None)
-            if column is not None and len(words) > column:
+            if column is not None:
                 labels[-1] = _label(words[column], atom_types)
                 _, symbol = labels[-1]
                 words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol or "X"
@@ -152,10 +152,10 @@ def _residues(atoms) -> list[tuple] | None:
     return [(int(n), str(name)) for n, name in zip(numbers, atoms.arrays[RESIDUE_NAMES], strict=True)]
 
 
-def _columns(properties: str) -> tuple[int | None, int | None]:
-    """Columns of the species and the positions: 0 and 1 of `species:S:1:pos:R:3`; None without."""
+def _columns(properties: str) -> tuple[int | None, int | None, int]:
+    """Columns of the species and the positions, or None, and their number: 0, 1 and 4 of `species:S:1:pos:R:3`."""
     words, column, found = properties.split(":"), 0, {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         found["species" if name.lower() == "symbols" else name.lower()] = column
         column += 1 if (columns := whole_number(width)) is None else columns
-    return found.get("species"), found.get("pos")
+    return found.get("species"), found.get("pos"), column

@@ -92,12 +92,11 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
     known = {*mass_of, *labels, *number_of, *map(str, range(1, 1 + (whole_number(declared) or 0)))}
     column = _columns(path, style, rows, known)
-    width = max(column.values()) + 1
-    if short := [row for row in rows if len(row.words) < width]:
-        raise StructureError(
-            str(path),
-            [f"line {short[0].line}: expected {width} columns of an atom, found {' '.join(short[0].words)!r}"],
-        )
+    width, whole = len(column), [column[name] for name in ("id", "mol") if name in column]
+    for line, words, _ in rows:
+        if len(words) < width or any(whole_number(words[k]) is None for k in whole):
+            told = f"line {line}: expected an atom ({' '.join(column)}), found {' '.join(words)[:60]!r}"
+            raise StructureError(str(path), [told])
     rows = sorted(rows, key=lambda row: whole_number(row.words[column["id"]]) or 0)
     cell = _box(path, head)
     position = table(path, [(r.line, r.words[column["x"] : column["x"] + 3]) for r in rows], "three coordinates")
@@ -159,7 +158,7 @@ def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[s
                 ],
             )
         [columns] = fitting
-    if width < len(columns):
+    if width - len(columns) not in (0, 3):
         told = (
             f"line {line}: an atom of style {style!r} has {len(columns)} columns ({' '.join(columns)}), found {width}"
         )
@@ -188,9 +187,13 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
         return table(
             path, [by_name.get(name, (1, [])) for name in ("avec", "bvec", "cvec")], "three components of an edge"
         )
-    if "xlo xhi" not in by_name:
+    lines = [f"{x}lo {x}hi" for x in "xyz"]
+    if lacking := [line for line in lines if line not in by_name]:
+        if any(word.endswith(("lo", "hi")) for row in head for word in row.words):
+            told = f"the bounds of its box are incomplete: before the sections there is no line 'LOW HIGH {lacking[0]}'"
+            raise StructureError(str(path), [told])
         return None
-    low, high = table(path, [by_name.get(f"{x}lo {x}hi", (1, [])) for x in "xyz"], "two bounds of the box").T
+    low, high = table(path, [by_name[line] for line in lines], "two bounds of the box").T
     cell = np.diag(high - low)
     if "xy xz yz" in by_name:
         cell[1, 0], cell[2, 0], cell[2, 1] = numbers(path, *by_name["xy xz yz"], "three tilts of the box")

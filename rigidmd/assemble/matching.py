@@ -238,7 +238,7 @@ def _attempt(
             found.notes.append(f"atoms called {listed} tell no element: {by_shape} by shape")
     if faults:
         return [f"{_address(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
-    others = np.delete(np.arange(len(kinds)), np.concatenate(found.atoms))
+    others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
     found.massless.update(atoms.names[i] for i in others)
     return found
 
@@ -247,7 +247,7 @@ def _address(atoms: Atoms, run: list[int], number: int, how: str) -> str:
     listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
     if run == list(range(run[0], run[-1] + 1)):
         listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
-    residue = f", residue {atoms.residue[run[0]][1]!r}" if atoms.residue[run[0]] else ""
+    residue = f", residue {atoms.residue[run[0]][1]!r}" if "".join(atoms.residue[run[0]][1:2]) else ""
     return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
 
 

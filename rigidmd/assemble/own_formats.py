@@ -29,18 +29,15 @@ def promised_atoms(path: Path, line: int, text: str, there: int) -> int:
     return count
 
 
-def number(word: str) -> float:
-    """A number, also one with the exponent of Fortran's double precision, 1.5D+00. Raises ValueError."""
-    try:
-        return float(word)
-    except ValueError:
-        return float(re.sub(r"(?<=[\d.])[dD](?=[-+]?\d+$)", "e", word))
+def without_fortran(word: str) -> str:
+    """A number with the exponent of Fortran's double precision, 1.5D+00, as other languages write it."""
+    return re.sub(r"(?<=[\d.])[dD](?=[-+]?\d+$)", "e", word)
 
 
 def numbers(path: Path, line: int, words: list[str], what: str) -> list[float]:
     """Words of a line as numbers. Raises StructureError with the line and what was expected."""
     try:
-        return [number(word) for word in words]
+        return [float(without_fortran(word)) for word in words]
     except ValueError:
         raise StructureError(str(path), [f"line {line}: expected {what}, found {' '.join(words)[:60]!r}"]) from None
 
@@ -200,7 +197,7 @@ def _cryst1(line: int, text: str) -> tuple[np.ndarray | None, list[str]]:
     """The cell of a CRYST1 in words or in columns. Of one that is no cell, of zeros for one, None and a note."""
     for words in (text[6:].split()[:6], [text[a:b] for a, b in pairwise(CRYST1)]):
         with contextlib.suppress(ValueError):
-            values = [number(word) for word in words]
+            values = [float(word) for word in words]
             if len(values) == 6:
                 cell = _cell_of(values)
                 told = " ".join(f"{x:g}" for x in values)

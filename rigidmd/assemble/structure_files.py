@@ -170,6 +170,8 @@ def _frames(path: Path, atom_types: dict[str, str] | None, held: bytes | None) -
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     # Titles may be in any encoding; all data are ASCII. Windows begins files with a mark of the encoding.
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    if not text.strip():
+        raise StructureError(str(path), ["holds no atoms: it is empty"])
     reader = READERS.get(suffix) or next((r for begin, r in BEGINNINGS if begin.search(text[:BEGINNING])), None)
     if atom_types is not None and reader not in WITH_TYPES:
         raise StructureError(str(path), [NO_TYPES])
