@@ -97,6 +97,25 @@ def test_any_molecules_come_back(counts, tmp_path):
         assert np.abs((again.state.rotation - system.state.rotation)[turning]).max(initial=0.0) < 10 * digits
 
 
+@pytest.mark.parametrize("formula", ["SF6", "C6H6", "CH3CN", "isobutane"])
+def test_sites_of_a_geometry_share_names(formula, tmp_path):
+    """Atoms of ASE have no names but their elements: as template, as .cif, and as atoms, in any order."""
+    octahedron = 1.56 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+    one = Atoms(formula, octahedron) if formula == "SF6" else molecule(formula)
+    ase.io.write(tmp_path / "m.xyz", one, plain=True)
+    species = {"file": str(tmp_path / "m.xyz"), "sites": [{"name": e, "charge_e": 0.0} for e in set(one.symbols)]}
+    rng, atoms = np.random.default_rng(3), Atoms(cell=[20, 20, 40], pbc=True)
+    for k, turn in enumerate(random_rotations(rng, 3)):
+        order = rng.permutation(len(one))
+        atoms += Atoms(one.symbols[order], one.positions[order] @ turn.T + [10, 10, 10 + 10 * k])
+    ase.io.write(tmp_path / "crystal.cif", atoms)
+    for found in (atoms, ase.io.read(tmp_path / "crystal.cif")):
+        system = build(Scene.from_atoms(found, [species], forces={"cutoff_A": 6.0}))
+        assert len(system.state.position) == 3
+        assert np.sort(system.scene.atoms().positions, axis=0) == pytest.approx(np.sort(atoms.positions, axis=0), abs=1e-6)  # fmt: skip
+        assert any("largest 0.0000 Å" in note for note in system.notes)
+
+
 def test_a_scene_holds_its_atoms(waters, tmp_path):
     """No file is needed; a run in a folder has one, and repeats to the bit."""
     made = Scene.from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine")
@@ -460,6 +479,13 @@ def test_a_calculator_serves_other_atoms(waters):
     larger = waters.copy()
     larger.set_cell(waters.cell.array * 1.5, scale_atoms=False)
     assert calc.get_potential_energy(larger) == pytest.approx(RigidMD("spce", cutoff_A=4.0, truncation="smooth_switch").get_potential_energy(larger), rel=1e-12)  # fmt: skip
+
+
+def test_a_calculator_of_sites_that_share_names(waters):
+    sites = [site | {"name": site["element"]} for site in load_model("spce").sites()]
+    for atoms in (waters, waters[::-1]):
+        energies = [RigidMD(models, **FORCES).get_potential_energy(atoms) for models in ("spce", [{"name": "w", "sites": sites}])]  # fmt: skip
+        assert energies[1] == pytest.approx(energies[0], rel=1e-12)
 
 
 def test_a_scene_may_be_the_calculator(results, waters):

@@ -108,7 +108,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", '[structure]\nfile = "none.gro"\n[start]', ["line 13: structure.file: there is no such file", "none.gro"]),
         ("[start]", '[structure]\nfile = "bda.toml"\n[start]', ["line 13: structure.file: ", "did you mean bad.toml?"]),
         ("[start]", '[structure]\nfile = "."\n[start]', ["line 13: structure.file: is a folder"]),
-        ("[start]", '[structure]\nfile = "bad.toml"\natom_types = { 1 = "O" }\n[start]', ["line 12: structure: atom_types are of LAMMPS' data files (.data .lmp .lammps), not of bad.toml"]),
+        ("[start]", '[structure]\nfile = "bad.toml"\natom_types = { 1 = "O" }\n[start]', ["bad.toml: structure.atom_types is for formats whose atoms have types: LAMMPS' data files and dumps, .xyz"]),
         ("count = 20", 'count = 20\nparameters = "p.toml"', ["line 4: molecules.0: parameters would do nothing"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [30.0, 30.0, 90.0]", ["cannot form these angles"]),
         ("lengths_A = 20.0", "density_g_cm3 = 1.0\nangles_deg = [80.0, 80.0, 90.0]", ["angles_deg needs lengths_A"]),

@@ -12,6 +12,7 @@ from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError
 from rigidmd.molecules import GROUPS, MODELS, available_models, load_model, read_molecule, with_masses
 from rigidmd.output.molecule_report import bonds, models_table
+from rigidmd.output.scene_file import write_scene
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -360,6 +361,18 @@ duration_ps = 0.004
 """
 
 
+INNER = """
+name = "argon"
+[[sites]]
+name = "Ar"
+element = "Ar"
+mass_u = 39.948
+position_A = [0.0, 0.0, 0.0]
+sigma_A = 3.4
+epsilon_K = 120.0
+"""
+
+
 @pytest.fixture
 def own(tmp_path):
     """A folder with a geometry, a table of parameters and a scene."""
@@ -426,6 +439,24 @@ def test_a_run_keeps_the_table_and_runs_again_from_its_copy(own):
     again = Simulation(Scene.read(own / "out" / "scene.toml")).run()
     assert first.state.position.tobytes() == again.state.position.tobytes()
     assert again.system.species[0].mass == pytest.approx(6 * (12.011 + 2.014), rel=1e-4)
+
+
+@pytest.mark.parametrize("named", ["", 'name = "ring"\n'])
+def test_copied_files_do_not_rename_a_species(named, own):
+    """Also where other tables call it by its name."""
+    (own / "inner.toml").write_text(INNER)
+    species = f'parameters = "aromatic.toml"\n{named}'
+    other = '[[molecules]]\nfile = "inner.toml"\ncount = 2\n[fields]\nrestraints = [{ species = "SPECIES", stiffness_kJ_mol_A2 = 1.0 }]\n[start]'
+    name = "ring" if named else "benzene"
+    text = OWN.replace('parameters = "aromatic.toml"\n', species).replace("[start]", other.replace("SPECIES", name))
+    (own / "own.toml").write_text(text)
+    first = build(Scene.read(own / "own.toml"))
+    (own / "kept").mkdir()
+    write_scene(own / "kept", first.scene)
+    again = build(Scene.read(own / "kept" / "scene.toml"))
+    assert [m.name for m in again.species] == [m.name for m in first.species] == [name, "argon"]
+    assert [entry.label for entry in again.scene.molecules] == [name, "argon"]
+    assert again.scene.fields == first.scene.fields
 
 
 @pytest.mark.parametrize(
@@ -609,7 +640,8 @@ def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, capsys, m
     for what in ("masses", "positions_body", "charges", "sigma", "epsilon", "inertia"):
         assert getattr(before, what).tobytes() == getattr(after, what).tobytes(), what
     assert after.parameters == before.parameters == 6 * ({},) + 6 * ({"A": 0.1},)
-    assert (after.name, after.site_names, after.elements) == ("ring", before.site_names, before.elements)
+    assert (after.name, after.elements) == ("ring", before.elements)
+    assert after.site_names == tuple(f"{e}{k}" for e in "CH" for k in range(1, 7))  # atoms that share a name
     assert main(["models", "benzene.toml"]) == 0
     assert "78.1140 u, neutral" in capsys.readouterr().out
 
@@ -628,6 +660,23 @@ def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, capsys
     found = read_molecule(own / "heavy water.toml")
     assert found.mass == pytest.approx(15.999 + 2 * 2.0141, abs=1e-3)
     assert not found.charges.any()
+
+
+@pytest.mark.parametrize(
+    ("names", "numbered"),
+    [
+        ("O H H", "O H1 H2"),
+        ("H1 H1 H11 H12", "H13 H14 H11 H12"),
+        ("OW HW1 HW1 OW", "OW1 HW11 HW12 OW2"),
+        (" ".join(["HYDRO"] * 11), " ".join([*(f"HYDR{k}" for k in range(1, 10)), "HYD10", "HYD11"])),
+    ],
+)
+def test_sites_of_a_new_model_have_names_of_their_own(names, numbered, own, capsys, monkeypatch):
+    monkeypatch.chdir(own)
+    rows = [f"{name} {1.1 * k} {0.2 * k * k} 0" for k, name in enumerate(names.split())]
+    (own / "new.xyz").write_text(f"{len(rows)}\n\n" + "\n".join(rows) + "\n")
+    assert main(["models", "--from", "new.xyz"]) == 0
+    assert read_molecule(own / "new.toml").site_names == tuple(numbered.split())
 
 
 def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):

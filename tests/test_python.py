@@ -5,12 +5,14 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import BODIES, ROOT, small_scene
 
 import rigidmd
+from rigidmd.errors import SceneError
 from rigidmd.measure.columns import BODY, BODY_COLUMNS
 from rigidmd.measure.observables import Reading
 from rigidmd.measure.samples import COLUMNS
@@ -247,6 +249,66 @@ def test_the_package_passes_a_type_checker():
         for entry in found["generalDiagnostics"]
         if entry["severity"] != "information"
     ] == []
+
+
+@pytest.mark.parametrize(
+    ("key", "numpy", "plain"),
+    [
+        ("seed", np.int64(3), 3),
+        ("threads", np.uint8(2), 2),
+        ("molecules.0.count", np.int32(7), 7),
+        ("molecules.0.frozen", np.bool_(False), False),
+        ("molecules.0.frozen", np.arange(1, 4), [1, 2, 3]),
+        ("molecules.0.name", np.str_("water"), "water"),
+        ("box.lengths_A", np.array([20, 21, 22]), [20, 21, 22]),
+        ("box.lengths_A", np.array(20.0), 20.0),
+        ("box.lengths_A", (np.float32(20), np.int8(21), 22.5), [20.0, 21, 22.5]),
+        ("start.temperature_K", np.float32(300), 300.0),
+        ("forces.ewald_accuracy", np.float64(1e-5), 1e-5),
+        ("stages.0.duration_ps", np.int16(2), 2),
+        ("output.pressure_tensor", np.True_, True),
+        ("output.trajectory", Path("a.trr"), "a.trr"),
+        ("molecules.0.masses_u", {np.str_("H"): np.float32(2)}, {"H": 2.0}),
+    ],
+)
+def test_values_of_numpy_and_paths_in_a_scene(key, numpy, plain):
+    """In dictionaries, at any depth, and as what replaces their values."""
+    data = {
+        "box": {"lengths_A": 20.0},
+        "molecules": [{"model": "spce", "count": 5}],
+        "start": {"temperature_K": 300.0},
+        "forces": {"electrostatics": "ewald"},
+        "stages": [{"duration_ps": 1.0}],
+    }
+
+    def scene(value):
+        changed = json.loads(json.dumps(data))
+        *tables, last = key.split(".")
+        target = changed
+        for part in tables:
+            target = target[int(part)] if isinstance(target, list) else target.setdefault(part, {})
+        target[last] = value
+        return Scene.from_dict(changed)
+
+    assert scene(numpy) == scene(plain) == Scene.from_dict(data, overrides={key: numpy})
+    assert data == json.loads(json.dumps(data))
+    assert data["box"] == {"lengths_A": 20.0}  # an override leaves the dictionary as it was
+
+
+def test_paths_and_numbers_of_types_in_a_scene(tmp_path):
+    (tmp_path / "a.data").write_text("x")
+    data = {
+        "structure": {"file": Path("a.data"), "atom_types": {1: "O", np.int64(2): "H"}},
+        "molecules": [{"model": "spce"}],
+        "stages": [{"ensemble": "minimise"}],
+    }
+    scene = Scene.from_dict(data, tmp_path)
+    assert scene.structure.file == "a.data"
+    assert scene.structure.atom_types == {"1": "O", "2": "H"}
+    deep: list = []
+    deep.append(deep)
+    with pytest.raises(SceneError, match="more than 32 deep"):
+        Scene.from_dict(data | {"seed": deep}, tmp_path)
 
 
 def test_a_simulation_that_lacks_a_hook_is_not_made():

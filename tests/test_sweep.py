@@ -322,6 +322,25 @@ def test_from_python(argon, finished, copied):
 # Stops
 
 
+def test_values_of_numpy_in_a_sweep(argon, tmp_path):
+    """Arrays and their numbers name folders as numbers do."""
+    numbers = {"seed": [1, 2], "start.temperature_K": [90.5, 100.25], "stages.0.duration_ps": 0.5}
+    arrays = {
+        "seed": np.arange(1, 3),
+        "start.temperature_K": np.array([90.5, 100.25]),
+        "stages.0.duration_ps": np.float32(0.5),
+    }
+    listed = {"seed": (np.int64(k) for k in (1, 2)), "start.temperature_K": list(arrays["start.temperature_K"])}
+    wanted = sweeping.axes_of(numbers)
+    assert sweeping.axes_of(arrays) == wanted
+    assert sweeping.axes_of(listed) == wanted[:2]
+    found = [
+        [point.folder for point in long_sweep(argon, tmp_path / name, **changes).points]
+        for name, changes in (("a", numbers), ("b", arrays))
+    ]
+    assert found[0] == found[1]
+
+
 def long_sweep(argon, folder, **more):
     """Manifest of a sweep of three points that take a while."""
     changes = {

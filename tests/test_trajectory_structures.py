@@ -18,6 +18,7 @@ from rigidmd.assemble.structure import read_structure
 from rigidmd.assemble.structure_files import read_atoms, read_geometry
 from rigidmd.assemble.system import build
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.molecules import load_model
 from rigidmd.output.frame import Frame
 from rigidmd.output.readers import FORMATS
 from rigidmd.output.trajectory import from_files, in_memory, read_frames
@@ -39,11 +40,15 @@ duration_ps = 0.01
 """
 
 
-def make(folder, ending):
-    """A trajectory of two frames with its topology; returns its path and the system of the second frame."""
-    system = build(
-        small_scene({"tip4p2005": 4}, None, box={"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 95.0, 75.0]})
-    )
+def make(folder, ending, **species):
+    """A trajectory of two frames with its topology; returns its path and the system of the second frame.
+
+    species : a table of [[molecules]] in place of a shipped water
+    """
+    tables = {"box": {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 95.0, 75.0]}}
+    if species:
+        tables["molecules"] = [species | {"count": 4}]
+    system = build(small_scene({"tip4p2005": 4}, None, **tables))
     moved = system.state.copy()
     moved.position[:] += [40.0, 1.0, -3.0]
     moved.velocity[:] *= 2.0
@@ -143,8 +148,12 @@ def test_times_in_single_precision_are_evened_where_they_can_be():
 
 
 @pytest.mark.parametrize("ending", [".xtc", ".trr", ".gsd", ".dcd", ".nc"])
-def test_the_last_frame_of_a_trajectory(ending, tmp_path):
-    path, system, moved = make(tmp_path, ending)
+@pytest.mark.parametrize("names", ["OW HW1 HW2 MW", "O H H M", "O H H H", "Q Q Q Q"])
+def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
+    """Whatever names sites share, massless ones included."""
+    sites = load_model("tip4p2005").sites()
+    named = [site | {"name": name} for site, name in zip(sites, names.split(), strict=True)]
+    path, system, moved = make(tmp_path, ending, name="water", sites=named)
     names = None if ending == ".gsd" else tmp_path / "topology.gro"
     found = read_structure(path, system.species, None, True, 0.15, topology=names)
     error = 0.02 if ending == ".xtc" else 2e-5

@@ -1,4 +1,4 @@
-"""Structure files read through ASE, with corrections before or after for .pdb, .xyz and LAMMPS data."""
+"""Structure files read through ASE, with corrections before and after for .xyz."""
 
 import io
 import re
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
-from rigidmd.assemble.own_formats import promised_atoms
+from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, is_element
+from rigidmd.assemble.own_formats import numbers, promised_atoms, without_fortran
 from rigidmd.core.process import quiet
 from rigidmd.core.toml_text import whole_number
 from rigidmd.errors import StructureError
@@ -34,11 +34,13 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
         with quiet():
             found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
-        raise StructureError(
-            str(path), ["its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"]
-        ) from None
+        told = "its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"
+        raise StructureError(str(path), [told]) from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
-        raise StructureError(str(path), [f"ASE cannot read it: {type(error).__name__}: {error}"]) from None
+        why = " ".join(str(error).split()).rstrip(".") or "something is missing or out of place"
+        told = f"ASE, which reads this format, ends with {type(error).__name__}: {why}"
+        hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
+        raise StructureError(str(path), [f"{told}. {hint}"]) from None
     return [atoms for atoms in found if len(atoms)]
 
 
@@ -84,71 +86,40 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
     )
 
 
-def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
-    """The models of a .pdb, each with the last CRYST1 before it (which ASE forgets from model to model)."""
-    models, cryst, body = [], [], []
-    ends = next((line for line in reversed(lines) if line.strip()), "")
-    notes = ["it ends with an atom, without END: is it truncated?"] if ends.startswith(("ATOM", "HETATM")) else []
-    for number, line in enumerate([*lines, "END"], 1):
-        if line.startswith("CRYST1"):
-            if len(line[6:54].split()) < 6:
-                raise StructureError(
-                    str(path), [f"line {number}: CRYST1 needs three edges and three angles, found {line[6:].strip()!r}"]
-                )
-            cryst = [line]
-        elif line.startswith(("ATOM", "HETATM")):
-            body.append(line)
-        elif line.startswith("ORIGX"):
-            cryst = [*cryst, line]
-        elif line.startswith("END") and body:
-            models.append(partial(_pdb_model, path, cryst, body, notes if number > len(lines) else []))
-            body = []
-    return models
+def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = None) -> list[Callable[[], Atoms]]:
+    """The frames of a plain or extended .xyz through ASE, which needs elements where many files have names.
 
-
-def _pdb_model(path: Path, head: list[str], body: list[str], notes: list[str]) -> Atoms:
-    """One model through ASE, in lines as ASE expects them: an element in each, residues numbered anew."""
-    if len(places := {line[16:17] for line in body} - {"", " "}) > 1:
-        raise StructureError(str(path), [f"has alternate locations {', '.join(sorted(places))}; keep one of them"])
-    names, elements, residue, lines = [], [], [], []
-    count, last = 0, None
-    for line in body:
-        symbol = line[76:78].strip().capitalize()
-        names.append(line[12:16].strip())
-        elements.append(symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
-        if (here := line[17:27]) != last:  # name, chain, number and insertion code: numbers alone wrap or run out
-            count, last = count + 1, here
-        number = line[22:26].strip()
-        residue.append((whole_number(number), line[17:21].strip(), count))
-        lines.append(f"{line[:22]:22}{count % 10000:4d}{line[26:76]:50} X")
-    found = read_by_ase(path, io.StringIO("\n".join([*head, *lines]) + "\n"), format="proteindatabank")
-    if not found:
-        raise StructureError(str(path), ["holds no atoms that ASE can read"])
-    if count == 1 and not residue[0][1]:
-        residue = [()] * len(names)
-    return from_ase(path, found[0], names, elements, residue, notes=notes)
-
-
-def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
-    """The frames of a plain or extended .xyz through ASE, which needs elements where many files have names."""
-    labels, at = [], 0
-    while at < len(lines) and lines[at].strip():
+    atom_types : names in place of those in the file, as types of LAMMPS
+    """
+    labels, clean, at = [], [], 0
+    while at < len(lines):
+        if not lines[at].strip():
+            at += 1
+            continue
         count = promised_atoms(path, at + 1, lines[at].strip(), len(lines) - at - 2)
+        clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
-        column = _species_column(properties.group(1)) if properties else 0
+        column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
+        what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
+        lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
+        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
+            raise StructureError(str(path), [f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}"])
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
-            if column is None or len(words) <= column:
-                labels.append(None)
-                continue
-            name = words[column]
-            symbol = name.capitalize()
-            labels.append((name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""))
-            words[column] = symbol if is_element(symbol) else "H" if symbol in HEAVY_HYDROGEN else "X"
-            lines[k] = " ".join(words)
+            if len(words) < width:
+                raise StructureError(str(path), [f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}"])
+            if place is not None:
+                numbers(path, k + 1, words[place : place + 3], what)
+            words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
+            labels.append(None)
+            if column is not None:
+                labels[-1] = _label(words[column], atom_types)
+                _, symbol = labels[-1]
+                words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol or "X"
+            clean.append(" ".join(words))
         at += 2 + count
     frames, first = [], 0
-    for atoms in read_by_ase(path, io.StringIO("\n".join(lines) + "\n"), format="extxyz"):
+    for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []:
         own = labels[first : first + len(atoms)]
         first += len(atoms)
         named = len(own) == len(atoms) and None not in own
@@ -158,6 +129,17 @@ def read_xyz(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         masses = atoms.get_masses() if atoms.has("masses") else None
         frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms), masses))
     return frames
+
+
+def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
+    """Name and element of an atom; its name may be that of a type, or an atomic number."""
+    from ase.data import chemical_symbols
+
+    name = (atom_types or {}).get(name, name)
+    if (number := whole_number(name)) is not None and 0 < number < len(chemical_symbols):
+        name = chemical_symbols[number]
+    symbol = name.capitalize()
+    return name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""
 
 
 def _residues(atoms) -> list[tuple] | None:
@@ -170,82 +152,10 @@ def _residues(atoms) -> list[tuple] | None:
     return [(int(n), str(name)) for n, name in zip(numbers, atoms.arrays[RESIDUE_NAMES], strict=True)]
 
 
-def _species_column(properties: str) -> int | None:
-    """Which column holds the species: `species:S:1:pos:R:3` says 0; None if no column does."""
-    words, column = properties.split(":"), 0
+def _columns(properties: str) -> tuple[int | None, int | None, int]:
+    """Columns of the species and the positions, or None, and their number: 0, 1 and 4 of `species:S:1:pos:R:3`."""
+    words, column, found = properties.split(":"), 0, {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
-        if name.lower() in ("species", "symbols"):
-            return column
+        found["species" if name.lower() == "symbols" else name.lower()] = column
         column += 1 if (columns := whole_number(width)) is None else columns
-    return None
-
-
-def read_lammps(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    """LAMMPS data through ASE. The first line may name the units; real and metal differ only in velocities."""
-    text = "\n".join(lines) + "\n"
-    if promised := re.search(r"^[ \t]*(\d+)[ \t]+atoms\b", text, re.MULTILINE):
-        promised_atoms(path, text.count("\n", 0, promised.start()) + 1, promised[1], len(lines))
-    listed, labels = _lammps_types(lines)
-    if not listed and not labels and atom_types is None and re.search(r"^\s*Atoms\b", text, re.MULTILINE):
-        fault = "has no section Masses, from which its atom types could be told: name them by structure.atom_types"
-        raise StructureError(str(path), [fault])
-    units = re.search(r"\bunits\s*=?\s*(real|metal|si|cgs|electron)\b", text.split("\n", 1)[0])
-    try:
-        found = read_by_ase(path, io.StringIO(text), format="lammps-data", units=units.group(1) if units else "metal")
-    except StructureError:
-        if re.search(r"^\s*0\s+atoms\b", text, re.MULTILINE):
-            return []
-        raise
-    return [partial(_lammps_atoms, path, atoms, listed, labels, atom_types, units is not None) for atoms in found]
-
-
-def _lammps_types(lines: list[str]) -> tuple[list[str], dict[str, str]]:
-    """The atom types in the section Masses of LAMMPS data, and names of types from labels or one-word comments."""
-    listed, labels, words, section = [], {}, {}, ""
-    for line in lines[1:]:
-        data, _, comment = line.partition("#")
-        fields = data.split()
-        if fields and all(field.isalpha() for field in fields):
-            section = " ".join(fields)
-        elif len(fields) == 2 and section == "Masses":
-            listed.append(fields[0])
-            if len(comment.split()) == 1:
-                words[fields[0]] = comment.strip()
-        elif len(fields) == 2 and section == "Atom Type Labels":
-            labels[fields[0]] = fields[1]
-    return listed, words | labels
-
-
-def _lammps_atoms(
-    path: Path, atoms, listed: list[str], labels: dict[str, str], atom_types: dict[str, str] | None, units_known: bool
-) -> Atoms:
-    """Atoms named by type, as the scene or else the file names the types; molecules are residues."""
-    types = [str(t) for t in atoms.arrays["type"]]
-    if atom_types is not None:
-        present = sorted({*types, *listed}, key=int)
-        unknown, unnamed = [t for t in atom_types if t not in present], [t for t in present if t not in atom_types]
-        faults = []
-        if unknown:
-            faults.append(
-                f"structure.atom_types: there is no type {', '.join(unknown)}; there are {', '.join(present)}"
-            )
-        if unnamed:
-            faults.append(f"structure.atom_types does not say what type {', '.join(unnamed)} is")
-        if faults:
-            raise StructureError(str(path), faults)
-    names = labels if atom_types is None else atom_types
-    masses = atoms.get_masses() if listed else None
-    of_type = {} if masses is None else dict(zip(types, masses.tolist(), strict=True))
-    element = {t: element_of_mass(mass) for t, mass in of_type.items()}
-    result = from_ase(
-        path,
-        atoms,
-        [names.get(t, t) for t in types],
-        [element.get(t, "") for t in types],
-        [(int(n), "") for n in atoms.arrays["mol-id"]] if "mol-id" in atoms.arrays else None,
-        masses,
-    )
-    if result.velocity is not None and not units_known:
-        result.notes.append("its first line does not say its units ('units = real'): its velocities are not used")
-        return result._replace(velocity=None)
-    return result
+    return found.get("species"), found.get("pos"), column

@@ -7,6 +7,10 @@ import numpy as np
 
 SAME_MASS = 0.01  # masses that differ by less than this fraction are those of one element
 HEAVY_HYDROGEN = {"D": 2.014101777844, "T": 3.01604928132}  # u, AME2020; ASE has no symbols for them
+#: Names of ions in CHARMM's force fields that do not begin with their elements.
+CHARMM_IONS = {"SOD": "Na", "POT": "K", "CES": "Cs", "CLA": "Cl", "LIT": "Li", "RUB": "Rb", "CAL": "Ca", "BAR": "Ba"}
+#: CHARMM's names of the oxygen and the massless site of four-site waters, both of which begin like oxygen.
+CHARMM_WATER = ("OH2", "OM")
 #: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs give them.
 MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM|VS|XX?|Q)\d*", re.IGNORECASE)
 

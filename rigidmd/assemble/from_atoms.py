@@ -9,9 +9,11 @@ import numpy as np
 
 from rigidmd.assemble.ase_formats import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
 from rigidmd.assemble.cells import cell_fault
+from rigidmd.core.toml_text import plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import HELD
+from rigidmd.scene.species import SPECIES_FILES
 
 if TYPE_CHECKING:
     import ase
@@ -28,7 +30,7 @@ def scene_of_atoms(
     """See `Scene.from_atoms`. Raises SceneError."""
     if faults := atoms_faults(atoms):
         raise SceneError(SOURCE, faults)
-    data = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
+    data = plain_values(settings)
     faults = [f"{key} is given by the atoms and models" for key in ("molecules",) if key in data]
     structure, start, box = (data.setdefault(key, {}) for key in ("structure", "start", "box"))
     if faults := faults + _faults_of_tables(data):
@@ -125,14 +127,12 @@ def _faults_of_tables(data: Mapping[str, Any]) -> list[str]:
 def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Tables [[molecules]] of models. Files are absolute, or the scene would depend on the working directory."""
     found = []
-    for entry in [models] if isinstance(models, str | Mapping) else models:
-        if isinstance(entry, Mapping):
-            table = dict(entry)
-            for key in ("file", "parameters"):
-                if isinstance(table.get(key), str):
-                    table[key] = os.path.abspath(table[key])
-            found.append(table)
-        elif isinstance(entry, str | os.PathLike) and str(entry).endswith(".toml"):
+    models = plain_values(models)
+    for entry in models if isinstance(models, list) else [models]:
+        if isinstance(entry, dict):
+            paths = {key: os.path.abspath(entry[key]) for key in SPECIES_FILES if isinstance(entry.get(key), str)}
+            found.append(entry | paths)
+        elif isinstance(entry, str) and entry.endswith(".toml"):
             found.append({"file": os.path.abspath(entry)})
         else:
             found.append({"model": entry})

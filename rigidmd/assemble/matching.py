@@ -3,11 +3,11 @@
 from collections import Counter
 from itertools import groupby
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.atoms import SAME_MASS, Atoms, element_of
+from rigidmd.assemble.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
 from rigidmd.assemble.cells import pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.molecules import Molecule
@@ -17,8 +17,11 @@ from rigidmd.molecules import Molecule
 BOND_REACH = 1.25
 #: Partial assignments tried before the search for an order of atoms gives up.
 MOST_TRIES = 20_000
+MOST_DISTANCES = 1_000_000  # computed at a time
 #: u; engines without massless sites give them a mass below this.
 NO_MASS = 0.1
+#: Molecules that fit in no order, and the multiple of the tolerance to which their best order is sought for messages.
+MOST_NEAREST, NEAREST = 5, 3
 MOST_LISTED = 6  # atoms of a molecule that a message lists
 
 
@@ -107,9 +110,13 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
             by_name.setdefault(name, set()).add(label if mass > 0 else "X")
             if mass > 0:
                 by_mass.append((mass, label))
-    by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
     vocabulary = frozenset(label for _, label in by_mass)
+    open_names = {name for name, labels in by_name.items() if len(labels) > 1}
+    by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
     own_names = set(by_name) - vocabulary
+    points = {name: _labels(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names}
+    shared = {name for m in species if len(m.masses) > 1 for name in m.residue_names}
+    virtual = CHARMM_WATER[1] if set(CHARMM_WATER) <= set(atoms.names) else None
     known = {}
     hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
 
@@ -132,17 +139,24 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
                 return guess
         if name in own_names and (not element or element == "X"):
             return by_name[name]
+        if name == virtual:
+            return "X"
         if element:
             return isotope(element)
-        if residue and residue[1] == name:  # an ion or a noble gas: NA, CL, AR
-            name = name.capitalize()
+        if name in open_names:
+            return f"{name}?"
+        if residue and residue[1] in points and residue[1] not in shared:
+            return points[residue[1]]
+        if not residue or residue[1] == name:  # an ion or a noble gas: NA, CL, AR, SOD
+            ion = CHARMM_IONS.get(name.upper())
+            name = ion if ion in vocabulary else name.capitalize() if residue else name
         guess = isotope(element_of(name, vocabulary))
         return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
 
     found = []
     masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
     for name, element, mass, residue in zip(atoms.names, atoms.elements, masses, atoms.residue, strict=True):
-        key = (name, element, mass, bool(residue) and residue[1] == name)
+        key = (name, element, mass, residue[1:2])
         if key not in known:
             known[key] = kind(name, element, mass, residue)
         found.append(known[key])
@@ -183,6 +197,7 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
 class _Candidate(NamedTuple):
     species: int
     order: list[int]  # positions in the run, in the order of the massive sites
+    allowed: list[np.ndarray]  # (s, s) whether a site may be each atom of this order: by names, then by elements
     nameless: bool
 
 
@@ -203,7 +218,7 @@ def _attempt(
         rotation=np.zeros((n, 3, 3)),
         deviation=np.zeros(n),
         square=np.zeros(n),
-        massless=Counter(name for name, kind in zip(atoms.names, kinds, strict=True) if kind == "X"),
+        massless=Counter(),
         notes=[],
     )
     faults = {}
@@ -216,13 +231,15 @@ def _attempt(
             wanted = " or ".join(f"{species[k].name} ({_composition(species[k])})" for k in eligible)
             faults |= {m: f"has atoms {has}, expected {wanted}" for m in members}
             continue
-        _place(atoms, kinds, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
+        _place(atoms, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
         if any(c.nameless for c in candidates) and not faults:
             listed = ", ".join(name or "(no name)" for name in names)
             by_shape = species[found.species[members[0]]].name
             found.notes.append(f"atoms called {listed} tell no element: {by_shape} by shape")
     if faults:
         return [f"{_address(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
+    others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
+    found.massless.update(atoms.names[i] for i in others)
     return found
 
 
@@ -230,7 +247,7 @@ def _address(atoms: Atoms, run: list[int], number: int, how: str) -> str:
     listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
     if run == list(range(run[0], run[-1] + 1)):
         listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
-    residue = f", residue {atoms.residue[run[0]][1]!r}" if atoms.residue[run[0]] else ""
+    residue = f", residue {atoms.residue[run[0]][1]!r}" if "".join(atoms.residue[run[0]][1:2]) else ""
     return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
 
 
@@ -243,37 +260,50 @@ def _composition(molecule: Molecule) -> str:
 
 
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
-    """A run as a molecule of this species, or None. Atoms go by name if all names are its own, else by element."""
+    """A run as a molecule of this species, or None.
+
+    Atoms are first assigned by the names that occur as often among the atoms as among the sites, and by element among
+    the rest. Names that occur several times leave the order of their atoms to the geometry.
+    """
     sites = massive(molecule)
-    labels = [_labels(molecule)[s] for s in sites]
+    labels = _labels(molecule)
+    wanted = [(molecule.site_names[s], labels[s]) for s in sites]
+    if names == molecule.site_names and all(kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites):
+        # as in the files of a run, whatever names sites share
+        order, same = sites.tolist(), np.array([[labels[s] == labels[t] for t in sites] for s in sites])
+        return _Candidate(k, order, [np.eye(len(sites), dtype=bool), same], nameless=False)
     places = [i for i, kind in enumerate(kinds) if kind != "X"]
+    if len(places) > len(sites):
+        massless = {name for name, mass in zip(molecule.site_names, molecule.masses, strict=True) if mass == 0}
+        places = [i for i in places if not (kinds[i].endswith("?") and names[i] in massless)]
     if len(places) != len(sites):
         return None
     if len(places) > 1 and all(kinds[i].endswith("?") for i in places):
-        return _Candidate(k, places, nameless=True)
-    if Counter(kinds[i] for i in places) != Counter(labels):
+        return _Candidate(k, places, [np.ones((len(sites), len(sites)), bool)], nameless=True)
+    there = [(names[i], kinds[i]) for i in places]
+    if Counter(kind for _, kind in there) != Counter(label for _, label in wanted):
         return None
-    called = [names[i] for i in places]
-    if set(called) == {molecule.site_names[s] for s in sites}:
-        return _Candidate(k, [places[called.index(molecule.site_names[s])] for s in sites], nameless=False)
-    left = list(places)
-    order = []
-    for label in labels:
-        order.append(next(i for i in left if kinds[i] == label))
-        left.remove(order[-1])
-    return _Candidate(k, order, nameless=False)
+    count, count_wanted = Counter(there), Counter(wanted)
+    shared = {atom for atom in count if count[atom] == count_wanted[atom]}
+    group, group_wanted = ([key if key in shared else key[1] for key in keys] for keys in (there, wanted))
+    waiting: dict[Any, list[int]] = {}
+    for place, key in zip(places, group, strict=True):
+        waiting.setdefault(key, []).append(place)
+    queues = {key: iter(atoms) for key, atoms in waiting.items()}
+    order = [next(queues[key]) for key in group_wanted]
+    by_name, by_element = (
+        np.array([[one == other for other in keys] for one in keys])
+        for keys in (group_wanted, [label for _, label in wanted])
+    )
+    return _Candidate(k, order, [by_name, by_element], nameless=False)
 
 
-def _place(atoms, kinds, runs, members, candidates, species, cell, tolerance, found: Matched, faults: dict) -> None:
+def _place(atoms, runs, members, candidates, species, cell, tolerance, found: Matched, faults: dict) -> None:
     """Fit runs of one composition to their candidates; write into `found` or `faults`."""
     fits = []
     for c in candidates:
         order = np.array(runs)[:, c.order]
-        molecule = species[c.species]
-        labels = [_labels(molecule)[s] for s in massive(molecule)]
-        wild = [None if c.nameless else kinds[i] for i in order[0]]
-        allowed = np.array([[kind in (None, label) for kind in wild] for label in labels])
-        fits.append((order, _fit_in_any_order(atoms.position, order, molecule, cell, allowed, tolerance)))
+        fits.append((order, _fit_in_any_order(atoms.position, order, species[c.species], cell, c.allowed, tolerance)))
     for row, m in enumerate(members):
         limits = [tolerance * species[c.species].radius for c in candidates]
         good = [k for k, (_, fit) in enumerate(fits) if len(fits[k][0][row]) == 1 or fit.deviation[row] <= limits[k]]
@@ -287,37 +317,71 @@ def _place(atoms, kinds, runs, members, candidates, species, cell, tolerance, fo
             names = " or ".join(species[candidates[k].species].name for k in good)
             faults[m] = f"may be {names}: give them residue_names in the scene"
         else:
-            k = int(np.argmin([fit.deviation[row] / limit for (_, fit), limit in zip(fits, limits, strict=True)]))
+            off = [fit.deviation[row] for _, fit in fits]
+            if len(faults) < MOST_NEAREST:  # of the best order
+                points = [_whole(atoms.position[order[row]][None], cell)[0] for order, _ in fits]
+                tried = zip(points, candidates, limits, off, strict=True)
+                off = [_nearest(p, species[c.species], c.allowed[-1], limit, there) for p, c, limit, there in tried]
+            k = int(np.argmin(np.array(off) / limits))
             faults[m] = (
-                f"is no {species[candidates[k].species].name}: an atom is {fits[k][1].deviation[row]:.3f} Å from the "
-                f"rigid template, more than {limits[k]:.3f} Å (structure.tolerance)"
+                f"is no {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, more "
+                f"than {limits[k]:.3f} Å (structure.tolerance)"
             )
 
 
 def _fit_in_any_order(
-    position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: np.ndarray, tolerance: float
+    position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: list[np.ndarray], tolerance: float
 ) -> Fit:
     """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits.
 
-    allowed (s, s): whether a site may be each atom of the given order.
+    allowed: see _Candidate; each is tried where those before it give no fit
     """
     limit = tolerance * molecule.radius
     points = _whole(position[order], cell)
     fit = _fit(points, molecule)
-    bad = np.flatnonzero(fit.deviation > limit)
-    while len(bad) and allowed.sum() > len(allowed):
-        better = _search(points[bad[0]], molecule, allowed, limit)
-        if better is None:
-            bad = bad[1:]
-            continue
-        again = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
-        mended = again.deviation <= limit
-        for old, new in zip(fit, again, strict=True):
-            old[bad[mended]] = new[mended]
-        order[bad[mended]] = order[bad[mended]][:, better]
-        mended[0] = True  # even if rounding puts it just above the limit
-        bad = bad[~mended]
+    for way in allowed:
+        bad = np.flatnonzero(fit.deviation > limit)
+        if len(bad) and way.sum() > len(way):
+            bad = bad[_may_fit(points[bad], molecule, way, limit)]
+            while len(bad):
+                better = _search(points[bad[0]], molecule, way, limit)
+                if better is None:
+                    bad = bad[1:]
+                    continue
+                again = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
+                mended = again.deviation <= limit
+                for old, new in zip(fit, again, strict=True):
+                    old[bad[mended]] = new[mended]
+                order[bad[mended]] = order[bad[mended]][:, better]
+                mended[0] = True  # even if rounding puts it just above the limit
+                bad = bad[~mended]
     return fit
+
+
+def _nearest(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float) -> float:
+    """The deviation of the atoms (s, 3) of a molecule in the best order that is found, for messages."""
+    order = _search(points, molecule, allowed, NEAREST * limit, MOST_TRIES // 10)
+    return deviation if order is None else min(deviation, float(_fit(points[None, order], molecule).deviation[0]))
+
+
+def _may_fit(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:
+    """Which molecules (m, s, 3) have the distances of the template, without regard to which atoms they are between.
+
+    In a molecule that fits, every distance is that of the template to twice the limit; so are then those between two
+    kinds of atoms in order of their length.
+    """
+    template = molecule.positions_body[massive(molecule)]
+    i, j = np.triu_indices(len(template), 1)
+    kind = allowed.argmax(axis=1)
+    pair = np.minimum(kind[i], kind[j]) * len(kind) + np.maximum(kind[i], kind[j])
+
+    def sorted_distances(points: np.ndarray) -> np.ndarray:
+        distance = np.linalg.norm(points[:, i] - points[:, j], axis=2)
+        return np.take_along_axis(distance, np.lexsort((distance, np.broadcast_to(pair, distance.shape)), axis=1), 1)
+
+    wanted = sorted_distances(template[None])
+    blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)
+    return np.concatenate([(np.abs(sorted_distances(b) - wanted) <= 2 * limit).all(axis=1) for b in blocks])
 
 
 def _whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
@@ -341,7 +405,9 @@ def _fit(points: np.ndarray, molecule: Molecule) -> Fit:
     return Fit(centre, rotation, off.max(axis=1), (off**2).mean(axis=1))
 
 
-def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> list[int] | None:
+def _search(
+    points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, most: int = MOST_TRIES
+) -> list[int] | None:
     """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
 
     A depth-first search assigns atoms to sites one by one so that all distances agree: first closely, then up to twice
@@ -355,11 +421,11 @@ def _search(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: 
     def extended(order: list[int], closeness: float) -> list[int] | None:
         nonlocal tries
         site = len(order)
+        tries += 1
+        if tries > most:
+            return None
         if site == len(points):
             return order if _fit(points[None, order], molecule).deviation[0] <= limit else None
-        tries += 1
-        if tries > MOST_TRIES:
-            return None
         off = np.abs(there[:, order] - wanted[site, :site]).max(axis=1, initial=0.0)
         off[order] = inf
         off[~allowed[site]] = inf

@@ -1,6 +1,7 @@
 """A model of one's own, from the geometry of one molecule and a table of parameters."""
 
 from collections import Counter
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,6 +51,7 @@ def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnM
         used = [find_site(table.sites, *atom) for atom in dict.fromkeys(zip(names, elements, strict=True))]
         if idle := [entry.name for entry in table.sites if entry not in used]:
             notes.append(f"{parameters}: no atom uses {', '.join(idle)}")
+    sites = _numbered(sites)
     if long := sorted({atom for atom in names if len(atom) > 5}):
         notes.append(f"names of atoms have five characters at most: {', '.join(long)} are cut")
     atoms = read_atoms(geometry)
@@ -66,6 +68,22 @@ def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnM
         nearly = f"nearly but not exactly {f'{whole:+d}' if whole else 0}" if off < NEARLY else "not a whole number"
         notes.append(f"the charges sum to {found.charge:+.6g} e, {nearly}")
     return OwnModel(file, found, notes)
+
+
+def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
+    """Sites with unique names: those that share one are numbered, C1, C2, ..., within five characters."""
+    times = Counter(site.name for site in sites)
+    numbers = {name: count(1) for name in times}
+    taken = {name for name in times if times[name] == 1}
+    named = []
+    for site in sites:
+        name = site.name
+        while times[site.name] > 1 and (name == site.name or name in taken):
+            number = str(next(numbers[site.name]))
+            name = site.name[: 5 - len(number)] + number
+        taken.add(name)
+        named.append(site.model_copy(update={"name": name}))
+    return tuple(named)
 
 
 def _residue(atoms: Atoms) -> tuple[str, ...]:

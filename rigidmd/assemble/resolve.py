@@ -104,6 +104,11 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
         "output": _output(scene.output),
         "stages": tuple(resolved_stage(scene, stage) for stage in scene.stages),
     }
+    # A file is copied under another name, which must not rename the species.
+    tables["molecules"] = tuple(
+        entry if entry.file is None else entry.model_copy(update={"name": facts.species[k].name})
+        for k, entry in enumerate(scene.molecules)
+    )
     if scene.structure is not None:
         tables["structure"] = scene.structure.model_copy(update={"topology": scene.topology})
     reads_velocities = scene.structure is not None and scene.structure.velocities

@@ -72,8 +72,8 @@ def read_structure(
     topology: see Scene.structure. held: the content, where there is no file.
     """
     if path.suffix == ".npz":
-        if frame is not None:
-            raise StructureError(str(path), ["holds one state: leave out structure.frame"])
+        if needless := [f"structure.{key}" for key, value in (("frame", frame), ("atom_types", atom_types)) if value]:
+            raise StructureError(str(path), [f"holds one state with its names: leave out {' and '.join(needless)}"])
         found = _read_state(path, species)
         if periodic and wanted is None:
             _check_box(path, found.cell, [])

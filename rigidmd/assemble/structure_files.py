@@ -1,14 +1,22 @@
 """The atoms of a structure file of any format, read through ASE or by our own readers."""
 
+import bz2
+import codecs
+import gzip
+import lzma
+import re
+import tempfile
+import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.ase_formats import from_ase, read_by_ase, read_lammps, read_pdb, read_xyz
+from rigidmd.assemble.ase_formats import from_ase, read_by_ase, read_xyz
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of
-from rigidmd.assemble.own_formats import read_arc, read_cssr, read_gro
+from rigidmd.assemble.lammps_formats import read_data, read_dump
+from rigidmd.assemble.own_formats import read_arc, read_cssr, read_gro, read_pdb
 from rigidmd.assemble.trajectory_formats import read_trajectory
 from rigidmd.core.files import file_fault
 from rigidmd.core.memory import in_words, memory_fault
@@ -20,7 +28,8 @@ HEAVIEST = 1e30  # u
 FOR_BYTE = 20  # bytes of memory for each of a file: lines and words as text, numbers
 NO_VOLUME = 1e-9  # of a cell, relative to the cube of its longest edge
 ASE_TRAJECTORY = ".traj"
-READERS = {
+#: Readers of text by ending. The last ones take structure.atom_types.
+READERS: dict[str, Callable[..., list[Callable[[], Atoms]]]] = {
     ".gro": read_gro,
     ".arc": read_arc,
     ".txyz": read_arc,
@@ -29,7 +38,21 @@ READERS = {
     ".ent": read_pdb,
     ".xyz": read_xyz,
     ".extxyz": read_xyz,
+    **dict.fromkeys(LAMMPS_DATA, read_data),
 }
+WITH_TYPES = (read_xyz, read_data, read_dump)
+NO_TYPES = "structure.atom_types is for formats whose atoms have types: LAMMPS' data files and dumps, .xyz"
+#: How files begin whose ending says nothing.
+BEGINNINGS = (
+    (re.compile(r"\s*ITEM: (TIMESTEP|UNITS|TIME)\b"), read_dump),
+    (re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE), read_data),
+    (re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE), read_pdb),
+    (re.compile(r"\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"), read_xyz),
+    (re.compile(r".*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"), read_gro),
+)
+PACKED = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
+BEGINNING = 1 << 16  # characters
+PIECE = 1 << 24  # bytes that are unpacked at a time
 
 
 def read_atoms(
@@ -42,7 +65,7 @@ def read_atoms(
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
     frame: 1 for the first, -1 for the last; None where there must be only one, and for the last of a trajectory.
-    atom_types: names of the types in a LAMMPS data file. topology: a file with the names that a trajectory lacks.
+    atom_types: names of types, where a format has types. topology: a file with the names that a trajectory lacks.
     held: the content, where there is no file; `path` is then its name.
     """
     if held is None and (fault := file_fault(path)):
@@ -53,8 +76,12 @@ def read_atoms(
         raise StructureError(
             str(path), [f"holds no names of atoms, and {looked}: name a file that has them by structure.topology"]
         )
+    if suffix in TRAJECTORIES and topology is None and atom_types is not None:
+        raise StructureError(str(path), [NO_TYPES])
     if suffix in TRAJECTORIES:
-        atoms = read_trajectory(path, frame, None if topology is None else partial(read_atoms, topology))
+        atoms = read_trajectory(
+            path, frame, None if topology is None else partial(read_atoms, topology, None, atom_types)
+        )
     else:
         size = path.stat().st_size if held is None else len(held)
         if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
@@ -137,11 +164,40 @@ def _masses(atoms, suffix: str) -> np.ndarray | None:
 
 def _frames(path: Path, atom_types: dict[str, str] | None, held: bytes | None) -> list[Callable[[], Atoms]]:
     """One function for each structure of a file, which reads it."""
-    suffix = path.suffix.lower()
-    if suffix not in READERS and suffix not in LAMMPS_DATA:
-        found = read_by_ase(path, path)
-        return [partial(from_ase, path, atoms, masses=_masses(atoms, suffix)) for atoms in found]
-    # Titles may be in any encoding; all data are ASCII.
-    content = path.read_bytes() if held is None else held
-    lines = content.decode("utf-8", errors="replace").splitlines()
-    return read_lammps(path, lines, atom_types) if suffix in LAMMPS_DATA else READERS[suffix](path, lines)
+    content = _content(path) if held is None else held
+    name = Path(path.stem if path.suffix.lower() in PACKED else path.name)
+    suffix = name.suffix.lower()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    # Titles may be in any encoding; all data are ASCII. Windows begins files with a mark of the encoding.
+    text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    if not text.strip():
+        raise StructureError(str(path), ["holds no atoms: it is empty"])
+    reader = READERS.get(suffix) or next((r for begin, r in BEGINNINGS if begin.search(text[:BEGINNING])), None)
+    if atom_types is not None and reader not in WITH_TYPES:
+        raise StructureError(str(path), [NO_TYPES])
+    if reader is not None:
+        return reader(path, text.splitlines(), *([atom_types] if reader in WITH_TYPES else []))
+    with tempfile.TemporaryDirectory() as folder:
+        source = path
+        if name.name != path.name or wide or content.startswith(codecs.BOM_UTF8):
+            source = Path(folder) / name.name
+            source.write_bytes(text.encode() if wide else content.removeprefix(codecs.BOM_UTF8))
+        found = read_by_ase(path, source)
+    return [partial(from_ase, path, atoms, masses=_masses(atoms, suffix)) for atoms in found]
+
+
+def _content(path: Path) -> bytes:
+    """What a file holds, unpacked. Raises StructureError."""
+    if (opened := PACKED.get(path.suffix.lower())) is None:
+        return path.read_bytes()
+    pieces, size = [], 0
+    try:
+        with opened(path) as file:
+            while piece := file.read(PIECE):
+                pieces.append(piece)
+                size += len(piece)
+                if fault := memory_fault(FOR_BYTE * size, f"reading the {in_words(size)} that it unpacks to"):
+                    raise StructureError(str(path), [f"not enough memory: {fault}"])
+    except (OSError, EOFError, zlib.error, lzma.LZMAError) as error:
+        raise StructureError(str(path), [f"cannot be unpacked: {error}. Is it damaged?"]) from None
+    return b"".join(pieces)

@@ -1,8 +1,9 @@
 """TOML from strangers: files are read within bounds, and what no table may hold is found before anything else is."""
 
+import os
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from tomllib import TOMLDecodeError
@@ -52,6 +53,25 @@ def parse_toml(text: str) -> dict[str, Any]:
         line = text.count("\n", 0, number.start()) + 1 if number else 1
         why = "a whole number of more than 64 bits" if number else str(error)
         raise TOMLDecodeError(f"{why} (at line {line}, column 1)") from None
+
+
+def plain_values(data: Any, depth: int = 0) -> Any:
+    """Tables from Python as those of a file: texts for paths and numbers of keys, numbers and lists for NumPy's."""
+    match data:
+        case _ if depth > DEEPEST + 1:  # which `impossible_values` reports
+            return data
+        case Mapping():
+            return {
+                str(key) if isinstance(key, int) else key: plain_values(value, depth + 1)
+                for key, value in zip(map(plain_values, data), data.values(), strict=True)
+            }
+        case list() | tuple():
+            return [plain_values(value, depth + 1) for value in data]
+        case os.PathLike():
+            return os.fspath(data)
+        case _ if hasattr(data, "tolist"):  # NumPy's, without importing it
+            return data.tolist()
+    return data
 
 
 def impossible_values(data: Any) -> list[tuple[list, str]]:

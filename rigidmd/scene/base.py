@@ -14,6 +14,7 @@ from rigidmd.core.toml_text import (
     TOMLDecodeError,
     impossible_values,
     parse_toml,
+    plain_values,
     read_toml,
     shortened,
     whole_number,
@@ -183,9 +184,12 @@ class Scene(Section):
     ) -> "MolecularScene | BodyScene":
         """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault.
 
+        Numbers and arrays of NumPy and paths may stand for numbers, lists and texts. The dictionary is not changed.
+
         held : see `held`; files of a scene that holds inputs, which Python made, may be anywhere
         """
-        folder = Path(folder)
+        folder, data = Path(folder), plain_values(data)
+        overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
         from rigidmd.scene import BodyScene, MolecularScene
 
         kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind(data, BodyScene, MolecularScene)
@@ -193,7 +197,7 @@ class Scene(Section):
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults = [] if held else kind.strange_paths(data, folder)
         overridden = []
-        for named, value in (overrides or {}).items():
+        for named, value in overrides.items():
             key, wrong = _override(data, named, value)
             faults += wrong
             if value is None and whole_number(key.rpartition(".")[2]) is not None:

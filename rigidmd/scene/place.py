@@ -39,14 +39,8 @@ class Structure(Section):
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
     """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
     atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
-    """Of LAMMPS' data files: the site name or element of each atom type, { 1 = "O", 2 = "H" }; X has no mass. Default:
-    labels in the file, else masses"""
-
-    @model_validator(mode="after")
-    def _has_types(self):
-        if self.atom_types is not None and not self.file.lower().endswith(LAMMPS_DATA):
-            raise ValueError(f"atom_types are of LAMMPS' data files ({' '.join(LAMMPS_DATA)}), not of {self.file}")
-        return self
+    """Of LAMMPS' data files and dumps, and of .xyz: the site name or element of each atom type, { 1 = "O", 2 = "H" }; X
+    has no mass. Default: labels or elements in the file, else masses"""
 
     @model_validator(mode="after")
     def _needs_names(self):

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
-from rigidmd.core.toml_text import shortened, whole_number
+from rigidmd.core.toml_text import plain_values, shortened, whole_number
 from rigidmd.errors import SceneError
 from rigidmd.output.sweep_names import value_name
 from rigidmd.scene import parse_override
@@ -122,13 +122,15 @@ def checked(axes: Sequence[Axis]) -> list[Axis]:
 
 
 def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
-    """Axes from Python: key -> a list, tuple or range of values, or one value for all points. Keys that go together
-    are one text with commas. A list that is one value is put into a list: {"box.lengths_A": [[30, 30, 30]]}."""
+    """Axes from Python: key -> a list, tuple, array or range of values, or one value for all points. Keys that go
+    together are one text with commas. A list that is one value is put into a list: {"box.lengths_A": [[30, 30, 30]]}.
+    """
     found = []
     for name, told in sets.items():
         keys = tuple(key.strip() for key in name.split(","))
+        told = plain_values(told)
         swept = isinstance(told, Iterable) and not isinstance(told, str | bytes | Mapping)
-        found.append(Axis(keys, tuple(told) if swept else (told,), swept))
+        found.append(Axis(keys, tuple(map(plain_values, told if swept else (told,))), swept))
     return found
 
 
