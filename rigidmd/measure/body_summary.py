@@ -44,14 +44,14 @@ def summarise_body(
         if system.turns
         else None,
         "trajectory_A_per_m": system.scale,
-        "notes": _notes(system, motion),
+        "notes": _notes(system, motion, interrupted),
     }
 
 
-def _notes(system: BodySystem, motion: Motion) -> list[str]:
+def _notes(system: BodySystem, motion: Motion, interrupted: bool) -> list[str]:
     """Warnings about the results."""
     run, notes = system.scene.run, []
-    if abs(run.steps * run.timestep_s - run.duration_s) > 1e-9 * run.duration_s:
+    if not interrupted and abs(run.steps * run.timestep_s - run.duration_s) > 1e-9 * run.duration_s:
         notes.append(
             f"{run.duration_s:g} s is not a whole number of steps; this run is {run.steps * run.timestep_s:g} s long"
         )
