@@ -44,11 +44,11 @@ def summarise_body(
         if system.turns
         else None,
         "trajectory_A_per_m": system.scale,
-        "notes": _notes(system, motion),
+        "notes": _notes(system, motion, interrupted),
     }
 
 
-def _notes(system: BodySystem, motion: Motion) -> list[str]:
+def _notes(system: BodySystem, motion: Motion, interrupted: bool) -> list[str]:
     """Warnings about the results."""
     notes = system.notes
     if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
