@@ -549,7 +549,7 @@ def _precision(options: argparse.Namespace) -> int:
 
     scene = _read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-precision"
-    check_folder(folder, options.force)
+    check_folder(folder, options.force, names=FILES)
     integrators = options.integrators.split(",") if options.integrators else None
     try:
         timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
@@ -588,9 +588,10 @@ def _averages(
     from tqdm import tqdm
 
     from rigidmd.output.averages_report import FILES, advice, table_text, write_averages
-    from rigidmd.output.folder import make_folder
+    from rigidmd.output.folder import check_folder, make_folder
     from rigidmd.study.averages import SAMPLE_PS, averages
 
+    check_folder(folder, options.force, names=FILES)
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
         told = _progress(bar, "compiling, and running what comes before the last stage")
@@ -612,7 +613,7 @@ def _stability(options: argparse.Namespace) -> int:
     from rigidmd.study.stability.battery import battery, chosen
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
-    check_folder(folder, options.force)
+    check_folder(folder, options.force, names=FILES)
     total = len(chosen(options.case))
     with tqdm(total=total, disable=None, leave=False, bar_format="{l_bar}{bar}| {desc} [{elapsed}]") as bar:
         findings = []

@@ -251,8 +251,10 @@ def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
         assert all(CHECKPOINT in fault for fault in faults)
         return {name: array.tobytes() for name, array in kept.arrays.items()}
     owner = {LOG: "LogFile", TRAJECTORY: "Frames"}[name]
-    size, checksum = next(part["kept"] for who, part in kept.told["of"].items() if who.endswith(owner))[:2]
-    AppendedFile(folder / name, (size, checksum)).close()
+    size, checksum = next(part["kept"] for who, part in kept.told["of"].items() if who == owner)[:2]
+    found = AppendedFile(folder / name, (size, checksum))
+    found.cut()
+    found.close()
     return (folder / name).read_bytes()
 
 

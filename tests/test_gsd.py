@@ -121,7 +121,7 @@ def test_wrapped_centres_and_no_box(tmp_path):
         ("shorter", "2 frames are needed"),
         ("changed", "its checksum is not that"),
         ("noise", "Not a GSD file"),
-        ("missing", "No such file"),
+        ("missing", "there is no such file"),
         ("other", "2 frames are needed"),
     ],
 )
@@ -134,7 +134,10 @@ def test_a_file_that_changed_is_not_gone_on_with(fault, said, run, tmp_path):
         if state is states[1]:
             kept, content = file.kept, path.read_bytes()
     file.close()
+    longer = path.read_bytes()
     again = GsdFile(path, results.system, True, False, kept)
+    assert path.read_bytes() == longer
+    again.cut()
     again.close()
     assert path.read_bytes() == content
     if fault == "shorter":

@@ -1,5 +1,8 @@
 """Runs that are stopped and go on: to the same bits as one that never stopped."""
 
+import contextlib
+import copy
+import functools
 import hashlib
 import json
 import os
@@ -10,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,10 +22,12 @@ import pytest
 from conftest import ROOT
 
 from rigidmd import cli
-from rigidmd.errors import CheckpointError
-from rigidmd.output.checkpoint import read_checkpoint, write_checkpoint
+from rigidmd.core.files import AppendedFile
+from rigidmd.errors import CheckpointError, OutputError, SimulationError
+from rigidmd.output import checkpoint
+from rigidmd.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from rigidmd.output.folder import CHECKPOINT, PREVIOUS, FolderLock
-from rigidmd.run import Simulation, provenance
+from rigidmd.run import Simulation, provenance, run_together
 from rigidmd.run.observers import Every
 from rigidmd.scene import Scene
 
@@ -42,6 +48,26 @@ MINIMISE = {"ensemble": "minimise", "most_iterations": 5}
 def scene(*stages: dict, **changes) -> dict:
     """Forty waters."""
     return WATER | {"stages": list(stages)} | changes
+
+
+TOP = {
+    "body": {
+        "mass_kg": 0.15,
+        "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4],
+        "pinned": True,
+        "inertia_about": "pivot",
+        "centre_of_mass_m": [0.0, 0.0, 0.04],
+    },
+    "gravity": {},
+    "start": {"euler_angles_deg": [0.0, 40.0, 0.0], "euler_rates_rad_s": [0.0, 0.0, 60.0]},
+    "run": {"duration_s": 0.5, "timestep_s": 0.005},
+    "output": {"interval_s": 0.02, "figures": False},
+}
+
+
+def top(integrator: str) -> dict:
+    """A heavy top."""
+    return TOP | {"run": TOP["run"] | {"integrator": integrator}}
 
 
 def stopped_at(steps: set[int]) -> Every:
@@ -140,19 +166,7 @@ def test_pme_goes_on(tmp_path):
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
 def test_a_body_goes_on(integrator, tmp_path):
-    data = {
-        "body": {
-            "mass_kg": 0.15,
-            "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4],
-            "pinned": True,
-            "inertia_about": "pivot",
-            "centre_of_mass_m": [0.0, 0.0, 0.04],
-        },
-        "gravity": {},
-        "start": {"euler_angles_deg": [0.0, 40.0, 0.0], "euler_rates_rad_s": [0.0, 0.0, 60.0]},
-        "run": {"duration_s": 0.5, "timestep_s": 0.005, "integrator": integrator},
-        "output": {"interval_s": 0.02, "figures": False},
-    }
+    data = top(integrator)
     looks = Every(0.005, lambda moment: None)
     Simulation(Scene.from_dict(data), tmp_path / "whole", observers=looks).run()
     left = {30, 71}
@@ -289,6 +303,398 @@ def test_another_scene_is_not_gone_on_with(again, capsys):
     before = contents(again / "run")
     assert cli.main([*command, "--set", "threads=2"]) == 0
     assert contents(again / "run") != before
+
+
+def everything(folder: Path) -> dict[str, object]:
+    """All that is in a folder: bytes of files, targets of links."""
+    found = {path.name: path for path in sorted(folder.iterdir()) if path.name != ".rigidmd-lock"}
+    return {
+        name: os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else path.stat().st_mode
+        for name, path in found.items()
+    }
+
+
+def flip(path: Path) -> None:
+    """Damage a file within its first half."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 4
+    path.write_bytes(bytes(data))
+
+
+def linked(path: Path) -> None:
+    """Put a link to a copy elsewhere in the place of a file."""
+    path.rename(path.parent.parent / path.name)
+    path.symlink_to(path.parent.parent / path.name)
+
+
+def piped(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+BROKEN = {
+    "a damaged log": (lambda run: flip(run / "log.csv"), [], "log.csv has changed or is damaged"),
+    "a damaged trajectory": (lambda run: flip(run / "trajectory.xtc"), [], "trajectory.xtc has changed"),
+    "no log": (lambda run: (run / "log.csv").unlink(), [], "log.csv: there is no such file"),
+    "no trajectory": (lambda run: (run / "trajectory.xtc").unlink(), [], "trajectory.xtc: there is no such file"),
+    "a short log": (lambda run: os.truncate(run / "log.csv", 50), [], "log.csv is shorter than it was"),
+    "a linked log": (lambda run: linked(run / "log.csv"), [], "log.csv: is a link"),
+    "a linked trajectory": (lambda run: linked(run / "trajectory.xtc"), [], "trajectory.xtc: is a link"),
+    "a piped log": (lambda run: piped(run / "log.csv"), [], "log.csv: is no file but a pipe"),
+    "a shorter scene": (lambda run: None, ["--until", "0.001ps"], "longer already"),
+    "another seed": (lambda run: change(run / "scene.toml", "seed = 1", "seed = 2"), [], "seed is 2, there 1"),
+    "a figure of another": (
+        lambda run: [change(run / "scene.toml", "figure = false", "figure = true"), (run / "energy.png").touch()],
+        [],
+        "energy.png exists, was not written by rigidmd",
+    ),
+}
+
+
+def change(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_refused_resume_changes_nothing(case, again, capsys):
+    """Neither a summary nor frames beyond the checkpoint are lost: all is checked before the first change."""
+    run = again / "run"
+    data = Scene.read(again / "water.toml", {"threads": 1})
+    Simulation(
+        data, run, resume=True, observers=stopped_at({73})
+    ).run()  # its checkpoint before is older than its files
+    (run / CHECKPOINT).write_bytes((run / PREVIOUS).read_bytes())
+    damage, more, sentence = BROKEN[case]
+    damage(run)
+    before = everything(run)
+    assert cli.main(["resume", str(run), *more]) == 2
+    assert sentence in capsys.readouterr().err
+    assert everything(run) == before and "summary.json" in before
+
+
+@pytest.mark.parametrize("name", ["trajectory.gsd", "trajectory.traj", "trajectory.pdb"])
+def test_frames_beyond_a_checkpoint_outlive_a_refused_resume(name, again, capsys):
+    """Formats with a table or an end of their own."""
+    data = scene(NVT, output=WATER["output"] | {"trajectory": name}, threads=1)
+    run = again / "other"
+    Simulation(Scene.from_dict(data), run, observers=stopped_at({31})).run()
+    shutil.copy(run / CHECKPOINT, again)
+    Simulation(Scene.from_dict(data), run, resume=True).run()
+    shutil.copy(again / CHECKPOINT, run)
+    whole = contents(run)
+    (again / "log.csv").write_bytes((run / "log.csv").read_bytes())
+    flip(run / "log.csv")
+    before = everything(run)
+    assert cli.main(["resume", str(run)]) == 2
+    assert everything(run) == before
+    (run / "log.csv").write_bytes((again / "log.csv").read_bytes())
+    assert cli.main(["resume", str(run)]) == 0
+    assert contents(run) == whole
+    flip(run / name)
+    shutil.copy(again / CHECKPOINT, run)
+    before = everything(run)
+    capsys.readouterr()
+    assert cli.main(["resume", str(run)]) == 2
+    assert name in capsys.readouterr().err and everything(run) == before
+
+
+@pytest.mark.parametrize("command", ["report", "view", "analyse", "sweep", "run", "resume"])
+def test_no_command_writes_through_a_link(command, again, capsys):
+    """Folders of runs may come from strangers, with links in the place of any file: what these point to stays."""
+    run, away = again / "run", again / "away"
+    assert cli.main(["analyse", str(run), "--only", "density_profile"]) == 0
+    change(run / ".rigidmd-run", "log.csv", "log.csv\nreport.html\nview.html\nanalyses.csv")
+    for name in ("report.html", "view.html", "analyses.csv"):
+        (run / name).touch()
+    files = sorted(path.name for path in run.iterdir() if path.is_file())
+    assert ".trajectory.xtc_offsets.npz" in files and "density_profile.png" in files
+    shutil.copytree(run, again / "kept")
+    arguments = {
+        "run": ["run", str(again / "water.toml"), "-o", str(run), "--force", "--set", "stages.0.duration_ps=0.01"],
+        "sweep": ["sweep", str(again / "water.toml"), "--set", "seed=1", "-o", str(run)],
+        "analyse": ["analyse", str(run), "--only", "density_profile"],
+    }
+    # a resumed run is refused at the first link that it would continue, so each is tried by itself
+    for names in [[name] for name in files] if command == "resume" else [files]:
+        for folder in (run, away):
+            shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(again / "kept", run)
+        away.mkdir()
+        for name in names:
+            if name != ".rigidmd-lock":
+                (run / name).rename(away / name)
+                (run / name).symlink_to(away / name)
+        before = everything(away)
+        ended = cli.main(arguments.get(command, [command, str(run)]))
+        assert everything(away) == before, names
+        refuses = command == "sweep" or (command == "resume" and names[0] in ("log.csv", "trajectory.xtc"))
+        assert ended == (2 if refuses else 0), (names, capsys.readouterr().err)
+
+
+def test_a_file_that_grows_replaces_what_has_its_name(tmp_path):
+    """A link, a pipe or a file of others: what a link points to stays, and no pipe is waited for."""
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "link").symlink_to(tmp_path / "victim")
+    (tmp_path / "broken").symlink_to(tmp_path / "nothing")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("link", "broken", "pipe", "victim"):
+        file = AppendedFile(tmp_path / name)
+        file.append(b"mine")
+        file.close()
+        assert (tmp_path / name).read_bytes() == b"mine" and not (tmp_path / name).is_symlink()
+        assert (tmp_path / "victim").read_text() == ("mine" if name == "victim" else "precious")
+    assert not (tmp_path / "nothing").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        ("mine.trr", "output.trajectory=mine.trr"),
+        ("mine.gsd", "output.trajectory=mine.gsd"),
+        ("mine.pdb", "output.topology=mine.pdb"),
+        ("pressure_tensor.csv", "output.pressure_tensor_interval_ps=0.01"),
+        ("energy.png", "output.figure=true"),
+        ("last_good_state.npz", None),
+        ("log.csv", None),
+    ],
+)
+def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys):
+    run = again / "run"
+    marker = run / ".rigidmd-run"
+    marker.write_text("".join(line for line in marker.read_text().splitlines(keepends=True) if line.strip() != name))
+    (run / name).write_text("precious")
+    before = everything(run)
+    more = ["--set", setting] if setting else []
+    for how in (
+        ("--force", "--resume")
+        if setting and "trajectory" not in setting and "topology" not in setting and "pressure" not in setting
+        else ("--force",)
+    ):
+        assert cli.main(["run", str(again / "water.toml"), "-o", str(run), how, *more]) == 2
+        said = capsys.readouterr().err
+        assert f"{name} exists, was not written by rigidmd, and would be replaced" in said and "compiling" not in said
+        assert everything(run) == before
+
+
+def test_a_callback_that_changes_the_directory(again, monkeypatch):
+    """Paths are those of the start: neither another run is overwritten nor are files missing."""
+    elsewhere = again / "elsewhere"
+    shutil.copytree(again / "run", elsewhere / "run")
+    before = everything(elsewhere / "run")
+    monkeypatch.chdir(again)
+    data = scene(NVT | {"duration_ps": 0.02}, threads=1)
+    moved = Every(0.005, lambda moment: os.chdir(elsewhere))
+    results = Simulation(Scene.from_dict(data), "new", observers=moved).run()
+    assert everything(elsewhere / "run") == before and not (elsewhere / "new").exists()
+    assert {path.name for path in results.files} <= set(everything(again / "new"))
+    assert all(path.is_file() for path in results.files) and results.universe().trajectory.n_frames == 2
+    monkeypatch.chdir(again)
+    Simulation(Scene.from_dict(data | {"name": "new"}).lasting(0.03), "new", observers=moved, resume=True).run()
+    monkeypatch.chdir(again)
+    run_together([Simulation(Scene.from_dict(data | {"seed": k}), f"of{k}", observers=moved) for k in (1, 2)])
+    assert [path.name for path in elsewhere.iterdir()] == ["run"] and everything(elsewhere / "run") == before
+    assert len((again / "of2" / "log.csv").read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize("ends", ["raises", "exits", "returns"])
+@pytest.mark.parametrize("name", ["trajectory.xtc"])
+def test_a_forked_child_leaves_the_files_of_the_run_alone(ends, name, again):
+    """A child of a callback that unwinds, or comes back into the run, writes nothing and ends no lock."""
+    program = f"""
+import os, sys
+from rigidmd import Every, Scene, Simulation
+from rigidmd.errors import OutputError, SimulationError
+def fork(moment):
+    if moment.step == 12 and os.fork() == 0:
+        if {ends!r} == "raises":
+            raise SimulationError("the child")
+        if {ends!r} == "exits":
+            sys.exit(3)
+    elif moment.step == 12:
+        os.wait()
+scene = Scene.read("water.toml", {{"threads": 1, "output.log_interval_ps": 0.001, "output.trajectory": {name!r}, "stages.0.duration_ps": 0.03}})
+parent = os.getpid()
+try:
+    Simulation(scene, "forked", observers=Every(0.001, fork)).run()
+except (OutputError, SimulationError):
+    assert os.getpid() != parent
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=again, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    steps = [int(line.split(",")[0]) for line in (again / "forked" / "log.csv").read_text().splitlines()[1:]]
+    assert steps == list(range(31))
+    assert not (again / "forked" / "last_good_state.npz").exists()
+
+
+def test_a_run_cannot_run_itself(again, tmp_path):
+    data = Scene.from_dict(scene(NVT | {"duration_ps": 0.01}, threads=1))
+    simulation = Simulation(data, tmp_path / "run", observers=Every(0.005, lambda moment: simulation.run()))
+    with pytest.raises(RuntimeError, match="running already"):
+        simulation.run()
+    simulation = Simulation(data, tmp_path / "run", force=True)
+    assert simulation.run().summary["interrupted"] is False
+    for strange in (3, "runs/water", data, None):
+        with pytest.raises(TypeError, match="is no Simulation"):
+            run_together([simulation, strange])
+
+
+class Counting(Every):
+    """Counts its looks, also over stops, and sees to it that its memory is not that of another."""
+
+    def __init__(self, start: int):
+        super().__init__(0.01, self.count)
+        self.counted = start
+
+    def count(self, moment) -> None:
+        self.counted += 1
+
+    def memory(self) -> Checkpoint:
+        return Checkpoint({"counted": self.counted}, {"squares": np.arange(self.counted) ** 2})
+
+    def resume(self, run, kept) -> None:
+        self.counted = kept.told["counted"]
+        assert len(kept.arrays["squares"]) == self.counted
+
+
+def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
+    """What may change (figures, the user's own observers) takes no other observer's memory."""
+    data = scene(NVT, threads=1)
+    first, second = Counting(0), Counting(100)
+    Simulation(Scene.from_dict(data), again / "two", observers=[first, second, stopped_at({40})]).run()
+    assert (first.counted, second.counted) == (5, 105)
+    figure = data | {"output": data["output"] | {"figure": True}}
+    for now, own in (
+        (figure, [stopped_at({70}), Counting(0), Counting(0)]),
+        (data, [Counting(0), Counting(0), Counting(7)]),
+    ):
+        Simulation(Scene.from_dict(now), again / "two", resume=True, observers=own).run()
+    assert [one.counted for one in own] == [11, 111, 10]  # the third is new
+    assert not (again / "two" / "energy.png").exists() or "energy.png" in (again / "two" / ".rigidmd-run").read_text()
+
+
+def test_a_checkpoint_of_another_version_is_refused(again, capsys):
+    kept = read_checkpoint(again / "run" / CHECKPOINT)
+    for schema, age in ((1, "an earlier"), (99, "a later")):
+        told = np.frombuffer(json.dumps(kept.told | {"schema": schema}).encode(), np.uint8)
+        for name in (CHECKPOINT, PREVIOUS):
+            with zipfile.ZipFile(again / "run" / name, "w") as archive:
+                for member, array in {"told": told, **kept.arrays}.items():
+                    with archive.open(f"{member}.npy", "w") as file:
+                        np.lib.format.write_array(file, array)
+            with zipfile.ZipFile(again / "run" / name, "a") as archive:
+                archive.writestr("contents", checkpoint._contents(archive))
+        before = everything(again / "run")
+        assert cli.main(["resume", str(again / "run")]) == 2
+        assert f"was written by {age} rigidmd (version {schema} of the format" in capsys.readouterr().err
+        assert everything(again / "run") == before
+
+
+def altered(array: np.ndarray) -> dict[str, np.ndarray]:
+    """An array with other values: every kind of change that its type can hold."""
+    changed = {"longer": np.concatenate([array.reshape(-1), array.reshape(-1)[:1]]), "text": array.astype(str)}
+    changed["of another type"] = array.astype(np.float32 if array.dtype == np.float64 else np.float64)
+    if array.ndim:
+        changed["shorter"] = array[:-1]
+    values = {"off by one": lambda x: x + 1, "negative": lambda x: -x - 1, "zero": lambda x: 0 * x}
+    if array.dtype.kind == "f":
+        values |= {"nan": lambda x: x * np.nan, "infinite": lambda x: x + np.inf, "huge": lambda x: x + 1e300}
+    else:
+        values |= {"huge": lambda x: np.iinfo(array.dtype).max, "lowest": lambda x: np.iinfo(array.dtype).min}
+    with np.errstate(all="ignore"):
+        for name, function in values.items():
+            for place in (np.s_[...], *([0] if array.size > 1 else [])):
+                changed[f"{name}, {'all' if place is ... else 'first'}"] = other = array.copy()
+                flat = other.reshape(-1)
+                flat[place] = function(flat[place])
+    return {name: other for name, other in changed.items() if array.size and not np.array_equal(array, other)}
+
+
+def leaves(value: object, path: tuple = ()) -> list[tuple]:
+    """The paths of all values in nested lists and dictionaries, and of these."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path, *(leaf for key, part in inner for leaf in leaves(part, (*path, key)))]
+
+
+def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
+    """A checkpoint with one value changed, in every way."""
+    found = []
+    for name, array in kept.arrays.items():
+        for kind, other in altered(array).items():
+            found.append((f"{name}: {kind}", Checkpoint(kept.told, kept.arrays | {name: other})))
+        found.append((f"{name}: left out", Checkpoint(kept.told, {k: a for k, a in kept.arrays.items() if k != name})))
+    for path in leaves(kept.told)[1:]:
+        *way, last = path
+        whole = functools.reduce(lambda part, key: part[key], way, kept.told)[last]
+        others = [None, "x", [], {}, [None], -1.5, float("nan"), float("inf"), 10**30, -(10**30), 40, 7, -1]
+        others += [whole + 1, -whole, whole + 0.5] if isinstance(whole, int | float) else []
+        for other in others:
+            told = copy.deepcopy(kept.told)
+            functools.reduce(lambda part, key: part[key], way, told)[last] = other
+            if other != whole:
+                found.append((f"{'.'.join(map(str, path))}: {other!r:.20}", Checkpoint(told, kept.arrays)))
+    return found
+
+
+#: What nothing else in a checkpoint decides: other values of these are of another run, which must end by itself.
+FREE = re.compile(
+    r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load.torque_body"
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [("molecules", 120), ("verlet", 300), ("dop853", 300)]
+    + [pytest.param(kind, 10**6, marks=pytest.mark.slow) for kind in ("molecules", "verlet", "dop853", "rk4")],
+)
+def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
+    """With right checksums: refused with a sentence, or they change no bit. No crash, no hang, no wrong course."""
+    data = (
+        scene(NVT | {"duration_ps": 0.06}, threads=1)
+        if kind == "molecules"
+        else top(kind.replace("verlet", "velocity_verlet"))
+    )
+    stop = stopped_at({20} if kind == "molecules" else {30})
+    stop.interval = 0.001 if kind == "molecules" else 0.005
+    look = Every(stop.interval, lambda moment: None)
+    run = tmp_path / "run"
+    Simulation(Scene.from_dict(data), run, observers=stop).run()
+    shutil.copytree(run, tmp_path / "kept")
+    kept = read_checkpoint(run / CHECKPOINT)
+    Simulation(Scene.from_dict(data), run, observers=look, resume=True).run()
+    whole, wrong, same, refused = contents(run), [], 0, 0
+    changes = changes_of(kept)
+    for k in np.random.default_rng(count).permutation(len(changes))[:count].tolist():
+        name, changed = changes[k]
+        shutil.rmtree(run)
+        shutil.copytree(tmp_path / "kept", run)
+        before = everything(run)
+        write_checkpoint(run, changed)
+        with contextlib.suppress(FileNotFoundError):
+            before |= {file: (run / file).read_bytes() for file in (CHECKPOINT, PREVIOUS)}
+        try:
+            simulation = Simulation(Scene.from_dict(data), run, observers=look, resume=True, warn=lambda sentence: None)
+            simulation.run()
+        except CheckpointError:
+            refused += 1
+            if everything(run) != before:
+                wrong.append(f"{name}: refused, and files have changed")
+        except OutputError as error:
+            refused += 1
+            if "has changed or is damaged" not in str(error) and "shorter than it was" not in str(error):
+                wrong.append(f"{name}: {error}")
+        except SimulationError as error:
+            if not FREE.match(name):
+                wrong.append(f"{name}: {error}")
+        except Exception as error:
+            wrong.append(f"{name}: {error!r}")
+        else:
+            same += 1
+            if contents(run) != whole and not FREE.match(name):
+                wrong.append(f"{name}: other bits")
+    assert not wrong, f"{len(wrong)} of {count}, {same} the same, {refused} refused:\n" + "\n".join(wrong)
+    assert refused > same / 2
 
 
 @pytest.mark.parametrize("damage", ["flipped", "cut", "empty"])

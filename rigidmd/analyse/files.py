@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.analyse.findings import Curve, Finding, Value
 from rigidmd.analyse.history import History
 from rigidmd.analyse.registry import ORDER, place
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
 from rigidmd.output.figure import COLORS, FAINT, INK, drawing, few_decades, save_figure, thin_series
 from rigidmd.output.folder import add_to_folder, written_by_runs
@@ -60,8 +60,7 @@ def write_findings(
         files = []
         for curve in finding.curves:
             path, picture = folder / f"{curve.file}.csv", folder / f"{curve.file}.png"
-            with whole_file(path) as temporary:
-                temporary.write_text(_text(curve), encoding="utf-8")
+            write_text(path, _text(curve))
             pictures[picture] = curve
             written += [path, picture]
             files += [path.name, picture.name]
@@ -76,8 +75,7 @@ def write_findings(
     for name, why in failed.items():
         entries[name] = {"about": name, "values": [], "notes": [why], "curves": [], "files": [], "stretch": stretch}
     entries = dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
-    with whole_file(folder / ANALYSIS) as temporary:
-        temporary.write_text(json.dumps({"analyses": entries}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_text(folder / ANALYSIS, json.dumps({"analyses": entries}, indent=1, ensure_ascii=False) + "\n")
     for picture, curve in pictures.items():
         with drawing(picture) as temporary:
             save_figure(drawn(curve), temporary, dpi=150)

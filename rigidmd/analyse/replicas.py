@@ -11,7 +11,7 @@ import numpy as np
 from rigidmd.analyse.all import Task, analyse_folder
 from rigidmd.analyse.files import stretch_of, write_findings
 from rigidmd.analyse.findings import Curve, Finding, Value
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
 from rigidmd.measure.means import error_of_mean
 from rigidmd.output.folder import add_to_folder
@@ -212,8 +212,7 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
     add_to_folder(folder, [ANALYSES])
     stream = io.StringIO(newline="")
     csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n").writerows(lines)
-    with whole_file(folder / ANALYSES) as temporary:
-        temporary.write_text(stream.getvalue(), encoding="utf-8")
+    write_text(folder / ANALYSES, stream.getvalue())
 
 
 def _cell(value: Any) -> Any:

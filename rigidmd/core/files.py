@@ -14,6 +14,8 @@ from rigidmd.errors import OutputError
 
 #: Bytes that are read at a time.
 CHUNK = 1 << 20
+#: How an existing file is opened to be continued: no link is followed, where the system can do so.
+CONTINUED = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 
 def file_fault(path: Path, largest: float = inf) -> str:
@@ -38,7 +40,10 @@ def file_fault(path: Path, largest: float = inf) -> str:
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed to it when the block succeeds and removed when it fails."""
+    """A temporary path beside `path`, renamed to it when the block succeeds and removed when it fails.
+
+    A link at `path` is replaced, and what it points to stays.
+    """
     temporary = None
     try:
         beside = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
@@ -53,6 +58,18 @@ def whole_file(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text as a whole file. Raises OutputError."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def begin_file(path: Path) -> None:
+    """Make an empty file for a library that opens it by its name; what has the name, a link too, is removed first."""
+    path.unlink(missing_ok=True)
+    path.touch(exist_ok=False)
+
+
 def sync_file(path: Path) -> None:
     """Return when what has been written to a file or a folder is on the disk."""
     handle = os.open(path, os.O_RDONLY)
@@ -65,23 +82,34 @@ def sync_file(path: Path) -> None:
 class AppendedFile:
     """A file that grows by whole pieces. A piece that cannot be written is taken back. Methods raise OutputError.
 
-    kept : `kept` of an earlier time, at which an existing file goes on, its rest cut off; None begins a new file
+    A new file replaces what has its name; an existing one is continued where it was left, once `cut` has been called.
+    Neither follows a link.
+
+    kept : `kept` of an earlier time, at which the file is continued; None begins a new file
     patched : offset and first value of bytes that `patch` replaces
     """
 
     def __init__(self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")):
         self._path = path
         self._size, self._sum = kept or (0, 0)
-        with self._told():
-            self._file = path.open("wb" if kept is None else "r+b", buffering=0)
+        with self._told("written" if kept is None else "read"):
+            if kept is None:
+                begin_file(path)
+            elif path.is_symlink() or (fault := file_fault(path)):
+                raise OutputError(f"{path}: {'is a link' if path.is_symlink() else fault}; the run cannot continue it")
+            self._file = os.fdopen(os.open(path, CONTINUED), "r+b", buffering=0)
             if kept is not None:
                 try:
                     self._check(*patched)
                 except OutputError:
                     self._file.close()
                     raise
-                self._file.truncate(self._size)
-                self._file.seek(self._size)
+
+    def cut(self) -> None:
+        """Cut off what was appended after the time of `kept`."""
+        with self._told():
+            self._file.truncate(self._size)
+            self._file.seek(self._size)
 
     @property
     def kept(self) -> tuple[int, int]:
@@ -110,19 +138,18 @@ class AppendedFile:
             self._file.seek(self._size)
 
     def close(self) -> None:
-        """Close it."""
         with self._told():
             self._file.close()
 
     def _check(self, offset: int, first: bytes) -> None:
-        """Hold the file against its size and checksum."""
+        """Compare the file with its size and checksum."""
         found, left = 0, self._size
         while left and (piece := bytearray(self._file.read(min(left, CHUNK)))):
             if left == self._size:
                 piece[offset : offset + len(first)] = first
             found, left = zlib.crc32(piece, found), left - len(piece)
         if left:
-            raise OutputError(f"{self._path} is shorter than it was: {self._size} bytes are needed to go on with it")
+            raise OutputError(f"{self._path} is shorter than it was: {self._size} bytes are needed to continue it")
         if found != self._sum:
             raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
 
@@ -132,8 +159,8 @@ class AppendedFile:
             rest = rest[self._file.write(rest) :]
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _told(self, done: str = "written") -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
+            raise OutputError(f"{self._path} cannot be {done}: {error.strerror}") from None

@@ -89,19 +89,23 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     bad = {key for key, shape in shapes.items() if arrays[key].shape != shape or arrays[key].dtype.kind not in "fi"}
     sound = [key for key in shapes if key not in (*bad, "cell")]
     bad |= {key for key in sound if not (np.abs(arrays[key]) <= LARGEST).all()}  # NaN is not
-    if "cell" not in bad and not _is_cell(arrays["cell"]):
+    if "cell" not in bad and not is_cell(arrays["cell"]):
         bad.add("cell")
     bad |= {key for key in ("species", "residue_number") if key in arrays and arrays[key].dtype.kind != "i"}
     if "species" not in bad and not ((arrays["species"] >= 0) & (arrays["species"] < len(names))).all():
         bad.add("species")
-    if "rotation" not in bad and m:
-        gap = np.swapaxes(arrays["rotation"], 1, 2) @ arrays["rotation"] - np.eye(3)
-        if np.abs(gap).max() > NOT_A_ROTATION or (np.linalg.det(arrays["rotation"]) < 0).any():
-            bad.add("rotation")
+    if "rotation" not in bad and m and not are_rotations(arrays["rotation"]):
+        bad.add("rotation")
     return bad
 
 
-def _is_cell(cell: np.ndarray) -> bool:
+def are_rotations(matrices: np.ndarray) -> bool:
+    """Whether matrices (n, 3, 3) are rotations, as far as those at the end of a run are."""
+    gap = np.swapaxes(matrices, 1, 2) @ matrices - np.eye(3)
+    return bool(np.abs(gap).max(initial=0.0) <= NOT_A_ROTATION and (np.linalg.det(matrices) > 0).all())
+
+
+def is_cell(cell: np.ndarray) -> bool:
     """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or infinite edges, which are none."""
     if not np.isfinite(cell).all():
         return not np.isfinite(cell.diagonal()).any()

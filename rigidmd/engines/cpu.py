@@ -55,6 +55,8 @@ REMEMBERED = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
 #: dt, `until` and `looked` of `Engine.advance`.
 Orders = tuple[float, int, bool]
 DTYPES = {"double": np.float64, "mixed": np.float32}
+#: Relative difference of forces and virials that were computed on two machines.
+ROUNDING = {np.float64: 1e-8, np.float32: 1e-3}
 
 
 class Asks(Protocol):
@@ -255,18 +257,53 @@ class Engine:
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         """Go on from a state with what `memory` gave for it, to the same bits. Raises ValueError if they do not fit."""
-        own = self._prepare(state)
+        self._prepare(state)
         kept = {name: {key: memory[f"{name}.{key}"] for key in of} for name, of in _by_owner(memory).items()}
-        pairs = zip(self.names, own, strict=False)
-        found = tuple(recalled(workspace, kept.get(name, {})) for name, workspace in pairs)
-        self._workspaces = in_common(found) or own
+        if strange := kept.keys() - {*self.names, *REMEMBERED}:
+            raise ValueError(f"an engine of {', '.join(self.names)} remembers no {', '.join(sorted(strange))}")
+        self._recall_lists(state, kept)
         self.load, self._stale = no_load(state), LOAD not in kept
         self._loadings.pop("steps", None)  # what it knows of energies belongs to another moment
         if LOAD in kept:
             _fill(self.load, kept[LOAD])
         if BOX in kept:
-            self._room = box_room(state)
-            _fill(self._room, kept[BOX])
+            self._room = room = box_room(state)
+            _fill(room, kept[BOX])
+            if room.known[0] not in (0, 1) or not 0 <= room.counts[1] <= room.counts[0]:
+                raise ValueError("the moves of the box are not counted as a run counts them")
+        if LOAD in kept and not self._applied:
+            self._check_recalled(state, kept)
+
+    def _recall_lists(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
+        """New workspaces with the lists that were kept, all or none."""
+        own, now = tuple(with_code(workspace) for workspace in self.room(state)), float(state.time[NOW])
+        if kept.keys() & set(self.names):
+            pairs = zip(self.names, own, strict=False)
+            own = tuple(recalled(workspace, kept.get(name, {}), self._setup.skin, now) for name, workspace in pairs)
+        self._workspaces = in_common(own)
+
+    def _check_recalled(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
+        """Raise ValueError unless the forces that were kept are those of the state, computed with the lists."""
+        try:
+            load, tallies = self.evaluate(state)
+        except SimulationError as error:
+            raise ValueError(f"its state has no forces: {error}") from None
+        rounding = ROUNDING[self._setup.dtype]
+        for name, found, there in zip(Load._fields, load, self.load or (), strict=True):
+            if np.abs(found - there).max(initial=0.0) > rounding * np.abs(found).max(initial=0.0):
+                raise ValueError(f"its state has another {name} than was kept with it")
+        lists = {name: memory_of(workspace) for name, workspace in self.workspaces.items()}
+        served = all(np.array_equal(array, kept[name][key]) for name, of in lists.items() for key, array in of.items())
+        if BOX in kept:
+            if self._room is not None and self._room.known[0]:
+                parts = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
+                apart = np.abs(parts.sum(0) - self._room.tally[0]) > rounding * np.abs(parts).sum(0).max()
+                if apart[int(self._setup.presses) :].any():  # a piston asks for no energies
+                    raise ValueError("its state has another energy or virial than was kept with it")
+            if not served:  # they were built for a box that was tried and given up
+                self._recall_lists(state, kept)
+        elif not served:
+            raise ValueError("its neighbour lists are not those of its state")
 
     @staticmethod
     def _named(arrays: NamedTuple, owner: str) -> dict[str, np.ndarray]:
@@ -348,8 +385,10 @@ def _fill(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
     """Copy arrays of a memory into those of a tuple. Raises ValueError if they do not fit."""
     for name, array in kept.items():
         there = getattr(arrays, name)
-        if there.shape != array.shape:
-            raise ValueError(f"{name} has the shape {array.shape}, not {there.shape}")
+        if (there.shape, there.dtype) != (array.shape, array.dtype):
+            raise ValueError(f"{name} has the shape {array.shape}, not {there.shape}, or is of another type")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
         there[:] = array
 
 

@@ -198,6 +198,28 @@ class OdeEngine(Engine):
         super().recall(state, memory)
         self._anew = False
 
+    def check(self, state: State, row: Scheme | Solver, dt: float, start: State | None) -> None:
+        """Raise ValueError unless a state that was recalled is the one that its variables give.
+
+        start : where the run began, if forces have not changed since
+        """
+        solver, variables = _solver_of(row), len(state.bath) // 3
+        if solver.name != RK4:
+            time, length = state.bath[:2]
+            sizes = state.bath[2 + 2 * variables :]
+            if not (0 <= time <= state.time[NOW] and length >= 0 and (sizes > 0).all()):
+                raise ValueError("the last step of its solver is none")
+            if start is not None and not np.array_equal(sizes, self.variables(start, row)[2 + 2 * variables :]):
+                raise ValueError("the sizes of its variables are not those of the start")
+        again = state.copy()
+        try:
+            self.advance(again, row, dt, int(state.step[NOW]))
+        except (SimulationError, ValueError) as error:
+            raise ValueError(f"its solver finds no way to its state: {error}") from None
+        for name, found, there in zip(State._fields, again, state, strict=True):
+            if not np.allclose(found, there, rtol=1e-9, atol=1e-9 * np.abs(there[np.isfinite(there)]).max(initial=0.0)):
+                raise ValueError(f"its state has another {name} than its variables")
+
     def forget(self) -> None:
         """As `Engine.forget`; the variables stay, and the solver restarts."""
         super().forget()

@@ -64,9 +64,16 @@ def memory_of(workspace: NamedTuple) -> dict[str, np.ndarray]:
     return workspace.memory() if hasattr(workspace, "memory") else {}
 
 
-def recalled(workspace: NamedTuple, memory: dict[str, np.ndarray]) -> NamedTuple:
-    """The workspace, which has machine code, with what `memory_of` gave. Raises ValueError if that does not fit."""
-    return workspace.recall(memory) if memory else workspace
+def recalled(workspace: NamedTuple, memory: dict[str, np.ndarray], skin: float, now: float) -> NamedTuple:
+    """The workspace, which has machine code, with what `memory_of` gave. Raises ValueError if that does not fit.
+
+    skin : of neighbour lists, as asked for, Å. now : the present time, ps
+    """
+    if bool(memory) != hasattr(workspace, "memory"):
+        raise ValueError(
+            f"{type(workspace).__name__} {'lacks what it remembers' if not memory else 'remembers nothing'}"
+        )
+    return workspace.recall(memory, skin, now) if memory else workspace
 
 
 def add_forces(term, state, load, tally):

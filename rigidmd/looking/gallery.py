@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.errors import Faults
 from rigidmd.looking.body_film import body_film
 from rigidmd.looking.draw_body import BodyPicture
@@ -63,8 +63,7 @@ def write_gallery(
         f'<div class="cards">{"".join(cards)}</div>',
         code(command),
     ]
-    with whole_file(folder / INDEX) as temporary:
-        temporary.write_text(page("Tops, gyroscopes and a stone", parts, STYLE), encoding="utf-8")
+    write_text(folder / INDEX, page("Tops, gyroscopes and a stone", parts, STYLE))
     return folder / INDEX
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.assemble.body import BodySystem
 from rigidmd.assemble.system import System
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
 from rigidmd.looking.body_film import body_film
 from rigidmd.looking.columns import record_of
@@ -41,8 +41,7 @@ class Film:
     def save(self, path: str | Path) -> Path:
         """Write the page, replacing a file of that name. Raises OutputError."""
         path = Path(path)
-        with whole_file(path) as temporary:
-            temporary.write_text(self.page, encoding="utf-8")
+        write_text(path, self.page)
         return path
 
 

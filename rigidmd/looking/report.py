@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.analyse.files import drawn, read_findings
 from rigidmd.assemble.describe import describe
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.looking import plots
 from rigidmd.measure.means import mean, with_error
 from rigidmd.output.folder import SCENE
@@ -54,8 +54,7 @@ ABOUT = {
 def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
     """Write the page of the run in a folder. Returns its path, and what is missing. Raises OutputError."""
     record = read_record(folder)
-    with whole_file(path) as temporary:
-        temporary.write_text(page(f"{record.scene.name}: a run of rigidmd", parts(record)), encoding="utf-8")
+    write_text(path, page(f"{record.scene.name}: a run of rigidmd", parts(record)))
     return path, record.missing
 
 

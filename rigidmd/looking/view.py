@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.looking import plots, report
 from rigidmd.looking.body_film import BodyFilm, body_film
 from rigidmd.output.page import items, page
@@ -35,8 +35,7 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
         film, told = page_part(record)
     style = f"<style>{own('film.css')}</style>"
     parts = [*report.parts(record, film[0]), *film[1:]]
-    with whole_file(path) as temporary:
-        temporary.write_text(page(f"{record.scene.name}: the film of a run", parts, style), encoding="utf-8")
+    write_text(path, page(f"{record.scene.name}: the film of a run", parts, style))
     return path, [*record.missing, *told]
 
 

@@ -19,14 +19,13 @@ class Minimum(NamedTuple):
     after: float  # at the end
     force: float  # largest force on a molecule that is not frozen
     torque: float  # largest torque about a principal axis
-    pressure: np.ndarray  # (6,) by `boxes.COMPONENTS`, without the kinetic part; NaN without a box
+    pressure: tuple[float, ...] | None  # six, by `boxes.COMPONENTS`, without the kinetic part; None without a box
     deviation: float | None  # largest deviation from the pressure asked for; None if the cell does not relax
 
 
 def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
     """The figures of a minimum with units in their keys. Pressures are without the kinetic part; None without a box."""
-    pressure = found.pressure / BAR
-    boxed = bool(np.isfinite(pressure).all())
+    pressure = None if found.pressure is None else np.array(found.pressure) / BAR
     return {
         "converged": found.converged,
         "ended_by": found.why or None,
@@ -36,8 +35,8 @@ def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
         "energy_after_kJ_mol_per_molecule": found.after / KJ_PER_MOL / molecules,
         "largest_force_kJ_mol_A": found.force / KJ_PER_MOL,
         "largest_torque_kJ_mol": found.torque / KJ_PER_MOL,
-        "pressure_bar": float(pressure[:3].mean()) if boxed else None,
-        "pressure_tensor_bar": pressure.tolist() if boxed else None,
+        "pressure_bar": float(pressure[:3].mean()) if pressure is not None else None,
+        "pressure_tensor_bar": pressure.tolist() if pressure is not None else None,
         "largest_pressure_deviation_bar": None if found.deviation is None else found.deviation / BAR,
     }
 

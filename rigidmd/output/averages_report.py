@@ -5,7 +5,7 @@ import json
 from itertools import groupby
 from pathlib import Path
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import whole_file, write_text
 from rigidmd.measure.bias import SHARE, AverageRun, Averages, Quantity
 from rigidmd.output.figure import FAINT, INK, curve_style, drawing, save_figure
 from rigidmd.output.report import signed
@@ -128,8 +128,7 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(headers(found))
         writer.writerows(row(found, run) for run in found.runs)
-    with whole_file(folder / FILES[1]) as temporary:
-        temporary.write_text(json.dumps(as_data(found, command), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(folder / FILES[1], json.dumps(as_data(found, command), indent=2, allow_nan=False) + "\n")
     draw(folder / FILES[2], found)
     with drawing(folder / FILES[3]) as temporary:
         temporary.write_text(averages_page(found, command), encoding="utf-8")

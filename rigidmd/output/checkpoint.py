@@ -12,8 +12,8 @@ from rigidmd.core.files import sync_file, whole_file
 from rigidmd.errors import CheckpointError
 from rigidmd.output.folder import CHECKPOINT, PREVIOUS
 
-#: Of the files.
-SCHEMA = 1
+#: Of the files. Version 1 (rigidmd 0.1) named observers by their number.
+SCHEMA = 2
 #: Members that are no arrays of the run: the rest as JSON, and the names, lengths and CRC-32 of all other members.
 TOLD, CONTENTS = "told", "contents"
 
@@ -28,7 +28,14 @@ class Checkpoint(NamedTuple):
         """The part of one owner, whose arrays are called owner/name."""
         start = f"{owner}/"
         found = {name.removeprefix(start): array for name, array in self.arrays.items() if name.startswith(start)}
-        return Checkpoint(self.told["of"].get(owner, {}), found)
+        return Checkpoint(dict(self.told["of"].get(owner, {})), found)
+
+
+def count_list(values: Any) -> list[int]:
+    """A list of counts from a checkpoint. Raises ValueError if they are none."""
+    if not isinstance(values, list) or not all(type(value) is int and value >= 0 for value in values):
+        raise ValueError(f"{values!r:.60} are no sizes and checksums of a file")
+    return values
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -62,14 +69,16 @@ def read_checkpoint(path: Path) -> Checkpoint:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files if name != CONTENTS}
         told = json.loads(arrays.pop(TOLD).tobytes())
-        schema = told.pop("schema")
+        schema = int(told.pop("schema"))
     except FileNotFoundError:
         raise CheckpointError(f"{path}: there is no such file") from None
     except Exception as error:  # zipfile, zlib, numpy and json refusals all mean the same to the user
         raise CheckpointError(f"{path}: is damaged, or no checkpoint: {error}") from None
-    if schema > SCHEMA:
+    if schema != SCHEMA:
+        age = "a later" if schema > SCHEMA else "an earlier"
         raise CheckpointError(
-            f"{path}: was written by a later rigidmd (version {schema} of the format; this one reads up to {SCHEMA})"
+            f"{path}: was written by {age} rigidmd (version {schema} of the format; this one reads version {SCHEMA}): "
+            "finish the run with that one, or begin it again with --force"
         )
     return Checkpoint(told, arrays)
 

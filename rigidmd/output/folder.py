@@ -6,6 +6,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from rigidmd.core.files import write_text
 from rigidmd.core.toml_text import cut
 from rigidmd.errors import OutputError
 
@@ -20,8 +21,11 @@ LOCK = ".rigidmd-lock"
 SWEEP = "sweep.json"
 
 
-def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None:
-    """Raise OutputError if a run could not be written there, or would remove one of its inputs; changes nothing."""
+def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: Iterable[str] = ()) -> None:
+    """Raise OutputError if a run could not be written there, or would remove one of its inputs; changes nothing.
+
+    names : files that the run will write; of those that are there, an earlier run must have written all
+    """
     try:
         exists = folder.exists()
     except OSError as error:  # a name that is too long
@@ -43,11 +47,27 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = ()) -> None
                     raise OutputError(
                         f"{path} is an input of this run and would be replaced; name another folder with -o"
                     )
+            check_names(folder, names)
     parent = folder
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")
+
+
+def check_names(folder: Path, names: Iterable[str]) -> None:
+    """Raise OutputError if a file of one of these names is in a folder whose marker does not list it."""
+    known = {*written_by_runs(folder), MARKER, LOCK}
+    if strange := [name for name in names if name not in known and os.path.lexists(folder / name)]:
+        raise OutputError(
+            f"{folder / strange[0]} exists, was not written by rigidmd, and would be replaced; "
+            "move it away, or name another place with -o"
+        )
+
+
+def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
+    """List the files that may be removed from a folder with --force. Raises OutputError."""
+    write_text(folder / marker, "\n".join(dict.fromkeys(names)) + "\n")
 
 
 def make_folder(
@@ -57,15 +77,16 @@ def make_folder(
 
     lock : taken as soon as there is a folder. Raises OutputError.
     """
-    check_folder(folder, force, inputs)
+    names = list(names)
+    check_folder(folder, force, inputs, names)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if lock is not None and not lock.is_taken:
             lock.take()
-            check_folder(folder, force, inputs)  # another run may have made it meanwhile
+            check_folder(folder, force, inputs, names)  # another run may have made it meanwhile
         for name in written_by_runs(folder):
             (folder / name).unlink(missing_ok=True)
-        (folder / MARKER).write_text("\n".join(names) + "\n", encoding="utf-8")
+        write_marker(folder, names)
     except OSError as error:
         raise OutputError(f"{folder} cannot be made: {error.strerror}") from None
 
@@ -75,10 +96,9 @@ def continue_folder(folder: Path, names: Iterable[str]) -> None:
 
     Raises OutputError.
     """
+    add_to_folder(folder, names)
     try:
         (folder / SUMMARY).unlink(missing_ok=True)
-        everything = dict.fromkeys([*written_by_runs(folder), *names])
-        (folder / MARKER).write_text("\n".join(everything) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
 
@@ -96,11 +116,9 @@ def check_is_run(folder: Path) -> None:
 
 def add_to_folder(folder: Path, names: Iterable[str]) -> None:
     """Note files that are made from a run beside its own: a new run in the folder removes them. Raises OutputError."""
-    everything = dict.fromkeys([*written_by_runs(folder), *names])
-    try:
-        (folder / MARKER).write_text("\n".join(everything) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror}; name another file with -o") from None
+    names = list(names)
+    check_names(folder, names)
+    write_marker(folder, [*written_by_runs(folder), *names])
 
 
 class FolderLock:
@@ -138,6 +156,11 @@ def never_began(folder: Path) -> bool:
         return False
     log = folder / LOG
     return not log.exists() or len(log.read_bytes().splitlines()) <= 2  # its header, its start
+
+
+def offsets_of(trajectory: Path) -> list[Path]:
+    """The files that MDAnalysis writes beside a trajectory that it reads."""
+    return [trajectory.with_name(f".{trajectory.name}_offsets.{ending}") for ending in ("npz", "lock")]
 
 
 def is_empty(folder: Path) -> bool:

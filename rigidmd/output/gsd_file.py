@@ -6,7 +6,7 @@ orientation and angular momentum, and its sites as constituent particles. A mole
 
 import zlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from rigidmd.assemble.gsd_format import TIME, GsdReader, box_of, momentum_quaternion
 from rigidmd.assemble.system import System
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import begin_file, file_fault, whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
 from rigidmd.mechanics.rotation import to_quaternion
@@ -44,15 +44,15 @@ class GsdFile:
         self._velocities, self._wrapped = velocities, wrapped
         self._changing = PLACES | MOMENTA if velocities else PLACES
         self._layout()
-        self._sum, self._frames = 0, 0
+        self._sum, self._frames, self._kept = 0, 0, kept
+        self._file: Any = None
+        if kept is not None:
+            for _ in self._kept_frames():
+                pass
+            return
         try:
-            if kept is None:
-                path.touch()  # with the permissions of other files
-                self._file = gsd.hoomd.open(str(path), "w")
-                return
-            with whole_file(path) as temporary:
-                self._copy(temporary, *kept)
-            self._file = gsd.hoomd.open(str(path), "r+")
+            begin_file(path)
+            self._file = gsd.hoomd.open(str(path), "w")
         except (OSError, RuntimeError) as error:
             raise OutputError(f"{path} cannot be written: {_reason(error)}") from None
 
@@ -70,31 +70,45 @@ class GsdFile:
             raise OutputError(f"{self._path} cannot be written: {_reason(error)}") from None
         self._sum, self._frames = self._summed(frame), self._frames + 1
 
+    def cut(self) -> None:
+        """Leave out the frames that came after the time of `kept`."""
+        try:
+            with whole_file(self._path) as temporary, gsd.hoomd.open(str(temporary), "w") as new:
+                for frame in self._kept_frames():
+                    self._append(new, frame)
+            self._file = gsd.hoomd.open(str(self._path), "r+")
+        except (OSError, RuntimeError) as error:
+            raise OutputError(f"{self._path} cannot be written: {_reason(error)}") from None
+
     def close(self) -> None:
         """Finish the file."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     @staticmethod
     def _append(file: Any, frame: Any) -> None:
         file.append(frame)
         file.file.flush()  # after every frame, or the places of chunks would depend on when
 
-    def _copy(self, target: Path, kept_sum: int, frames: int) -> None:
-        """Copy the first frames, and hold them against their checksum."""
+    def _kept_frames(self) -> Iterator[Any]:
+        """The frames that a checkpoint knows, one after the other. Raises OutputError if they have changed."""
+        self._sum, (kept_sum, self._frames) = 0, self._kept or (0, 0)
         try:
-            reader = GsdReader(self._path)
-            if reader.count < frames or any(reader.size(k) != len(self._constant["mass"]) for k in range(frames)):
-                raise OutputError(f"{self._path} is not what it was: {frames} frames are needed to go on with it")
+            if fault := file_fault(self._path):
+                raise ValueError(fault)
+            reader, sizes = GsdReader(self._path), {len(self._constant["mass"])}
+            if reader.count < self._frames or not {reader.size(k) for k in range(self._frames)} <= sizes:
+                raise ValueError(f"{self._frames} frames of {sizes.pop()} particles are needed")
             reader.close()
-            with gsd.hoomd.open(str(self._path), "r") as old, gsd.hoomd.open(str(target), "w") as new:
-                for k in range(frames):
-                    self._append(new, old[k])
-                    self._sum = self._summed(old[k])
+            with gsd.hoomd.open(str(self._path), "r") as old:
+                for k in range(self._frames):
+                    frame = old[k]
+                    self._sum = self._summed(frame)
+                    yield frame
         except (ValueError, RuntimeError, KeyError, OSError) as error:
-            raise OutputError(f"{self._path} cannot be read to go on with it: {_reason(error)}") from None
+            raise OutputError(f"{self._path} cannot be read to continue it: {_reason(error)}") from None
         if self._sum != kept_sum:
             raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
-        self._frames = frames
 
     def _layout(self) -> None:
         """What is the same in every frame: molecules first, then the sites of those that have several."""

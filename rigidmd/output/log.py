@@ -28,7 +28,7 @@ def columns(tensor: bool = True, own: Sequence[str] = ()) -> dict[str, str]:
     return written if tensor else {name: header for name, header in written.items() if name not in TENSOR}
 
 
-class Log:
+class Log(AppendedFile):
     """Writes samples to a CSV file, numbers with all significant digits; missing values are empty. Raises OutputError.
 
     kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
@@ -42,7 +42,7 @@ class Log:
         self._time = shared.index("time")
         self._rows: list[list] = []
         self._written = self._came = -inf
-        self._file = AppendedFile(path, kept)
+        super().__init__(path, kept)
         if kept is None:
             self._rows.append(list(self._columns.values()))
             self.flush()
@@ -51,7 +51,7 @@ class Log:
     def kept(self) -> tuple[int, int]:
         """Bytes so far, all of them on the disk, and their checksum."""
         self.flush()
-        return self._file.kept
+        return super().kept
 
     def write(self, sample: Sample) -> None:
         """Add a line. It is written at once if none came shortly before."""
@@ -72,11 +72,11 @@ class Log:
         lines = io.StringIO(newline="")
         writer = csv.writer(lines, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
         writer.writerows([None if x != x else x for x in row] for row in rows)  # NaN
-        self._file.append(lines.getvalue().encode())
+        self.append(lines.getvalue().encode())
 
     def close(self) -> None:
         """Write the rest and close the file."""
         try:
             self.flush()
         finally:
-            self._file.close()
+            super().close()

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.molecules import LENNARD_JONES, MoleculeFile, Site
 
 #: Of a file whose sites have no interactions.
@@ -17,8 +17,7 @@ TO_FILL_IN = """# Sites have masses only: they do not act on anything. Give each
 
 def write_model(path: Path, model: MoleculeFile) -> None:
     """Write a model; it reads back to the same bits. Raises OutputError."""
-    with whole_file(path) as temporary:
-        temporary.write_text(model_text(model), encoding="utf-8")
+    write_text(path, model_text(model))
 
 
 def model_text(model: MoleculeFile) -> str:

@@ -19,26 +19,17 @@ def tensor_row(time: float, tensor: np.ndarray) -> list[float]:
     return [round(time, 9), *(float(tensor["xyz".index(a), "xyz".index(b)]) for a, b in COMPONENTS)]
 
 
-class TensorFile:
-    """Writes it line by line; `kept` of an earlier time is where an existing file goes on. Raises OutputError."""
+class TensorFile(AppendedFile):
+    """Written line by line; `kept` of an earlier time is where an existing file is continued. Raises OutputError."""
 
     def __init__(self, path: Path, kept: Sequence[int] | None = None):
-        self._file = AppendedFile(path, kept)
+        super().__init__(path, kept)
         if kept is None:
-            self._file.append((",".join(f'"{title}"' for title in HEADER) + "\n").encode())
-
-    @property
-    def kept(self) -> tuple[int, int]:
-        """Bytes so far, all of them on the disk, and their checksum."""
-        return self._file.kept
+            self.append((",".join(f'"{title}"' for title in HEADER) + "\n").encode())
 
     def write(self, row: list[float]) -> None:
         """Add a line."""
-        self._file.append((",".join(map(repr, row)) + "\n").encode())
-
-    def close(self) -> None:
-        """Close it."""
-        self._file.close()
+        self.append((",".join(map(repr, row)) + "\n").encode())
 
 
 def read_tensor(path: Path) -> np.ndarray | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import tomli_w
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import whole_file, write_text
 from rigidmd.output.folder import SCENE
 from rigidmd.scene import Scene
 from rigidmd.scene.molecules import HELD
@@ -34,5 +34,4 @@ def write_scene(folder: Path, scene: Scene) -> None:
         for part in tables:
             section = section[int(part) if isinstance(section, list | tuple) else part]
         section[last] = copied
-    with whole_file(folder / SCENE) as temporary:
-        temporary.write_text(tomli_w.dumps(data), encoding="utf-8")
+    write_text(folder / SCENE, tomli_w.dumps(data))

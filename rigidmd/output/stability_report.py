@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import whole_file, write_text
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
 from rigidmd.output.figure import INK, curve_style, drawing, few_decades
 
@@ -105,8 +105,7 @@ def write_stability(folder: Path, findings: list[Finding], command: str, machine
              "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]
         )  # fmt: skip
         writer.writerows(line for finding in findings for line in _csv_lines(finding))
-    with whole_file(folder / FILES[2]) as temporary:
-        temporary.write_text(markdown(findings, command, machine), encoding="utf-8")
+    write_text(folder / FILES[2], markdown(findings, command, machine))
     with drawing(folder / FILES[1]) as temporary:
         temporary.write_text(stability_page(findings, command, machine), encoding="utf-8")
     return [folder / name for name in FILES if (folder / name).is_file()]

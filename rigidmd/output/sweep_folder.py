@@ -7,9 +7,18 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
-from rigidmd.output.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_empty, written_by_runs
+from rigidmd.output.folder import (
+    LOCK,
+    MARKER,
+    SUMMARY,
+    SWEEP,
+    add_to_folder,
+    is_empty,
+    offsets_of,
+    written_by_runs,
+)
 from rigidmd.output.sweep_names import point_name, short_keys
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
@@ -19,8 +28,6 @@ FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)
 #: Of the manifest.
 SCHEMA = 1
 WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED = "waiting", "running", "finished", "interrupted", "failed"
-#: What MDAnalysis writes beside a trajectory .NAME that it reads.
-OFFSETS = ("_offsets.npz", "_offsets.lock")
 #: The key whose values make replicas.
 SEED = "seed"
 
@@ -135,8 +142,7 @@ def _is_whole(found: Manifest) -> bool:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write sweep.json as a whole. Raises OutputError."""
-    with whole_file(folder / MANIFEST) as temporary:
-        temporary.write_text(json.dumps({"schema": SCHEMA, **asdict(manifest)}, indent=1) + "\n", encoding="utf-8")
+    write_text(folder / MANIFEST, json.dumps({"schema": SCHEMA, **asdict(manifest)}, indent=1) + "\n")
 
 
 def check_sweep_folder(folder: Path) -> None:
@@ -163,8 +169,8 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
             continue
         try:
             for name in written_by_runs(inner):
-                for own in (name, *(f".{name}{ending}" for ending in OFFSETS)):
-                    (inner / own).unlink(missing_ok=True)
+                for own in (inner / name, *offsets_of(inner / name)):
+                    own.unlink(missing_ok=True)
             (inner / MARKER).unlink(missing_ok=True)
             if inner != folder:
                 (inner / LOCK).unlink(missing_ok=True)

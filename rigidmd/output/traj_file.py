@@ -1,8 +1,9 @@
 """Trajectories of molecules as ASE's own .traj, in double precision: for `ase gui` and `ase.io.read`."""
 
+import contextlib
 import os
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from ase.io.trajectory import TrajectoryWriter
 from rigidmd.assemble.system import System
 from rigidmd.assemble.to_atoms import atoms_of_sites
 from rigidmd.assemble.traj_format import ATOMS, MASSLESS, MASSLESS_VELOCITY, Stored, TrajReader
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import begin_file, file_fault, whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
 
@@ -31,18 +32,35 @@ class TrajFile:
         self._velocities, self._wrapped = velocities, wrapped
         self._atoms = np.flatnonzero(system.sites.mass > 0)
         self._others = np.flatnonzero(system.sites.mass == 0)
-        self._sum, self._frames = 0, 0
+        self._sum, self._frames, self._kept = 0, 0, kept
+        self._file: Any = None
         # its symbols, masses and periodicity are those of every frame
         self._like = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        if kept is None:
+            self._begin()
+        elif kept[1]:
+            for _ in self._kept_frames():
+                pass
+
+    def _begin(self) -> None:
         try:
-            if kept is None or kept[1] == 0:
-                self._file = TrajectoryWriter(path, "w")
-                return
-            with whole_file(path) as temporary:
-                self._copy(temporary, *kept)
-            self._file = TrajectoryWriter(path, "a")
+            begin_file(self._path)
+            self._file = TrajectoryWriter(self._path, "w")
         except OSError as error:
-            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"{self._path} cannot be written: {error.strerror or error}") from None
+
+    def cut(self) -> None:
+        """Leave out the frames that came after the time of `kept`."""
+        if not self._kept or not self._kept[1]:
+            self._begin()
+            return
+        with whole_file(self._path) as temporary, contextlib.closing(TrajectoryWriter(temporary, "w")) as new:
+            for frame in self._kept_frames():
+                self._append(new, frame)
+        try:
+            self._file = TrajectoryWriter(self._path, "a")
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be written: {error.strerror or error}") from None
 
     @property
     def kept(self) -> tuple[int, int]:
@@ -70,13 +88,15 @@ class TrajFile:
                 found = found._replace(massless_velocity=velocity[self._others])
         try:
             self._append(self._file, found)
+            self._sum, self._frames = self._summed(found), self._frames + 1
         except OSError as error:
             raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
 
     def close(self) -> None:
         """Finish the file."""
         try:
-            self._file.close()
+            if self._file is not None:
+                self._file.close()
         except OSError as error:
             raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
 
@@ -89,28 +109,28 @@ class TrajFile:
             atoms.set_momenta(frame.momenta)
         atoms.info = {"time_ps": frame.time, "step": frame.step}
         own = {MASSLESS: frame.massless, MASSLESS_VELOCITY: frame.massless_velocity}
-        if self._frames == 0:
+        if len(file.backend) == 0:
             own[ATOMS] = self._atoms.astype(np.int64)
         backend: Any = file.backend
         backend.write(**{name: array for name, array in own.items() if array is not None})
         file.write(atoms)
-        self._sum, self._frames = self._summed(frame), self._frames + 1
 
-    def _copy(self, target: Path, kept_sum: int, frames: int) -> None:
-        """Copy the first frames, and hold them against their checksum."""
+    def _kept_frames(self) -> Iterator[Stored]:
+        """The frames that a checkpoint knows, one after the other. Raises OutputError if they have changed."""
+        self._sum, (kept_sum, self._frames) = 0, self._kept or (0, 0)
         try:
-            old = TrajReader(self._path)
-            try:
-                if old.count < frames or old.sites != len(self._system.sites.mass):
-                    raise OutputError(f"{self._path} is not what it was: {frames} frames are needed to go on with it")
-                with TrajectoryWriter(target, "w") as new:
-                    for k in range(frames):
-                        self._append(new, old.read(k))
-            finally:
-                old.close()
+            if fault := file_fault(self._path):
+                raise ValueError(fault)
+            with contextlib.closing(TrajReader(self._path)) as old:
+                if old.count < self._frames or old.sites != len(self._system.sites.mass):
+                    raise ValueError(f"{self._frames} frames of {len(self._system.sites.mass)} sites are needed")
+                for k in range(self._frames):
+                    frame = old.read(k)
+                    self._sum = self._summed(frame)
+                    yield frame
         except (ValueError, OSError) as error:
             reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-            raise OutputError(f"{self._path} cannot be read to go on with it: {reason}") from None
+            raise OutputError(f"{self._path} cannot be read to continue it: {reason}") from None
         if self._sum != kept_sum:
             raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
 

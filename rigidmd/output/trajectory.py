@@ -21,6 +21,7 @@ from rigidmd.core.process import quiet
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError, StructureError
 from rigidmd.output.connections import charges, connections
+from rigidmd.output.folder import offsets_of
 from rigidmd.output.frame import Frame
 from rigidmd.output.readers import FORMATS, TIMED, TimedFrames, dimensions
 
@@ -92,6 +93,7 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
 
 def from_files(system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
     """The Universe of a finished run's files, whose frames have these times (ps), with all that its system tells."""
+    _drop_links(trajectory)
     u = mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
     u.add_TopologyAttr("elements", system.sites.element)
     u.add_TopologyAttr("masses", system.sites.mass)
@@ -148,6 +150,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def _frames(path: Path, sites: int, most: int) -> Frames:
+    _drop_links(path)
     reader: Any = open_reader(str(path), format=FORMATS.get(path.suffix, path.suffix[1:]))
     with contextlib.closing(reader):
         if reader.n_atoms != sites:
@@ -196,6 +199,13 @@ def _told_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
                 if found[1]:
                     cells.append(np.array(found[1].split(), float).reshape(3, 3))
     return times, cells
+
+
+def _drop_links(path: Path) -> None:
+    """Remove links that MDAnalysis would follow when it writes beside a trajectory."""
+    for beside in offsets_of(path):
+        if beside.is_symlink():
+            beside.unlink()
 
 
 def read_rotations(path: Path) -> np.ndarray:

@@ -72,7 +72,7 @@ class TrajectoryFile:
     write is checked, a file that ends early ends with a whole frame, and a run can go on with the file of another.
 
     interval : time between frames (ps); only .dcd uses it, which stores it once for all frames
-    kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
+    kept : `kept` of an earlier time, at which an existing file is continued after `cut`; None begins a new file
     Raises OutputError, here and in every method.
     """
 
@@ -118,6 +118,10 @@ class TrajectoryFile:
         if self._format in COUNTER:
             offset, form = COUNTER[self._format]
             self._file.patch(offset, struct.pack(form, self._frames))
+
+    def cut(self) -> None:
+        """Cut off the frames that came after the time of `kept`."""
+        self._file.cut()
 
     def close(self) -> None:
         """Finish the file."""

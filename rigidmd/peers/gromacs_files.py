@@ -11,7 +11,7 @@ from shlex import quote
 import numpy as np
 from scipy.special import erfc
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.core.state import State
 from rigidmd.forces.laws.coulomb import ReactionField
 from rigidmd.forces.laws.screened import ScreenedCoulomb
@@ -115,8 +115,7 @@ def write_gromacs(folder: Path, portrait: Portrait, state: State) -> list[str]:
         SCRIPT: _script(names),
     }
     for name, content in text.items():
-        with whole_file(folder / name) as temporary:
-            temporary.write_text(content, encoding="utf-8")
+        write_text(folder / name, content)
     (folder / SCRIPT).chmod(0o755)
     return list(text)
 

@@ -88,7 +88,6 @@ class LammpsEngine(OtherEngine):
         self._process.say(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
         self._give(state)
         load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
@@ -121,7 +120,6 @@ class LammpsEngine(OtherEngine):
         )
 
     def close(self) -> None:
-        """End the process."""
         self._process.close()
 
     def _give(self, state: State) -> None:

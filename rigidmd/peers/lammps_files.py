@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.core.state import State
 from rigidmd.forces.laws.endings import Plain
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
@@ -128,8 +128,7 @@ def write_data(path: Path, portrait: Portrait, state: State) -> None:
     per_fs = velocity * 1e-3  # Å/ps to Å/fs
     lines += ["", "Velocities", ""]
     lines += [f"{i} {_n(x)} {_n(y)} {_n(z)}" for i, (x, y, z) in enumerate(per_fs, 1)]
-    with whole_file(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _n(number: Any) -> str:
@@ -264,8 +263,7 @@ def write_tables(path: Path, portrait: Portrait) -> bool:
             if f"\n{name}\n" not in "".join(parts):
                 parts.append(f"# {formula}\n\n{name}\n{table(formula, INNERMOST, float(cutoff), ENTRIES)}\n")
     if parts:
-        with whole_file(path) as temporary:
-            temporary.write_text("".join(parts), encoding="utf-8")
+        write_text(path, "".join(parts))
     return bool(parts)
 
 
@@ -383,7 +381,6 @@ def write_lammps(folder: Path, portrait: Portrait, state: State) -> list[str]:
     """All files of a run in a folder. Returns their names. Raises OutputError."""
     write_data(folder / DATA, portrait, state)
     for name, text in ((SETTINGS, "\n".join([*settings(portrait), ""])), (INPUT, input_script(portrait))):
-        with whole_file(folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(folder / name, text)
     tables = [TABLES] if write_tables(folder / TABLES, portrait) else []
     return [INPUT, SETTINGS, DATA, *tables]

@@ -118,7 +118,6 @@ class OpenmmEngine(OtherEngine):
             raise SimulationError(f"OpenMM stopped: {error}") from None
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, and each term's energy; the virial of all of them stands with the first."""
         if self._seen is None or not same(self._seen[0], state):
             position, force = self._forces(state)
             load = self._held.bodies.load(state, position, force)
@@ -149,7 +148,6 @@ class OpenmmEngine(OtherEngine):
         self._moved = state
 
     def close(self) -> None:
-        """Let OpenMM's memory go."""
         for name in ("_mover", "_seer", "_integrator"):
             vars(self).pop(name, None)
 

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import whole_file, write_text
 from rigidmd.core.state import State
 from rigidmd.output.plain_text import in_comment
 from rigidmd.peers import openmm_system as parts
@@ -118,8 +118,7 @@ def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
     values = {"title": in_comment(scene.in_short), "stages": "\n".join(rows), **names}
     text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda found: values[found[1]], TEXT)
     for name, content in text.items():
-        with whole_file(folder / name) as temporary:
-            temporary.write_text(content, encoding="utf-8")
+        write_text(folder / name, content)
     with whole_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
         _write_pdb(file, _topology(holds), position)
     return [*text, TOPOLOGY]

@@ -6,10 +6,14 @@ from math import ceil, inf
 from pathlib import Path
 from typing import Any, Unpack
 
+from pydantic import PositiveFloat
+
 from rigidmd.assemble.body import BodySystem, Pose, build_body
 from rigidmd.compile.cache import kept_in_words
+from rigidmd.core.schemes import Scheme
 from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.cpu import Engine
+from rigidmd.engines.textbook import OdeEngine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure.body_summary import summarise_body
 from rigidmd.measure.motion import Motion, Snapshot, motion
@@ -25,11 +29,17 @@ from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.options import Options
 from rigidmd.run.provenance import plain
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import check_same_scene, state_from
+from rigidmd.run.resuming import Record, check_same_scene, read_as, state_from
 from rigidmd.run.signals import interruptible
 from rigidmd.run.stretches import Costs, Stretch
 from rigidmd.scene import BodyScene
 from rigidmd.validation import settled
+
+
+class BodyRecord(Record):
+    """What evolves in the run of a body and is not in its state."""
+
+    stable: PositiveFloat | None = None  # the longest stable step, s
 
 
 class BodySimulation(Simulation):
@@ -82,12 +92,12 @@ class BodySimulation(Simulation):
         self._stretches = self._walk()
         rate, angle = body_rate(self.system), stable_angle(self.system.method)
         followed = self.scene.watch.stable_step and rate > 0 and angle < inf  # some solvers choose their own steps
-        self._stable = angle / rate if followed else None
-        if self._stable is not None and self.scene.run.timestep_s > self._stable:
+        self._record = BodyRecord(stable=angle / rate if followed else None)
+        if (stable := self._record.stable) is not None and self.scene.run.timestep_s > stable:
             self.note(
                 f"timestep_s = {self.scene.run.timestep_s:g} is longer than what is stable: at its start the body "
                 f"swings or spins at {rate:.3g} rad/s, which {self.scene.run.integrator} can follow "
-                f"up to {self._stable:.3g} s"
+                f"up to {stable:.3g} s"
             )
 
     def _durations(self) -> list[float]:
@@ -100,23 +110,22 @@ class BodySimulation(Simulation):
         return self._stretches[k]
 
     def _memory(self) -> dict[str, Any]:
-        return {
-            "scene": plain(self.scene),
-            "stable": self._stable,
-            "notes": self.notes,
-        }
+        return self._record.to_json(scene=plain(self.scene), notes=self.notes)
 
     def _recall(self, kept: Checkpoint) -> None:
-        told = kept.told["run"]
-        self.state = state_from(kept.of("state").arrays, self.state)
-        check_same_scene(self.scene, told["scene"], {}, int(self.state.step[NOW]))
-        self._stable = told["stable"]
-        self._warnings.extend(told["notes"])
+        self._record = read_as(BodyRecord, kept.told["run"])
+        self._warnings.extend(self._record.notes)
         self._stretches = self._walk()
+        arrays, method = kept.of("state").arrays, self.system.method
+        check_same_scene(self.scene, self._record.scene, {}, int(arrays["step"][NOW]))
+        self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
         k = kept.told["place"]["stretch"]
         if k > 0:
             self.engine.change(*self.system.during(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
+        if isinstance(self.engine, OdeEngine):
+            self.engine.check(self.state, method, self._stretches[k].dt, self.system.state if k == 0 else None)
+            self.engine.recall(self.state, kept.of("engine").arrays)
 
     def _reenter(self, k: int) -> Stretch:
         return self._stretches[k]
@@ -159,12 +168,12 @@ class BodySimulation(Simulation):
         found = summarise_body(
             self.system, samples, steps, costs.preparing, costs.wall, sum(costs.computing), self._interrupted
         )
-        found["stable_timestep_s"] = self._stable
+        found["stable_timestep_s"] = self._record.stable
         found["notes"] = [*([self._choice] if self._choice else []), *found["notes"], *self.notes]
         return found
 
     def _explain(self, error: SimulationError) -> str:
-        return self._watch.check.explained(error, self.stretch.dt, self._stable)
+        return self._watch.check.explained(error, self.stretch.dt, self._record.stable)
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs."""

@@ -1,10 +1,11 @@
 """Observers of a single body: snapshots, the watch, motion.csv, figures."""
 
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.state import State
+from rigidmd.core.state import NOW, State
 from rigidmd.measure.motion import Motion, Snapshot, motion
 from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
 from rigidmd.output.body_figures import FIGURES, draw_motion
@@ -14,6 +15,7 @@ from rigidmd.output.motion_file import write_csv, write_npz
 from rigidmd.output.run_figures import body_figures
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
+from rigidmd.run.resuming import state_from
 from rigidmd.validation import settled
 
 if TYPE_CHECKING:
@@ -31,22 +33,20 @@ class Sampler(Observer):
         self.snapshots: list[Snapshot] = []
 
     def memory(self) -> Checkpoint:
-        """All of them."""
         stacked = {
             name: np.array([getattr(snapshot.state, name) for snapshot in self.snapshots]) for name in State._fields
         }
         return Checkpoint({}, stacked | {"t": np.array([snapshot.time for snapshot in self.snapshots])})
 
     def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        """Restore them."""
-        fields = [kept.arrays[name] for name in State._fields]
-        self.snapshots = [
-            Snapshot(time, State(*(field[k].copy() for field in fields)))
-            for k, time in enumerate(kept.arrays["t"].tolist())
-        ]
+        times = kept.arrays["t"]
+        if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.state.time[NOW]).all()):
+            raise ValueError("the times of its samples are not those of a run")
+        arrays = [{name: array[k] for name, array in kept.arrays.items() if name != "t"} for k in range(len(times))]
+        states = [state_from(of, run.state, exact=False) for of in arrays]
+        self.snapshots = [Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)]
 
     def see(self, moment: Moment) -> None:
-        """One more."""
         self.snapshots.append(Snapshot(moment.time, moment.state))
 
 
@@ -63,12 +63,15 @@ class BodyWatch(Observer):
         self._run = run
 
     def memory(self) -> Checkpoint:
-        """What its checks remember."""
         return Checkpoint({"moved": self.check.moved}, {})
 
     def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        """Restore it."""
-        self.check.moved = kept.told["moved"]
+        """Restore it, and check the state."""
+        least, self.check.moved = self.check.moved, float(kept.told["moved"])
+        if not least <= self.check.moved < inf:
+            raise ValueError(f"it has exchanged an energy of {self.check.moved:g} J")
+        if finding := self.check.finding(run.state, run.scene.run.timestep_s):
+            raise ValueError(f"its state is none of the run: {finding}")
 
     def see(self, moment: Moment) -> None:
         """Raise a `Finding` if the state exceeds a limit."""
@@ -83,11 +86,9 @@ class MotionFiles(Observer):
         self._sampler, self._npz = sampler, npz
 
     def files(self) -> list[str]:
-        """Both."""
         return [MOTION, MOTION_NPZ]
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
-        """Write them."""
         if not isinstance(samples := results.samples, Motion):
             raise TypeError("these are samples of molecules")
         write_csv(run.path(MOTION), samples.columns)
@@ -108,7 +109,6 @@ class Figures(Observer):
     draws = True
 
     def files(self) -> list[str]:
-        """As PNG and SVG."""
         return [f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "svg")]
 
     def end(self, run: "BodySimulation", results: "Results") -> None:

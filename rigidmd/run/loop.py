@@ -1,12 +1,15 @@
 """The one loop of runs, for molecules and single bodies. All steps between two looks of observers are compiled."""
 
 import contextlib
+import os
 import signal
 import sys
 import time as clock
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from math import isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, cast, overload
 
@@ -25,6 +28,7 @@ from rigidmd.output.folder import (
     SUMMARY,
     FolderLock,
     check_folder,
+    check_names,
     continue_folder,
     is_empty,
     make_folder,
@@ -38,7 +42,7 @@ from rigidmd.run.observers import Observer
 from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
 from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import changed_since, fitting
+from rigidmd.run.resuming import changed_since, fitting, read_as
 from rigidmd.run.signals import ending_signals, handled, interruptible
 from rigidmd.run.stretches import Agenda, Costs, Place, Stretch
 from rigidmd.scene import BodyScene, MolecularScene, Scene
@@ -56,9 +60,20 @@ else:
     Base = ABC
 
 
-def _owner(k: int, observer: Observer) -> str:
-    """The name under which a checkpoint keeps what an observer remembers."""
-    return f"{k}.{type(observer).__name__}"
+def _named(own: Sequence[Observer], of_user: Sequence[Observer]) -> dict[str, Observer]:
+    """Observers by the names under which a checkpoint keeps what they remember: class, and number in its class."""
+    found: dict[str, Observer] = {}
+    for start, observers in (("", own), (USER, of_user)):
+        count: Counter[str] = Counter()
+        for observer in observers:
+            kind = type(observer).__name__
+            count[kind] += 1
+            found[f"{start}{kind}{f'-{count[kind]}' if count[kind] > 1 else ''}"] = observer
+    return found
+
+
+#: Begins the names of the user's observers.
+USER = "user-"
 
 
 def _as_warning(sentence: str) -> None:
@@ -126,7 +141,7 @@ class Simulation(Base):
         walltime: float | None = None,
     ):
         self.scene = scene
-        self.folder = None if folder is None else Path(folder)
+        self.folder = None if folder is None else Path(folder).absolute()  # a callback may change the directory
         self._force = force
         self._observers = [observers] if isinstance(observers, Observer) else list(observers)
         if strange := [one for one in self._observers if not isinstance(one, Observer)]:
@@ -146,6 +161,7 @@ class Simulation(Base):
         self._resume = resume
         self._deadline = None if walltime is None else clock.monotonic() + checked_walltime(walltime)
         self._keeper = Keeper(None, False, None)  # before a run
+        self._process: int | None = None  # that runs it
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
 
@@ -177,11 +193,14 @@ class Simulation(Base):
         """
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
+        if self._process is not None:
+            raise RuntimeError("this simulation is running already; its own observers cannot run it again")
         with contextlib.ExitStack() as stack:
             kept, stays = None, False
-            self._progress, self._spot = progress, Spot()
+            self._progress, self._spot, self._process = progress, Spot(), os.getpid()
+            stack.callback(setattr, self, "_process", None)
             if self.folder is not None:
-                stack.callback((lock := FolderLock(self.folder)).release)
+                stack.callback(self._if_not_forked, (lock := FolderLock(self.folder)).release)
                 lock.take()
                 if self._resume:
                     kept, stays = self._kept()
@@ -198,44 +217,71 @@ class Simulation(Base):
             self._inputs = input_digests(self.scene)
             self._reset()
             began = clock.perf_counter()
+            place, changed = None, None
+            if kept is not None:
+                with fitting(self.folder):
+                    self._recall(kept)
+                    place = self._place_of(kept)
+                    changed = changed_since(kept.told["with"])
+            named = _named(self._own_observers(), self._observers)
+            observers = list(named.values())
+            names = [name for observer in observers for name in observer.files()]
+            names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self._keeper.keeps else [])]
+            if self.folder is not None:
+                if stays:
+                    check_names(self.folder, names)
+                else:
+                    check_folder(self.folder, self._force, inputs, names)
             if kept is None:
                 with interruptible(), ONE_AT_A_TIME:  # of several runs one compiles, and the others read what it made
                     self._prepare()
-            else:
+            prepared = clock.perf_counter() - began
+            for observer in observers:
+                stack.callback(self._if_not_forked, observer.close)
+            if kept is not None:  # first all that may refuse it, then the first change of a file
                 with fitting(self.folder):
-                    self._recall(kept)
-                    changed = changed_since(kept.told["with"])
+                    for name, observer in named.items():
+                        if name.startswith(USER) and name not in kept.told["of"]:
+                            observer.begin(self)
+                        else:
+                            observer.resume(self, kept.of(name))
                 if changed is not None:
                     self.note(changed)
-                self._say(f"going on from step {self.state.step[NOW]}")
-            prepared = clock.perf_counter() - began
-            observers = [*self._own_observers(), *self._observers]
+                self._say(f"continuing from step {self.state.step[NOW]}")
             if self.folder is not None:
-                names = [name for observer in observers for name in observer.files()]
-                names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self._keeper.keeps else [])]
-                if not stays:
-                    make_folder(self.folder, self._force, names, inputs, lock)
-                else:
+                if stays:
                     continue_folder(self.folder, names)
+                else:
+                    make_folder(self.folder, self._force, names, inputs, lock)
             stack.enter_context(handled(self._stop_at_next_look, *ending_signals()))
-            for k, observer in enumerate(observers):
-                stack.callback(observer.close)
+            for observer in observers:
                 if kept is None:
                     observer.begin(self)
                 else:
-                    with fitting(self.folder):
-                        observer.resume(self, kept.of(_owner(k, observer)))
+                    observer.cut()
             try:
                 began = clock.perf_counter()
-                computing = self._run_stretches(observers, progress, kept)
+                computing = self._run_stretches(named, progress, place)
                 return self._finished(observers, Costs(prepared, clock.perf_counter() - began, computing))
             except (SimulationError, OutputError) as error:
+                self._check_process()
                 raise self._failed(error, observers) from None
             except Exception as error:  # of a force, or of an observer, after which all files are complete
-                if error is not self._error:
+                if error is not self._error and os.getpid() == self._process:
                     for observer in observers:
                         observer.failed(self)
                 raise
+
+    def _if_not_forked(self, function: Callable[[], object]) -> None:
+        """Call a function unless this is a forked process: files, their buffers and locks are those of the first."""
+        if os.getpid() == self._process:
+            function()
+
+    def _check_process(self) -> None:
+        if os.getpid() != self._process:
+            raise OutputError(
+                "a forked process cannot continue the run: its files are those of the process that began it"
+            )
 
     def _finished(self, observers: list[Observer], costs: Costs) -> Results:
         """The results, with all files written. Raises OutputError."""
@@ -304,7 +350,28 @@ class Simulation(Base):
 
     @abstractmethod
     def _recall(self, kept: Checkpoint) -> None:
-        """Return to a checkpoint, in place of `_prepare`. Raises CheckpointError if it is of another scene."""
+        """Return to a checkpoint, in place of `_prepare`. Raises CheckpointError if it is of another scene, and
+        ValueError if it is none that a run writes."""
+
+    def _place_of(self, kept: Checkpoint) -> Place:
+        """The place of a checkpoint. What follows from the scene and the state must be so. Raises ValueError."""
+        place, state = read_as(Place, kept.told["place"]), self.state
+        if place.stretch >= len(self._durations()) or len(place.computing) != place.stretch:
+            raise ValueError(f"it is of stage {place.stretch} of {len(self._durations())}")
+        first, time = 0, 0.0
+        for k in range(place.stretch):
+            before = self._reenter(k)
+            first, time = first + before.steps, time + before.steps * before.dt
+        stretch = self._reenter(place.stretch)
+        step, done = state.step.tolist(), int(state.step[NOW]) - first
+        if place.first != first or step[ORIGIN] != first or not 0 <= done <= stretch.steps:
+            raise ValueError(f"step {step[NOW]} is not in a stage of {stretch.steps} steps after {place.first}")
+        now, origin = state.time.tolist()
+        if not (isclose(origin, time, abs_tol=1e-6 * stretch.dt) and place.time == time):
+            raise ValueError(f"its stage began at {origin:g} {self.time_unit}, not at {time:g} {self.time_unit}")
+        if now != origin + done * stretch.dt:
+            raise ValueError(f"step {step[NOW]} is not at {now:g} {self.time_unit}")
+        return place
 
     def _is_replaced(self, moment: Moment) -> bool:
         """Whether the present moment is followed by another one of the same time."""
@@ -383,13 +450,12 @@ class Simulation(Base):
             self._warn(f"{fault}. The checkpoint before it is used")
         return kept, True
 
-    def _checkpoint(self, observers: list[Observer], place: Place) -> None:
+    def _checkpoint(self, observers: Mapping[str, Observer], place: Place) -> None:
         """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
         if not self._keeper.keeps or self._error is not None or (memory := self.engine.memory()) is None:
             return  # a run that resumes after an error calls the observer again
         of, arrays = {}, {}
-        for k, observer in enumerate(observers):
-            owner = _owner(k, observer)
+        for owner, observer in observers.items():
             of[owner], own = observer.memory()
             arrays |= {f"{owner}/{name}": array for name, array in own.items()}
         arrays |= {f"state/{name}": array for name, array in self.state._asdict().items()}
@@ -398,16 +464,16 @@ class Simulation(Base):
         self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW]), place.seconds > 0))
 
     def _run_stretches(
-        self, observers: list[Observer], progress: bool | None, kept: Checkpoint | None = None
+        self, named: Mapping[str, Observer], progress: bool | None, begun: Place | None = None
     ) -> Sequence[float]:
-        """Advance through all stretches, from a checkpoint on; seconds of computing in each."""
-        place = Place() if kept is None else Place(**kept.told["place"])
+        """Advance through all stretches, from the place of a checkpoint on; seconds of computing in each."""
+        place, observers = begun or Place(), list(named.values())
         durations = self._durations()
         self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
         whole = sum(durations)
         with progress_of(whole, self.time_unit, progress if whole > 0 else False, self._spot) as bar:
             for k in range(place.stretch, len(durations)):
-                if resumed := kept is not None and k == kept.told["place"]["stretch"]:
+                if resumed := begun is not None and k == begun.stretch:
                     self.stretch = stretch = self._reenter(k)
                     done = int(self.state.step[NOW]) - place.first
                     bar.skip(place.time + done * stretch.dt)
@@ -417,7 +483,7 @@ class Simulation(Base):
                     done = 0
                 if k == 0 and not resumed:
                     self._show(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
-                    self._checkpoint(observers, place)
+                    self._checkpoint(named, place)
                 agenda = Agenda(observers, stretch)
                 if stretch.act is not None:
                     began = clock.perf_counter()
@@ -446,13 +512,13 @@ class Simulation(Base):
                     if self._keeper.time_is_up:
                         self._interrupted = self._out_of_time = True
                     elif done < stretch.steps and self._keeper.is_due:
-                        self._checkpoint(observers, place)
+                        self._checkpoint(named, place)
                 if not (stretch.act is not None and self._interrupted):
-                    self._checkpoint(observers, place)
+                    self._checkpoint(named, place)
                 if done < stretch.steps and shown is not None:  # looks that a run without a stop does not have
                     due = [observer.ends and not seen for observer, seen in zip(observers, shown, strict=True)]
                     self._show(observers, self._moment(place, done), due)
-                place = place._replace(time=place.time + done * stretch.dt, computing=[*place.computing, place.seconds])
+                place = place._replace(time=place.time + done * stretch.dt, computing=(*place.computing, place.seconds))
                 if self._interrupted:
                     break
         return place.computing
@@ -465,6 +531,7 @@ class Simulation(Base):
         for observer, now in zip(observers, due, strict=True):
             if now and not (observer.once and self._is_replaced(moment)):
                 self._let(observer, observer.see, moment)
+        self._check_process()
 
     def _let(self, observer: Observer, act: Callable[..., None], *given: Any) -> None:
         """Let an observer act, unless it has failed before. Its error ends the run, which raises it when all files are

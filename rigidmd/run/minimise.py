@@ -91,8 +91,9 @@ def minimise(
         getattr(state, name)[:] = getattr(point.state, name)
     state.books[WORK] += point.energy - start.energy
     force, torque, deviation = enthalpy.largest(point)
+    pressure = tuple(point.pressure.tolist()) if np.isfinite(point.pressure).all() else None
     return Minimum(
-        converged, why, iterations, relief_steps, start.energy, point.energy, force, torque, point.pressure,
+        converged, why, iterations, relief_steps, start.energy, point.energy, force, torque, pressure,
         deviation if stage.changes_box else None,
     )  # fmt: skip
 

@@ -10,91 +10,65 @@ from rigidmd.core.state_file import write_state
 from rigidmd.engines.cpu import Engine
 from rigidmd.measure import watch
 from rigidmd.measure.samples import Samples
-from rigidmd.output.checkpoint import Checkpoint
+from rigidmd.output.checkpoint import Checkpoint, count_list
 from rigidmd.output.figure import save_figure
 from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.output.log import Log
 from rigidmd.output.pressure import TENSOR_FILE, TensorFile, tensor_row
 from rigidmd.output.run_figures import run_figures
 from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Observer
+from rigidmd.run.observers import Growing, Observer
+from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.run.molecules import MolecularSimulation
     from rigidmd.run.results import Results
 
 
-class LogFile(Observer):
+class LogFile(Growing):
     """log.csv: a line for each sample."""
 
     ends = reads_energies = True
 
     def __init__(self, interval: float, tensor: bool):
         self.interval, self._tensor = interval, tensor
-        self._log: Log | None = None
 
     def files(self) -> list[str]:
-        """One."""
         return [LOG]
 
     def begin(self, run: "MolecularSimulation") -> None:
-        """Open it."""
-        self._log = Log(run.path(LOG), self._tensor, own=tuple(run.system.own))
-
-    def memory(self) -> Checkpoint:
-        """Its size."""
-        return Checkpoint({"kept": None if self._log is None else self._log.kept}, {})
+        self._file = Log(run.path(LOG), self._tensor, own=tuple(run.system.own))
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        """Open it where the checkpoint left it."""
-        self._log = Log(run.path(LOG), self._tensor, kept.told["kept"], tuple(run.system.own))
+        self._file = Log(run.path(LOG), self._tensor, count_list(kept.told["kept"]), tuple(run.system.own))
 
     def see(self, moment: Moment) -> None:
-        """A line."""
-        if self._log is not None:
-            self._log.write(moment.sample)
+        self._file.write(moment.sample)
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
-        """Complete and name it."""
-        if self._log is not None:
-            self._log.flush()
+        self._file.flush()
         results.files.append(run.path(LOG))
 
-    def close(self) -> None:
-        """Close it."""
-        if self._log is not None:
-            self._log.close()
 
-
-class PressureTensor(Observer):
+class PressureTensor(Growing):
     """pressure_tensor.csv: the pressure tensor at an interval of its own; without a folder in memory."""
 
     once = reads_energies = True
 
     def __init__(self, interval: float):
         self.interval = interval
-        self._file: TensorFile | None = None
         self._rows: list[list[float]] = []
 
     def files(self) -> list[str]:
-        """One."""
         return [TENSOR_FILE]
 
     def begin(self, run: "MolecularSimulation") -> None:
-        """Open it."""
-        self._rows = []
         self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE))
 
-    def memory(self) -> Checkpoint:
-        """Its size."""
-        return Checkpoint({"kept": None if self._file is None else self._file.kept}, {})
-
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        """Open it where the checkpoint left it."""
-        self._file = TensorFile(run.path(TENSOR_FILE), kept.told["kept"])
+        self._file = TensorFile(run.path(TENSOR_FILE), count_list(kept.told["kept"]))
 
     def see(self, moment: Moment) -> None:
-        """A line."""
         row = tensor_row(moment.time, moment.observation.pressure_tensor_bar)
         if self._file is None:
             self._rows.append(row)
@@ -102,17 +76,10 @@ class PressureTensor(Observer):
             self._file.write(row)
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
-        """Hand it over."""
         if self._file is None:
             results._tensor = np.array(self._rows)
         else:
             results.files.append(run.path(TENSOR_FILE))
-
-    def close(self) -> None:
-        """Close it."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
 
 
 class Good(NamedTuple):
@@ -133,11 +100,15 @@ class Sampler(Observer):
         self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.own))
         self.last_good: Good | None = None
         self._run, self._check = run, check
-        self._begins: dict[int, int] = {}  # stage -> row of the sample at which it began
+        self._begins: dict[int, int] = {}  # stage -> row of the last sample before it, or of the first
 
     def files(self) -> list[str]:
         """The file of a failed run."""
         return [LAST_GOOD]
+
+    def origin(self, stage: int, conserved: float) -> float:
+        """What was conserved (kJ/mol) when a stage began: that of the last sample before it, else that of its first."""
+        return self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else conserved
 
     def see(self, moment: Moment) -> None:
         """Raise a `Finding` if the sample or the next step exceeds a limit."""
@@ -168,16 +139,26 @@ class Sampler(Observer):
         self.last_good = Good(step, time, kept)
 
     def memory(self) -> Checkpoint:
-        """The samples, and what the checks remember."""
-        told = {"begins": list(self._begins.items()), "thermal": self._check.thermal}
-        return Checkpoint(told, {"samples": self.samples.table()})
+        return Checkpoint({}, {"samples": self.samples.table()})
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        """Restore them. The state of the checkpoint is the last good one."""
-        self.samples = Samples(self.samples.stages, self.samples.own, kept.arrays["samples"])
-        self._begins = {int(stage): range(len(self.samples))[row] for stage, row in kept.told["begins"]}
-        self._check.thermal = kept.told["thermal"]
-        self._keep(int(run.state.step[NOW]), float(run.state.time[NOW]))
+        """Restore them, and what follows from them. The state of the checkpoint is the last good one."""
+        self.samples = samples = Samples(self.samples.stages, self.samples.own, kept.arrays["samples"])
+        steps, times, stages, conserved, drift = (
+            samples[name] for name in ("step", "time", "stage", "conserved", "drift")
+        )
+        step, time = int(run.state.step[NOW]), float(run.state.time[NOW])
+        series = ((steps, step), (times, time), (stages, len(samples.stages)))
+        if not all(((of >= 0) & (of <= most)).all() and (np.diff(of) >= 0).all() for of, most in series):
+            raise ValueError(f"its samples are not those of a run of {step} steps ({time:g} ps)")
+        first = {k: int(np.argmax(stages == k)) for k in np.unique(stages).tolist()}
+        self._begins = {k: max(0, row - 1) for k, row in first.items()}
+        origin = conserved[[self._begins[k] for k in stages.tolist()]]
+        if not (np.isfinite(conserved).all() and ((drift == conserved - origin) | np.isnan(drift)).all()):
+            raise ValueError("the drifts of its samples are not those of their energies")
+        if len(samples):
+            self._check.rescale(samples.row(-1).kinetic * KJ_PER_MOL)
+        self._keep(step, time)
 
     def failed(self, run: "MolecularSimulation") -> str:
         """Save the last good state."""
@@ -211,11 +192,9 @@ class FinalState(Observer):
     """final.npz: the exact state at the end."""
 
     def files(self) -> list[str]:
-        """One."""
         return [FINAL]
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
-        """Write it."""
         write_state(run.path(FINAL), run.system.saved(run.state))
         results.files.append(run.path(FINAL))
 
@@ -226,7 +205,6 @@ class EnergyFigure(Observer):
     draws = True
 
     def files(self) -> list[str]:
-        """One."""
         return [ENERGY]
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:

@@ -4,9 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import hypot, isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 import numpy as np
+from pydantic import Field, PositiveFloat
 
 from rigidmd.assemble.cells import edges_and_angles
 from rigidmd.assemble.momenta import remove_momentum
@@ -45,7 +46,7 @@ from rigidmd.run.options import Options
 from rigidmd.run.provenance import plain
 from rigidmd.run.relief import Relief, relieve
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import check_same_scene, state_from
+from rigidmd.run.resuming import Record, check_same_scene, read_as, state_from
 from rigidmd.run.signals import interruptible
 from rigidmd.run.stretches import Costs, Stretch
 from rigidmd.scene import MolecularScene
@@ -56,6 +57,21 @@ if TYPE_CHECKING:
     import ase
 
     from rigidmd.peers.engines import OtherEngine
+
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class MolecularRecord(Record):
+    """What evolves in a run of molecules and is not in its state; dictionaries have the indices of stages."""
+
+    stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
+    stage: Count = 0  # the present one
+    relief: Relief | None = None
+    choices: dict[Count, str] = Field(default_factory=dict)  # what was chosen for stages that left it open, and why
+    stable: dict[Count, PositiveFloat] = Field(default_factory=dict)  # the longest stable step, ps
+    moves: dict[Count, tuple[Count, Count]] = Field(default_factory=dict)  # of the box, tried and accepted
+    minima: dict[Count, Minimum] = Field(default_factory=dict)
 
 
 #: States between the last good one and a failure that are searched for its cause.
@@ -120,7 +136,7 @@ class MolecularSimulation(Simulation):
         self._reset()
         with interruptible():
             self._relieve()
-        return self._relief
+        return self._record.relief
 
     def settle(self) -> State:
         """Go to the state from which time passes, after relief of overlaps and the minimisations that come first."""
@@ -183,14 +199,7 @@ class MolecularSimulation(Simulation):
                     )
         check_forces(self.system, self.state)
         self.engine.forget()
-        self._relief = relief
-        self._choices: dict[int, str] = {}
-        self._stable: dict[int, float] = {}
-        self._moves: dict[int, tuple[int, int]] = {}
-        self._minima: dict[int, Minimum] = {}
-        self._origins: dict[int, float] = {}
-        self._stage = 0
-        self._conserved: float | None = None
+        self._record = MolecularRecord(relief=relief)
 
     def _compile(self) -> None:
         """Compile the steps of every stage."""
@@ -229,44 +238,37 @@ class MolecularSimulation(Simulation):
         return other
 
     def _memory(self) -> dict[str, Any]:
-        return {
-            "scene": plain(self._built.scene),
-            "inputs": self._inputs,
-            "stages": [stage.model_dump(mode="json", exclude_none=True) for stage in self.scene.stages],
-            "relief": None if self._relief is None else self._relief._asdict(),
-            "choices": list(self._choices.items()),
-            "stable": list(self._stable.items()),
-            "moves": list(self._moves.items()),
-            "minima": [(k, found._replace(pressure=found.pressure.tolist())) for k, found in self._minima.items()],
-            "origins": list(self._origins.items()),
-            "stage": self._stage,
-            "conserved": self._conserved,
-            "notes": self.notes,
-        }
+        scene, stages = plain(self._built.scene), self.scene.stages
+        return self._record.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
 
     def _recall(self, kept: Checkpoint) -> None:
-        told = kept.told["run"]
-        self.state = state_from(kept.of("state").arrays, self._built.state)
+        record = self._record = read_as(MolecularRecord, kept.told["run"])
+        before = record.scene["stages"]
         # the scene in the folder has decided what was open before
         decided = [
-            then if now.is_open else chosen
-            for now, then, chosen in zip(self.scene.stages, told["scene"]["stages"], told["stages"], strict=False)
+            then if now.is_open else plain(chosen)
+            for now, then, chosen in zip(self.scene.stages, before, record.stages, strict=False)
         ]
-        before = told["scene"] | {"stages": decided or told["scene"]["stages"]}
-        check_same_scene(self._built.scene, before, told["inputs"], int(self.state.step[NOW]))
-        stages = [Stage.model_validate(stage) for stage in told["stages"]]
+        step = int(kept.arrays["state/step"][NOW])
+        check_same_scene(self._built.scene, record.scene | {"stages": decided or before}, record.inputs, step)
+        for k, (chosen, then) in enumerate(zip(record.stages, before, strict=True)):
+            if k not in record.choices and plain(chosen) != then:
+                raise ValueError(f"its stages.{k} is not that of its scene")
+        known = (*record.choices, *record.stable, *record.moves, *record.minima)
+        if record.stage != kept.told["place"]["stretch"] or any(k > record.stage for k in known):
+            raise ValueError(f"it knows of later stages than {record.stage}, or is of another")
+        stages = list(record.stages)
         stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
         self.system = replace(self.system, scene=self.scene)
-        self._relief = None if told["relief"] is None else Relief(**told["relief"])
-        self._choices = dict(told["choices"])
-        self._stable = dict(told["stable"])
-        self._moves = {k: (tried, accepted) for k, (tried, accepted) in told["moves"]}
-        self._minima = {k: Minimum(*figures)._replace(pressure=np.array(figures[8])) for k, figures in told["minima"]}
-        self._origins = dict(told["origins"])
-        self._stage, self._conserved = told["stage"], told["conserved"]
-        self._warnings.extend(told["notes"])
-        self.engine = self._engine_of(self._stage)
+        self._warnings.extend(record.notes)
+        row = self._reenter(record.stage).row
+        self.engine = self._engine_of(record.stage)
+        like = self._built.state._replace(bath=self.engine.variables(self._built.state, row))
+        self.state = state_from(kept.of("state").arrays, like)
+        moves = any(before.has_barostat or before.is_minimisation for before in stages[: record.stage + 1])
+        if not moves and not np.array_equal(self.state.cell, self._built.state.cell):
+            raise ValueError("its box is not that of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
 
     def _reenter(self, k: int) -> Stretch:
@@ -280,8 +282,8 @@ class MolecularSimulation(Simulation):
         return [stage.duration for stage in self.scene.stages]
 
     def _enter(self, k: int) -> Stretch:
-        self._moves[self._stage] = self.engine.moves
-        self._stage = k
+        self._record.moves[self._record.stage] = self.engine.moves
+        self._record.stage = k
         if self.scene.stages[k].is_minimisation:
             return self._enter_minimisation(k)
         if was_open := self.scene.stages[k].is_open:
@@ -289,7 +291,7 @@ class MolecularSimulation(Simulation):
         self._estimate(k)
         # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
         # bit. Those of the start, if nothing has moved since, are what new ones would be.
-        if k or was_open or self.scene.engine.is_other or (self._relief is not None and self._relief.steps):
+        if k or was_open or self.scene.engine.is_other or (self._record.relief and self._record.relief.steps):
             self.engine = self._engine_of(k)
         row, stage = row_of_stage(self.system, k), self.scene.stages[k]
         self.state = self._begun(row)
@@ -298,8 +300,6 @@ class MolecularSimulation(Simulation):
         keeps = self.system.keeps_momentum_in
         if before and keeps(k) and not keeps(before[-1]):
             self.state.books[TAKEN] -= remove_momentum(self.system.model, self.state.velocity)
-        if self._conserved is not None:
-            self._origins[k] = self._conserved
         return Stretch(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
 
     def _enter_minimisation(self, k: int) -> Stretch:
@@ -307,18 +307,16 @@ class MolecularSimulation(Simulation):
         self.engine = self.system.engine()
         self.state = self._begun(stage.scheme)
         self.state.begin_stretch()
-        if self._conserved is not None:
-            self._origins[k] = self._conserved
         return Stretch(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
 
     def _minimise(self, progress: bool | None) -> None:
         """Minimise as the present stage says, with a warning if it does not converge."""
-        k = self._stage
+        k = self._record.stage
         stage = self.scene.stages[k]
         with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
             found = minimise(self.system, self.state, stage, lambda: self._interrupted, bar.update)
         self.engine.forget()
-        self._minima[k] = found
+        self._record.minima[k] = found
         if not found.converged:
             self.note(f"stages.{k}: {minimum_in_words(found, stage)}")
 
@@ -332,13 +330,13 @@ class MolecularSimulation(Simulation):
         found = stiffest(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
         if found is None:
             return
-        self._stable[k] = stable_angle(stage.scheme) / found.rate
-        if stage.timestep_fs * FEMTOSECOND > self._stable[k]:
+        stable = self._record.stable[k] = stable_angle(stage.scheme) / found.rate
+        if stage.timestep_fs * FEMTOSECOND > stable:
             self.note(
                 f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
                 f"at its start, of {watch.named(self.system, found.molecule)}, has a period of "
                 f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
-                f"{self._stable[k] / FEMTOSECOND:.3g} fs"
+                f"{stable / FEMTOSECOND:.3g} fs"
             )
 
     def _choose(self, k: int) -> None:
@@ -347,7 +345,7 @@ class MolecularSimulation(Simulation):
         self._say("choosing integrator and step by pilot runs")
         choose = choose_for_averages if stage.bias_kT else choose_for_molecules
         decided, reason = choose(self.system, self.state, k)
-        self._choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
+        self._record.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
         stages = list(self.scene.stages)
         stages[k] = decided
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
@@ -386,7 +384,6 @@ class MolecularSimulation(Simulation):
         seen: Observation = moment._seen
         energy, books = seen.energy / KJ_PER_MOL, self.state.books / KJ_PER_MOL
         conserved = energy - float(books.sum())
-        self._conserved = conserved
         volume, stage = self.state.volume, self.scene.stages[moment.stage]
         boxed = volume < np.inf
         a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
@@ -408,7 +405,7 @@ class MolecularSimulation(Simulation):
             temperature_translation_unbiased=seen.temperature_translation_unbiased,
             temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
             pressure_bar=seen.pressure_bar,
-            drift=conserved - self._origins.setdefault(moment.stage, conserved) if known else nan,
+            drift=conserved - self._sampler.origin(moment.stage, conserved) if known else nan,
             momentum=hypot(*seen.momentum.tolist()),
             orthogonality=seen.orthogonality,
             a=a,
@@ -455,15 +452,16 @@ class MolecularSimulation(Simulation):
         return self._sampler.samples
 
     def _summary(self, samples: Samples, costs: Costs) -> dict[str, Any]:
-        relief_steps = self._relief.steps if self._relief else 0
-        self._moves[self._stage] = self.engine.moves
+        record = self._record
+        record.moves[record.stage] = self.engine.moves
         return summarise(
-            self.system, samples, self.state, relief_steps, costs.preparing, costs.wall,
-            costs.computing, self._interrupted, self._choices, self._stable, self._moves, self._minima, self.notes,
+            self.system, samples, self.state, record.relief.steps if record.relief else 0, costs.preparing, costs.wall,
+            costs.computing, self._interrupted, record.choices, record.stable, record.moves, record.minima, self.notes,
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:
-        return watch.explained(self.system, error, self._suspects(), self.stretch.dt, self._stable.get(self._stage))
+        stable = self._record.stable.get(self._record.stage)
+        return watch.explained(self.system, error, self._suspects(), self.stretch.dt, stable)
 
     def _suspects(self) -> Iterator[tuple[str, State]]:
         """States of a run that failed, with the words for their moments: now; the last good one; those between, which
@@ -488,11 +486,9 @@ class MolecularSimulation(Simulation):
                 yield f"at step {to}, ", state
 
     def write_scene(self, folder: Path) -> None:
-        """Write the scene as it runs, with copies of the files that it reads."""
         write_scene(folder, self.scene)
 
     def introduction(self) -> str:
-        """A few lines for the start of a run."""
         system, asked = self.system, self.scene.threads or 0
         more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
         first = (

@@ -9,19 +9,17 @@ moment or the run.
 
 from collections.abc import Callable, Iterable, Sequence
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidmd.output.checkpoint import Checkpoint
+from rigidmd.core.state import NOW
+from rigidmd.output.checkpoint import Checkpoint, count_list
 from rigidmd.output.folder import SCENE
 from rigidmd.output.frame import Frame
 from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
-    from rigidmd.output.gsd_file import GsdFile
-    from rigidmd.output.traj_file import TrajFile
-    from rigidmd.output.trajectory_file import TrajectoryFile
     from rigidmd.run.loop import Simulation
     from rigidmd.run.results import Results
 
@@ -58,8 +56,14 @@ class Observer:
         return Checkpoint({}, {})
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        """Called instead of `begin` when a run goes on from a checkpoint: restore what `memory` gave for it."""
+        """Called instead of `begin` when a run is resumed: restore what `memory` gave, and check files, unchanged.
+
+        The run is refused if it raises KeyError, TypeError, ValueError or OutputError.
+        """
         self.begin(run)
+
+    def cut(self) -> None:
+        """Called when all observers have resumed: cut files off where the checkpoint left them."""
 
     def end(self, run: "Simulation", results: "Results") -> None:
         """Called after the last step or an interruption: complete the files."""
@@ -82,8 +86,26 @@ class Every(Observer):
         self.function = function
 
     def see(self, moment: Moment) -> None:
-        """Call the function."""
         self.function(moment)
+
+
+class Growing(Observer):
+    """An observer whose file grows while the run goes; None without a folder."""
+
+    _file: Any = None
+
+    def memory(self) -> Checkpoint:
+        """The size of the file."""
+        return Checkpoint({"kept": None if self._file is None else self._file.kept}, {})
+
+    def cut(self) -> None:
+        if self._file is not None:
+            self._file.cut()
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 class SceneFile(Observer):
@@ -93,20 +115,25 @@ class SceneFile(Observer):
         self._copies = list(names)
 
     def files(self) -> list[str]:
-        """The scene and its inputs."""
         return [SCENE, *self._copies]
 
     def begin(self, run: "Simulation") -> None:
         """Write it. A run writes it again after choosing an integrator for a stage."""
-        if run.folder is not None:
-            run.write_scene(run.folder)
+        self.resume(run, Checkpoint({}, {}))
+        self.cut()
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        self._run = run
+
+    def cut(self) -> None:
+        if self._run.folder is not None:
+            self._run.write_scene(self._run.folder)
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        """Name it."""
         results.files.append(run.path(SCENE))
 
 
-class Frames(Observer):
+class Frames(Growing):
     """Topology and trajectory; without a folder, frames in memory."""
 
     once = True
@@ -118,10 +145,8 @@ class Frames(Observer):
         self._names = [topology, trajectory]
         self._velocities, self._wrapped = velocities, wrapped
         self._frames: list[Frame] = []
-        self._file: TrajectoryFile | GsdFile | TrajFile | None = None
 
     def files(self) -> list[str]:
-        """Both."""
         return self._names
 
     def begin(self, run: "Simulation") -> None:
@@ -135,13 +160,16 @@ class Frames(Observer):
 
     def memory(self) -> Checkpoint:
         """Size of the trajectory, times of its frames."""
-        kept = None if self._file is None else self._file.kept
-        return Checkpoint({"kept": kept}, {"time": np.array([frame.time for frame in self._frames])})
+        return super().memory()._replace(arrays={"time": np.array([frame.time for frame in self._frames])})
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        """Go on with the trajectory where the checkpoint left it."""
-        self._run, self._frames = run, [Frame(time) for time in kept.arrays["time"].tolist()]
-        self._open(kept.told["kept"])
+        """Open the trajectory where the checkpoint left it."""
+        time, now = kept.arrays["time"], run.state.time[NOW]
+        *_, frames = counts = count_list(kept.told["kept"])
+        if time.shape != (frames,) or not ((time >= 0) & (time <= now)).all() or not (np.diff(time) >= 0).all():
+            raise ValueError("the times of its frames are not those of a run")
+        self._run, self._frames = run, [Frame(time) for time in time.tolist()]
+        self._open(counts)
 
     def _open(self, kept: Sequence[int] | None) -> None:
         from rigidmd.output.trajectory_file import open_trajectory
@@ -150,7 +178,6 @@ class Frames(Observer):
         self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, kept)
 
     def see(self, moment: Moment) -> None:
-        """A frame."""
         system, state = self._run.system, self._run.state
         if self._file is not None:
             self._file.write(state, moment.time, moment.step)
@@ -165,9 +192,3 @@ class Frames(Observer):
         results._frames = self._frames
         if self._file is not None:
             results.files += [run.path(name) for name in self._names]
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
 
+from pydantic import BaseModel
+
 from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
 from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene, Scene
@@ -63,8 +65,8 @@ def input_digests(scene: Scene) -> dict[str, str]:
     return read | {key: hashlib.sha256(content).hexdigest() for key, content in scene.held.items()}
 
 
-def plain(scene: Scene) -> dict[str, Any]:
-    """A scene as JSON has it."""
+def plain(scene: BaseModel) -> dict[str, Any]:
+    """A scene, or a part of one, as JSON has it."""
     return scene.model_dump(mode="json", exclude_none=True)
 
 

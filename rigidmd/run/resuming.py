@@ -3,14 +3,18 @@
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from rigidmd.core.state import NOW, State
+from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.state_file import LARGEST, are_rotations, is_cell
 from rigidmd.errors import CheckpointError
 from rigidmd.run.provenance import APART, computed_with, differences, input_digests, keys_of, plain
 from rigidmd.scene import MolecularScene, Scene
+
+T = TypeVar("T")
 
 
 def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int) -> None:
@@ -49,15 +53,47 @@ def changed_since(told: Mapping[str, Any]) -> str | None:
     )
 
 
-def state_from(arrays: Mapping[str, np.ndarray], like: State) -> State:
-    """The state in a checkpoint, of a run that began from a state like this one. Raises ValueError, KeyError."""
-    found = State(*(np.array(arrays[name]) for name in State._fields))
+def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True) -> State:
+    """The state in a checkpoint, of a run whose states have arrays like this one. Raises ValueError, KeyError.
+
+    exact : whether the method of the run keeps rotations, and does not only approach them
+    """
+    found = State(*(np.array(arrays[name], order="C") for name in State._fields))
     for name, array, own in zip(State._fields, found, like, strict=True):
-        if array.dtype != own.dtype or (name != "bath" and array.shape != own.shape):
-            raise ValueError(f"{name} has the shape {array.shape}, not {own.shape}")
-    if not found.is_finite or found.step[NOW] < 0:
-        raise ValueError("the state is not finite")
+        if array.dtype != own.dtype or array.shape != own.shape:
+            raise ValueError(f"{name} has the shape {array.shape}, not {own.shape}, or is of another type")
+        if name != "cell" and not (np.abs(array) <= LARGEST).all():
+            raise ValueError(f"{name} of its state is not finite")
+    if exact and not are_rotations(found.rotation):
+        raise ValueError("its state has rotation matrices that are none")
+    if not is_cell(found.cell) or (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
+        raise ValueError("its state has another kind of box")
+    if not (0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]):
+        raise ValueError("its step or time is before the start")
     return found
+
+
+def read_as(kind: type[T], data: Any) -> T:
+    """Data of a checkpoint as a type that pydantic knows. Raises ValueError in one sentence."""
+    try:
+        return TypeAdapter(kind).validate_python(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+class Record(BaseModel):
+    """What evolves in a run and is not in its state, besides the scene that it is of."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants")
+
+    scene: dict[str, Any] = {}
+    inputs: dict[str, str] = {}  # key -> SHA-256
+    notes: list[str] = []
+
+    def to_json(self, **changes: Any) -> dict[str, Any]:
+        """For a checkpoint, from which `read_as` makes it again."""
+        return plain(self.model_copy(update=changes))
 
 
 @contextlib.contextmanager
@@ -65,7 +101,7 @@ def fitting(folder: Path | None) -> Iterator[None]:
     """Turns whatever does not fit in a checkpoint into a CheckpointError."""
     try:
         yield
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+    except (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError) as error:
         raise CheckpointError(
             f"the checkpoint in {folder} does not fit this run: {error}. --force begins a new run"
         ) from None

@@ -2,10 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from operator import and_
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import Field, NonNegativeInt
 
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.run.observers import Observer, above_zero
+
+Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Stretch(NamedTuple):
@@ -53,11 +57,11 @@ class Agenda:
 class Place(NamedTuple):
     """Where in its stretches a run is."""
 
-    stretch: int = 0
-    first: int = 0  # steps before the stretch
-    time: float = 0.0  # of the stretches before, ps or s
-    computing: Sequence[float] = ()  # seconds of the stretches before
-    seconds: float = 0.0  # of computing in this one
+    stretch: NonNegativeInt = 0
+    first: NonNegativeInt = 0  # steps before the stretch
+    time: Seconds = 0.0  # of the stretches before, ps or s
+    computing: tuple[Seconds, ...] = ()  # seconds of the stretches before
+    seconds: Seconds = 0.0  # of computing in this one
 
 
 class Costs(NamedTuple):

@@ -377,7 +377,6 @@ class BodyScene(Scene):
 
     @property
     def in_short(self) -> str:
-        """Body, duration, steps."""
         run = self.run
         how = "" if run.is_open else f" in {run.steps} steps of {run.timestep_s:g} s"
         pinned = ", pinned" if self.body.pinned else ""
@@ -394,7 +393,6 @@ class BodyScene(Scene):
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
-        """Faults between tables."""
         found: list[tuple[list, str]] = []
         tables = {key: value for key, value in data.items() if isinstance(value, dict)}
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))

@@ -199,7 +199,6 @@ class MolecularScene(Scene):
 
     @property
     def inputs(self) -> dict[str, Path]:
-        """Every further file that it reads: dotted key -> path."""
         found = {}
         if self.structure is not None and "structure.file" not in self.held:
             found["structure.file"] = self.path(self.structure.file)

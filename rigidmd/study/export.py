@@ -8,7 +8,7 @@ from typing import NamedTuple
 from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.output.folder import SCENE
+from rigidmd.output.folder import SCENE, write_marker
 from rigidmd.output.scene_file import input_names, write_scene
 from rigidmd.peers.portrait import Portrait, portrait
 from rigidmd.run import MolecularSimulation
@@ -62,7 +62,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
             (folder / name).unlink(missing_ok=True)
         write_scene(folder, system.scene)
         names = [SCENE, *input_names(system.scene).values(), *writer.write(folder, drawn, state)]
-        (folder / MARKER).write_text("\n".join(names) + "\n", encoding="utf-8")
+        write_marker(folder, names, MARKER)
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
     return Exported(writer.title, names, system.notes, writer.command)

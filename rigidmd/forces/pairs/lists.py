@@ -192,30 +192,44 @@ def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
     return found
 
 
-def recalled(pairs: PairList, memory: dict[str, np.ndarray]) -> PairList:
-    """The list with the clusters and the skin of a memory; `update.refill` must follow if there are clusters.
+def recalled(pairs: PairList, memory: dict[str, np.ndarray], asked: float, now: float) -> PairList:
+    """The new list with the clusters and the skin of a memory; `update.refill` must follow if there are clusters.
 
-    Raises ValueError if the memory is that of another list.
+    asked : the skin that was asked for, Å. now : the present time, ps
+    Raises ValueError if the memory is that of no such list.
     """
+    clusters, cell = pairs.clusters, pairs.cell
+    like = {name: getattr(clusters, name) for name in (*REMEMBERED, "order")}
+    like |= {"built": pairs.built, "times": pairs.times}
+    if memory.keys() not in ({"skin"}, {"skin", *like}):
+        raise ValueError(f"a neighbour list has {', '.join(memory)}")
+    for name, array in ({"skin": np.array(pairs.skin)} | like).items():
+        found = memory.get(name, array)
+        if (found.shape, found.dtype) != (array.shape, array.dtype):
+            raise ValueError(f"{name} of a neighbour list has another shape or type")
+        if name in memory and name not in ("skin", "built") and not np.isfinite(found).all():
+            raise ValueError(f"{name} of a neighbour list is not finite")
     skin = float(memory["skin"])
+    if not (min(pairs.skin, 2 * LONGEST_SKIN * pairs.cutoff) <= skin <= max(pairs.skin, asked)):
+        raise ValueError(f"a neighbour list has the skin {skin:g} Å")
     pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
-    clusters = pairs.clusters
-    for name in (*REMEMBERED, "order"):
-        array = getattr(clusters, name)
-        if name in memory:
-            if (memory[name].shape, memory[name].dtype) != (array.shape, array.dtype):
-                raise ValueError(f"{name} of a list has another shape or type")
-            array[:] = memory[name]
-    if "order" in memory:
-        sites = len(clusters.slot)
-        if not np.array_equal(np.sort(clusters.order[:sites]), np.arange(sites)):
-            raise ValueError("order of a list is none of its sites")
-        clusters.slot[clusters.order[:sites]] = np.arange(sites)
-        clusters.group[:] = pairs.group[clusters.order]
-    if "built" in memory:  # the update of the list then follows the cell of the state
-        pairs.cell[:] = memory["built"]
-    if "times" in memory:
-        pairs.times[:] = memory["times"]
+    if "order" not in memory:
+        return pairs
+    with np.errstate(invalid="ignore"):  # of edges that are infinite
+        moved = np.abs(memory["built"] - cell)
+    if not ((memory["built"] == cell) | ((moved <= skin) & (moved < inf))).all():
+        raise ValueError("a neighbour list was built for another box")
+    if not 0 <= memory["times"][BUILT] <= now:
+        raise ValueError(f"a neighbour list was built at {memory['times'][BUILT]:g} ps")
+    sites = len(clusters.slot)
+    if not np.array_equal(np.sort(memory["order"][:sites]), np.arange(sites)):
+        raise ValueError("order of a neighbour list is none of its sites")
+    for name, array in like.items():
+        array[:] = memory[name]
+    clusters.order[sites:] = clusters.order[sites - 1]
+    clusters.slot[clusters.order[:sites]] = np.arange(sites)
+    clusters.group[:] = pairs.group[clusters.order]
+    cell[:] = pairs.built  # the update of the list then follows the cell of the state
     return pairs
 
 

@@ -160,9 +160,9 @@ class PairWorkspace(NamedTuple):
         """Its list as last built."""
         return neighbors.memory_of(self.pairs)
 
-    def recall(self, memory: dict[str, np.ndarray]) -> "PairWorkspace":
+    def recall(self, memory: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
         """With the list of a memory; has machine code. Raises ValueError if the memory is that of another term."""
-        found = self._replace(pairs=neighbors.recalled(self.pairs, memory))
+        found = self._replace(pairs=neighbors.recalled(self.pairs, memory, skin, now))
         while "order" in memory and _refill(found):
             found = found.with_room(found.pairs.cell)
         return found

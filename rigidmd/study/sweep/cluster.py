@@ -11,6 +11,7 @@ import select
 from pathlib import Path
 from typing import Any
 
+from rigidmd.core.files import write_text
 from rigidmd.errors import RigidMDError, SettingError
 from rigidmd.output.sweep_folder import STOP
 from rigidmd.study.sweep.processes import Message, Worker
@@ -104,7 +105,7 @@ class Cluster:
 
     def stop(self) -> None:
         """Let all runs end with checkpoints: a file tells them."""
-        self._stop.touch()
+        write_text(self._stop, "")
 
     def kill(self) -> None:
         """Wait for nothing; the runs end by themselves."""

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import write_text
 from rigidmd.output.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.output.sweep_folder import FINISHED, SCRIPT, Manifest
 
@@ -59,8 +59,7 @@ def write_script(
         script=shlex.quote(str(path)),
         again=again,
     )
-    with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text)
     return path, len(left)
 
 
