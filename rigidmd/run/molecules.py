@@ -275,7 +275,7 @@ class MolecularSimulation(Simulation):
         stage = self.scene.stages[k]
         step = stage.timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
-            return Stretch(stage.scheme, step, 0, act=None if k in self._minima else self._minimise)
+            return Stretch(stage.scheme, step, 0, act=None if k in self._record.minima else self._minimise)
         return Stretch(row_of_stage(self.system, k), step, stage.steps)
 
     def _durations(self) -> list[float]:
@@ -357,7 +357,7 @@ class MolecularSimulation(Simulation):
 
     def _is_replaced(self, moment: Moment) -> bool:
         stages, k = self.scene.stages, moment.stage
-        if stages[k].is_minimisation and k not in self._minima:
+        if stages[k].is_minimisation and k not in self._record.minima:
             return True  # the start
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
         # an interrupted minimisation is repeated by a run that resumes, which also has another frame for it
