@@ -1,30 +1,89 @@
-"""The error of a drift: right for white noise, for a random walk, and for the two together."""
+"""Errors of means and of drifts are as large as their scatter: white noise, processes with memory, random walks."""
 
 import numpy as np
 import pytest
+from conftest import small_scene
+from scipy.signal import lfilter
 
-from rigidmd.measure.drift import inefficiency, slope
+from rigidmd import Simulation
+from rigidmd.measure.drift import slope
+from rigidmd.measure.means import correlation_time, error_of_mean, inefficiency, mean
 
-
-@pytest.mark.parametrize(
-    ("white", "walk", "low", "high"), [(1.0, 0.0, 0.6, 1.2), (0.0, 1.0, 0.8, 1.5), (1.0, 0.3, 0.8, 1.6)]
-)
-def test_the_error_of_a_slope_is_as_large_as_its_scatter(white, walk, low, high):
-    rng = np.random.default_rng(0)
-    time = 0.05 * np.arange(400)
-    ratios = []
-    for _ in range(300):
-        noise = white * rng.standard_normal(400) + walk * np.cumsum(rng.standard_normal(400))
-        found = slope(time, 3.0 * time + noise)
-        ratios.append((found.value - 3.0) / found.error)
-    assert low < np.std(ratios) < high
+SERIES = 400
 
 
-def test_a_line_is_found_exactly():
-    time = np.linspace(0, 2, 50)
-    found = slope(time, 1 - 4 * time)
-    assert found.value == pytest.approx(-4)
-    assert found.rms < 1e-14
+def memory(rng, n, time):
+    """Ornstein and Uhlenbeck's process (SERIES, n) of variance 1; time in samples."""
+    keep = np.exp(-1 / time)
+    noise = np.sqrt(1 - keep**2) * rng.standard_normal((SERIES, n))
+    noise[:, 0] /= np.sqrt(1 - keep**2)
+    return lfilter([1], [1, -keep], noise, axis=1)
+
+
+def white(rng, n, time):
+    return rng.standard_normal((SERIES, n))
+
+
+def autoregressive(rng, n, time):
+    """x = a x + noise, whose sum over correlations is `time`."""
+    return memory(rng, n, 1 / np.log((2 * time + 1) / (2 * time - 1)))
+
+
+def mixed(slow):
+    """A slow process below white noise."""
+    return lambda rng, n, time: np.sqrt(1 - slow) * white(rng, n, time) + np.sqrt(slow) * memory(rng, n, time)
+
+
+def fast_and_slow(rng, n, time):
+    return np.sqrt(0.7) * memory(rng, n, max(0.5, time / 8)) + np.sqrt(0.3) * memory(rng, n, time)
+
+
+def pulls(series, estimate=mean):
+    """(mean - truth)/error of series of mean 0, and the fraction of them that have an error."""
+    found = np.array([estimate(values) for values in series], float)
+    known = np.isfinite(found[:, 1])
+    return found[known, 0] / found[known, 1], known.mean()
+
+
+PROCESSES = {
+    "white": white, "autoregressive": autoregressive, "memory": memory, "half of it slow": mixed(0.5),
+    "a tenth slow": mixed(0.1), "fast and slow": fast_and_slow,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+@pytest.mark.parametrize("n", [16, 50, 160, 1000, pytest.param(5000, marks=pytest.mark.slow)])
+def test_the_error_of_a_mean_is_as_large_as_its_scatter(n, name):
+    """For lengths of 10, 20 and 100 of the longest correlation time; a tenth that is slow is harder to see."""
+    rng = np.random.default_rng(n)
+    for time in (n / 10, n / 20, n / 100) if name != "white" else (0.5,):
+        if time < 0.75 and name != "white":
+            continue
+        found, known = pulls(PROCESSES[name](rng, n, time))
+        size = np.sqrt(np.mean(found**2))
+        short = 20 * time > n
+        assert 0.7 < size < (1.45 if short else 1.25), (time, size)
+        assert np.mean(np.abs(found) > 2) < (0.15 if short else 0.12)
+        assert np.mean(np.abs(found) > 3) < (0.06 if short else 0.03)
+        assert known > 0.9
+        # the precision is not given away where samples are many: of white noise 1/sqrt(n)
+        if name == "white" and n > 50:
+            assert np.median([mean(x)[1] for x in white(rng, n, 0.5)]) < 1.35 / np.sqrt(n)
+
+
+@pytest.mark.parametrize("values", [np.ones(7), np.arange(7.0), np.arange(100.0), np.linspace(0, 1, 20) ** 2])
+def test_what_is_too_short_has_no_error(values):
+    assert mean(values) == (pytest.approx(values.mean()), None)
+    assert mean(np.full(20, 0.1)) == (pytest.approx(0.1), 0.0)
+    assert mean([1.0, np.nan] * 10) == (None, None)
+
+
+def test_few_independent_values_have_the_error_of_student():
+    values = np.random.default_rng(0).standard_normal((20_000, 4))
+    for count in (2, 3, 4):
+        error = error_of_mean(values[:, :count].T)
+        within = np.mean(np.abs(values[:, :count].mean(axis=1)) < error)
+        assert within == pytest.approx(0.683, abs=0.012)
 
 
 def test_inefficiency_of_correlated_samples():
@@ -34,3 +93,56 @@ def test_inefficiency_of_correlated_samples():
         x[k] = 0.8 * x[k - 1] + rng.standard_normal()
     assert inefficiency(x) == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.15)
     assert inefficiency(rng.standard_normal(50000)) == pytest.approx(1, abs=0.1)
+    assert correlation_time(x, 0.1) == pytest.approx(0.05 * inefficiency(x - x.mean()))
+
+
+@pytest.mark.slow
+def test_means_of_windows_of_a_run_have_honest_errors():
+    """Windows of 10 ps of 0.6 ns of 100 argon atoms: potential energy, temperature, pressure."""
+    stages = [{"ensemble": "nvt", "temperature_K": 94.4, "timestep_fs": 10.0, "duration_ps": t} for t in (20.0, 600.0)]
+    scene = small_scene({"argon": 100}, 16.8, start={"temperature_K": 94.4}, stages=stages, forces={"cutoff_A": 8.0},
+                        output={"trajectory": False, "log_interval_ps": 0.1})  # fmt: skip
+    results = Simulation(scene).run()
+    for name in ("potential", "temperature", "pressure_bar"):
+        values = results[name][results["stage"] == 1]
+        found, known = pulls(values[: len(values) // 100 * 100].reshape(-1, 100) - values.mean())
+        assert known > 0.9
+        assert 0.7 < np.sqrt(np.mean(found**2)) < 1.3, name
+        assert np.mean(np.abs(found) > 2) < 0.15
+
+
+# drift
+
+
+@pytest.mark.parametrize(
+    ("n", "noise", "walk", "high"),
+    [
+        (16, 1.0, 0.0, 0.8), (40, 1.0, 0.0, 0.8), (400, 1.0, 0.0, 0.8),
+        (40, 0.0, 1.0, 1.4), (200, 0.0, 1.0, 1.3), (1000, 0.0, 1.0, 1.3),
+        (200, 1.0, 0.03, 1.25), (1000, 1.0, 0.03, 1.6), (400, 1.0, 0.3, 1.5),
+    ],
+)  # fmt: skip
+def test_the_error_of_a_slope_is_as_large_as_its_scatter(n, noise, walk, high):
+    """Also where a walk hides under white noise."""
+    rng = np.random.default_rng(0)
+    time, ratios = 0.05 * np.arange(n), []
+    for _ in range(SERIES):
+        values = noise * rng.standard_normal(n) + walk * np.cumsum(rng.standard_normal(n))
+        found = slope(time, 3.0 * time + values)
+        ratios.append((found.value - 3.0) / found.error)
+    assert 0.35 < np.std(ratios) < high
+    assert np.mean(np.abs(ratios) > 3) < 0.07
+
+
+def test_few_samples_have_a_slope_without_an_error():
+    for n in (3, 10, 15):
+        found = slope(np.arange(n), np.sin(np.arange(n)))
+        assert np.isfinite(found.value) and np.isnan(found.error)
+    assert np.isfinite(slope(np.arange(16), np.sin(np.arange(16))).error)
+
+
+def test_a_line_is_found_exactly():
+    time = np.linspace(0, 2, 50)
+    found = slope(time, 1 - 4 * time)
+    assert found.value == pytest.approx(-4)
+    assert found.rms < 1e-14

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from rigidmd.analyse.findings import Curve, Finding, correlation_time, settled
+from rigidmd.analyse.findings import Curve, Finding, settled
 from rigidmd.analyse.history import History
 from rigidmd.analyse.registry import built_in
 from rigidmd.errors import OutputError
-from rigidmd.measure.summary import mean
+from rigidmd.measure.means import correlation_time, mean
 from rigidmd.units import COULOMB, DEBYE
 
 

@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.analyse.history import History
-from rigidmd.measure.drift import inefficiency
+from rigidmd.analyse.history import History, Kind
+from rigidmd.measure.means import error_of_mean, with_error
 
 #: Blocks of a history whose scatter gives errors. The error of an error is one third.
 BLOCKS = 5
+#: Groups of molecules at most, whose scatter gives errors too.
+GROUPS = 10
 #: Correlation times that a stretch must hold before it gives a value: those of the whole system, and those of single
 #: molecules, which are many and of which each block should see one at least.
 LEAST, LEAST_EACH = 20.0, float(BLOCKS)
@@ -59,6 +61,10 @@ class Curve:
     level: float | None = None
     bars: bool = False
 
+    def add(self, title: str, values: np.ndarray, errors: np.ndarray) -> None:
+        """Add a column with its errors."""
+        self.columns[title], self.errors[title] = values, errors
+
 
 @dataclass(eq=False)
 class Finding:
@@ -98,29 +104,27 @@ class Finding:
     __repr__ = __str__
 
 
-def with_error(value: float, error: float | None) -> str:
-    """Such as 2.51 ± 0.04: two digits of the error."""
-    if error is None or not isfinite(error):
-        return f"{value:.4g}"
-    if error <= 0:
-        return f"{value:.6g}"
-    places = 1 - int(np.floor(np.log10(error)))
-    if -6 <= places <= 8 and abs(value) < 1e6:
-        return f"{value:.{max(0, places)}f} ± {error:.{max(0, places)}f}"
-    return f"{value:.4g} ± {error:.1e}"
+def so_far(value: float, error: float | None = None, unit: str = "") -> str:
+    """What a run that is too short has given, in words."""
+    return f"So far: {with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
 
 
 def settled(
-    name: str, unit: str, value: float, error: float, span: float, correlation: float, note: str = "",
+    name: str, unit: str, value: float, error: float | None, span: float, correlation: float, note: str = "",
     least: float = LEAST,
 ) -> Value:  # fmt: skip
     """A value made of a stretch of `span`, which has to be `least` correlation times long (both ps)."""
     if not correlation > 0 or not isfinite(value):
         return Value(name, unit, None, None, None, "the frames give no correlation time")
     if (lengths := span / correlation) < least:
-        told = f"this run is {lengths:.2g} correlation times ({correlation:.3g} ps) long: too short for a value"
+        told = (
+            f"{span:.3g} ps are {lengths:.2g} correlation times of {correlation:.3g} ps, too short for a value; "
+            f"{least:g} of them are {least * correlation:.3g} ps. {so_far(value, error, unit)}"
+        )
         return Value(name, unit, None, None, correlation, told)
-    return Value(name, unit, value, error if isfinite(error) else None, correlation, note)
+    if error is None or not isfinite(error):
+        return Value(name, unit, None, None, correlation, f"too short for an error. {so_far(value, None, unit)}")
+    return Value(name, unit, value, error, correlation, note)
 
 
 def blocks(history: History, count: int = BLOCKS) -> list[History]:
@@ -137,11 +141,17 @@ def over_blocks(history: History, function: Callable[[History], np.ndarray]) -> 
     """An array that a function makes of a history, and its standard error, from what it makes of blocks."""
     whole = np.asarray(function(history), float)
     parts = [np.asarray(function(part), float) for part in blocks(history)]
-    if len(parts) < 2:
-        return whole, np.full_like(whole, np.nan)
-    return whole, np.std(parts, axis=0, ddof=1) / np.sqrt(len(parts))
+    return whole, error_of_mean(parts) if parts else np.full_like(whole, np.nan)
 
 
-def correlation_time(values: np.ndarray, interval: float) -> float:
-    """Integrated correlation time of a series, in units of `interval`: half its inefficiency."""
-    return 0.5 * interval * inefficiency(values - values.mean())
+def over_parts(
+    history: History, kind: Kind, function: Callable[[History, Kind], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """An array that a function makes of the molecules of a species, and its standard error: the larger of two, from
+    blocks of the history and from groups of its molecules. Where motion repeats itself, as that of a gas, blocks are
+    alike; where molecules move together, groups are."""
+    whole, error = over_blocks(history, lambda part: function(part, kind))
+    if (count := min(GROUPS, len(kind.index))) > 1:
+        own = (kind._replace(index=kind.index[k::count], sites=kind.sites[k::count]) for k in range(count))
+        error = np.fmax(error, error_of_mean([function(history, group) for group in own]))
+    return whole, error

@@ -4,7 +4,7 @@ import numpy as np
 from scipy import optimize
 
 from rigidmd.analyse.correlation import correlation
-from rigidmd.analyse.findings import Curve, Finding, Value, settled
+from rigidmd.analyse.findings import Curve, Finding, Value, settled, so_far
 from rigidmd.analyse.history import EVEN, History
 from rigidmd.analyse.motion import MPA_S
 from rigidmd.analyse.registry import built_in
@@ -88,7 +88,11 @@ def viscosity(history: History) -> Finding:
     ]
     grows = float(mean[end - 1] - mean[end // 2]) > GROWS * float(mean[end - 1])
     if whole is None or grows or len(drawn) < DRAWS // 2:
-        told = f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps: too short for a value"
+        told = (
+            f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps, too short for a value; "
+            f"a run of {4 * gaps.sum():.3g} ps follows it four times as far. "
+            f"{so_far(mean[end - 1], scatter[end - 1] / np.sqrt(len(running)), 'mPa s')}"
+        )
         found.values.append(Value("viscosity", "mPa s", None, None, None, told))
         return found
     forgets = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0

@@ -3,8 +3,8 @@
 import numpy as np
 
 from rigidmd.analyse.correlation import squared_displacement
-from rigidmd.analyse.findings import BLOCKS, LEAST_EACH, Curve, Finding, Value, over_blocks, settled
-from rigidmd.analyse.history import History
+from rigidmd.analyse.findings import BLOCKS, LEAST_EACH, Curve, Finding, Value, over_parts, settled, so_far
+from rigidmd.analyse.history import History, Kind
 from rigidmd.analyse.registry import built_in
 from rigidmd.errors import OutputError
 from rigidmd.units import BAR
@@ -32,9 +32,9 @@ def evenly(history: History, what: str) -> tuple[float, int]:
     return history.interval, lags
 
 
-def _displacements(history: History, lags: int) -> np.ndarray:
-    """Mean squared displacements (lags, kinds), Å²."""
-    return np.stack([squared_displacement(history.paths[:, kind.index], lags) for kind in history.moving], axis=1)
+def _displacements(history: History, kind: Kind, lags: int) -> np.ndarray:
+    """Mean squared displacement (lags,), Å²."""
+    return squared_displacement(history.paths[:, kind.index], lags)
 
 
 @built_in("mean squared displacement of the centres of mass")
@@ -44,11 +44,10 @@ def msd(history: History) -> Finding:
     Molecules are followed through the walls of the box, without what a barostat scaled. Raises OutputError.
     """
     interval, lags = evenly(history, "a mean squared displacement")
-    values, errors = over_blocks(history, lambda part: _displacements(part, lags))
     curve = Curve("msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True))
-    for k, kind in enumerate(history.moving):
-        title = f"MSD {kind.name} (A^2)"
-        curve.columns[title], curve.errors[title] = values[:, k], errors[:, k]
+    for kind in history.moving:
+        found = over_parts(history, kind, lambda part, own: _displacements(part, own, lags))
+        curve.add(f"MSD {kind.name} (A^2)", *found)
     return Finding("msd", "mean squared displacement", curves=[curve])
 
 
@@ -71,21 +70,21 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
 
     half = len(time) // 2
 
-    def slopes(part: History) -> np.ndarray:
-        seen = _displacements(part, lags)[first:]
+    def slopes(part: History, kind: Kind) -> np.ndarray:
+        seen = _displacements(part, kind, lags)[first:]
         return np.array([_slope(time, seen), _slope(time[half:], seen[half:]) - _slope(time[:half], seen[:half])]) / 6
 
-    values, errors = over_blocks(history, slopes)
     found = Finding("diffusion", "diffusion coefficients", curves=[_so_far(history, interval, lags)])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
     edge = _cubic_edge(history)
     eta = viscosity_of(history) if viscosity_mPa_s is None else None
-    for k, kind in enumerate(history.moving):
-        name, D, error = f"D of {kind.name}", float(values[0, k]), float(errors[0, k])
-        bend, doubt = float(values[1, k]), float(errors[1, k])
+    for kind in history.moving:
+        name, ((D, bend), (error, doubt)) = f"D of {kind.name}", np.array(over_parts(history, kind, slopes)).tolist()
         if D <= 0 or abs(bend) > BEND * D + 2 * np.nan_to_num(doubt):
             told = (
-                f"the slope of its displacement changes from {time[0]:.3g} to {time[-1]:.3g} ps: too short for a value"
+                f"the slope of its displacement changes from {time[0]:.3g} to {time[-1]:.3g} ps, too short for a "
+                f"value; a run of {4 * history.span:.3g} ps follows it four times as far. "
+                f"{so_far(D / NM2_PER_S, error / NM2_PER_S, '1e-9 m²/s')}"
             )
             found.values.append(Value(name, "1e-9 m²/s", None, None, None, told))
             continue
@@ -114,16 +113,16 @@ def diffusion(history: History, viscosity_mPa_s: float | None = None) -> Finding
 def _so_far(history: History, interval: float, lags: int) -> Curve:
     """MSD/6t of each species, which tends to D."""
     time = interval * np.arange(1, lags)
-    values, errors = over_blocks(history, lambda part: _displacements(part, lags)[1:] / (6 * NM2_PER_S * time[:, None]))
     curve = Curve("diffusion", ("Time (ps)", time), "MSD/6t (1e-9 m²/s)", {})
-    for k, kind in enumerate(history.moving):
-        title = f"MSD/6t {kind.name} (1e-9 m^2/s)"
-        curve.columns[title], curve.errors[title] = values[:, k], errors[:, k]
+    size = 6 * NM2_PER_S * time
+    for kind in history.moving:
+        found = over_parts(history, kind, lambda part, own: _displacements(part, own, lags)[1:] / size)
+        curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *found)
     return curve
 
 
-def _slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Least-squares slopes of columns (t, k) against time."""
+def _slope(time: np.ndarray, values: np.ndarray) -> float:
+    """Least-squares slope of values (t,) against time."""
     off = time - time.mean()
     return off @ values / (off @ off)
 

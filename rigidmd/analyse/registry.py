@@ -11,8 +11,7 @@ from rigidmd.analyse.findings import Curve, Finding, Value, settled
 from rigidmd.analyse.history import History
 from rigidmd.core.files import file_fault
 from rigidmd.errors import OutputError
-from rigidmd.measure.drift import inefficiency
-from rigidmd.measure.summary import mean
+from rigidmd.measure.means import correlation_time, mean
 from rigidmd.validation import meant
 
 
@@ -123,9 +122,9 @@ def _of_own(name: str, about: str, function: Callable[[History], Any], history: 
         columns[str(title)] = array
         value, error = mean(array)
         gap = history.span / (len(history) - 1)
-        if np.ptp(array) == 0 or value is None or error is None:
+        if np.ptp(array) == 0 or value is None:
             values.append(Value(str(title), "", float(array[0]), 0.0))
         else:
-            tau = 0.5 * gap * inefficiency(array - array.mean())
+            tau = correlation_time(array, gap)
             values.append(settled(str(title), "", value, error, history.span, tau))
     return Finding(name, about, values, [Curve(name, ("Time (ps)", history.time), about, columns)])

@@ -4,12 +4,12 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from rigidmd.analyse.findings import BLOCKS, Curve, Finding, Value, correlation_time, over_blocks
+from rigidmd.analyse.findings import BLOCKS, Curve, Finding, Value, over_blocks
 from rigidmd.analyse.history import History, Kind
 from rigidmd.analyse.registry import built_in
 from rigidmd.errors import OutputError
 from rigidmd.forces.pairs.counts import count_pairs, heights
-from rigidmd.measure.summary import mean
+from rigidmd.measure.means import correlation_time, error_of_mean, mean
 from rigidmd.molecules import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
@@ -66,7 +66,7 @@ def rdf(
         within = curve.columns[title] * shells * density
         curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
         if len(parts) > 1:
-            curve.errors[title] = np.std(parts, axis=0, ddof=1) / np.sqrt(len(parts))
+            curve.errors[title] = error_of_mean(parts)
         gap = thinned.span / max(1, len(thinned) - 1)
         found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, gap)
     if len(thinned) < len(history):
@@ -119,29 +119,47 @@ def _peaks(
     frames (f, bins) : g(r) of each, `gap` ps apart; parts : means of blocks; filled (bins,) : neighbours where g is 1
     """
 
-    def valley(g: np.ndarray) -> int:
+    width = r[1] - r[0]
+    edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
+
+    def valley(g: np.ndarray) -> float:
+        """Place of the first minimum: that of a parabola through its surroundings, which noise of single bins moves
+        little."""
         top = _first_top(g)
-        return top + int(np.argmin(g[top : top + max(3, int(0.9 * top))]))
+        low = top + int(np.argmin(g[top : top + max(3, int(0.9 * top))]))
+        reach = max(2, (low - top) // 3)
+        near = slice(max(top, low - reach), low + reach + 1)
+        bend, tilt, _ = np.polyfit(r[near] - r[low], g[near], 2) if len(r[near]) > 3 else (0.0, 0.0, 0.0)
+        shift = -0.5 * tilt / bend if bend > 0 else 0.0
+        return float(r[low] + np.clip(shift, -reach * width, reach * width))
+
+    def within(g: np.ndarray, end: float) -> np.ndarray:
+        """Neighbours up to a distance, of g (..., bins)."""
+        share = np.clip((end - edges[:-1]) / width, 0.0, 1.0)  # of each bin
+        return (g * filled) @ share
 
     def seen(g: np.ndarray) -> np.ndarray:
         top = _first_top(g)
         low, middle, high = g[top - 1 : top + 2]
         bend = low - 2 * middle + high
         shift = 0.5 * (low - high) / bend if bend < 0 else 0.0
-        place, height = r[top] + shift * (r[1] - r[0]), middle - 0.25 * (low - high) * shift
-        return np.array([place, height, np.sum((g * filled)[: valley(g)])])
+        place, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
+        return np.array([place, height, within(g, valley(g))])
 
     g = frames.mean(axis=0)
     if g.max() < 1.05 or not 0 < _first_top(g) < len(g) - 3:
         return []
     whole = seen(g)
     usable = [seen(part) for part in parts if part.max() > 1.05 and 0 < _first_top(part) < len(g) - 3]
-    error = np.std(usable, axis=0, ddof=1) / np.sqrt(len(usable)) if len(usable) > 1 else [None] * 3
-    tau = correlation_time((frames * filled)[:, : valley(g)].sum(axis=1), gap) if len(frames) > 2 else None
+    errors = list(error_of_mean(usable)) if len(usable) > 1 else [None] * 3
+    inside = within(frames, valley(g))
+    tau = correlation_time(inside, gap) if len(frames) > 2 else None
+    if len(usable) > 1:
+        errors[2] = max(errors[2], mean(inside)[1] or 0.0)
     titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
-        for (title, unit), value, e in zip(titles, whole, error, strict=True)
+        for (title, unit), value, e in zip(titles, whole, errors, strict=True)
     ]
 
 
@@ -188,7 +206,7 @@ def structure_factor(history: History, name: str = "", largest: float = LARGEST_
     parts = [part.mean(axis=0) for part in _split(values)]
     found = Finding("structure_factor", "structure factor", curves=[curve])
     if len(parts) > 1:
-        curve.errors[title] = np.std(parts, axis=0, ddof=1) / np.sqrt(len(parts))
+        curve.errors[title] = error_of_mean(parts)
         top = int(np.argmax(curve.columns[title]))
         height, error = float(curve.columns[title][top]), float(curve.errors[title][top])
         told = f"at {length[top]:.2f} 1/Å, bins of {WAVE_WIDTH} 1/Å"
@@ -276,7 +294,7 @@ def hydrogen_bonds(history: History, distance: float = BOND, angle: float = BOND
     told = [f"of {len(thinned)} of {len(history)} frames"] if len(thinned) < len(history) else []
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time(each, thinned.span / (len(thinned) - 1))
-    found = Value("hydrogen bonds of a molecule", "1", value, error if len(each) > 2 else None, tau, about)
+    found = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
     return Finding("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], told)
 
 

@@ -1,12 +1,13 @@
 """How molecules turn and shake: orientational correlation, rotational diffusion, spectra; from Q, L and V."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy import signal
 
 from rigidmd.analyse.correlation import correlation, squared_displacement
-from rigidmd.analyse.findings import BLOCKS, LEAST_EACH, Curve, Finding, Value, over_blocks, settled
+from rigidmd.analyse.findings import BLOCKS, LEAST_EACH, Curve, Finding, Value, over_parts, settled, so_far
 from rigidmd.analyse.history import History, Kind
 from rigidmd.analyse.motion import evenly
 from rigidmd.analyse.registry import built_in
@@ -17,6 +18,8 @@ from rigidmd.mechanics.inertia import rotational_freedom
 TAIL = 0.05
 #: Correlation at the longest lag above which there is no value: too much of the integral would be that exponential.
 HIGH = 0.2
+#: And up to which that lag tells when it will have decayed.
+SLOWEST = 0.98
 #: rad: largest turn between two frames, root mean square, at which turns about the body's axes can be added up.
 LARGEST_TURN = 0.7
 #: Correlation of a velocity over one interval of frames below which these are too far apart for a spectrum.
@@ -57,21 +60,29 @@ def orientation(history: History) -> Finding:
             found.notes.append(note)
         for axis in _axes(kind):
 
-            def seen(part: History, kind=kind, axis=axis) -> np.ndarray:
-                both = _legendre(part, kind, axis, lags)
+            def seen(part: History, own: Kind, axis=axis) -> np.ndarray:
+                both = _legendre(part, own, axis, lags)
                 return np.concatenate([both, [[_integral(c, interval)] for c in both]], axis=1)
 
-            values, errors = over_blocks(history, seen)
+            values, errors = over_parts(history, kind, seen)
             for l in (0, 1):  # noqa: E741
-                title = f"C{l + 1} {kind.name} axis {axis + 1}"
-                curve.columns[title], curve.errors[title] = values[l, :-1], errors[l, :-1]
-                tau, error, left = float(values[l, -1]), float(errors[l, -1]), float(values[l, -2])
+                C, doubt = values[l, :-1], errors[l, :-1]
+                curve.add(f"C{l + 1} {kind.name} axis {axis + 1}", C, doubt)
+                tau, error = float(values[l, -1]), float(errors[l, -1])
                 name = f"tau{l + 1} of {kind.name}, axis {axis + 1}"
-                if left > HIGH:
-                    told = f"C{l + 1} is still {left:.2f} after {time[-1]:.3g} ps: too short for a value"
+                if C[-1] > HIGH:
+                    # an exponential falls to HIGH at a lag, and a run is 2 BLOCKS times as long as its longest lag
+                    need = 2 * BLOCKS * time[-1] * np.log(HIGH) / np.log(min(float(C[-1]), SLOWEST))
+                    told = (
+                        f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a value; it needs "
+                        f"{'about' if C[-1] < SLOWEST else 'more than'} {need:.2g} ps. {so_far(tau, None, 'ps')}"
+                    )
                     found.values.append(Value(name, "ps", None, None, None, told))
-                else:
-                    found.values.append(settled(name, "ps", tau, error, history.span, tau, least=LEAST_EACH))
+                    continue
+                low, told = int(C.argmin()), ""
+                if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
+                    told = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
+                found.values.append(settled(name, "ps", tau, error, history.span, tau, told, LEAST_EACH))
         found.values += _rotational_diffusion(history, kind, interval, lags)
     return found
 
@@ -135,16 +146,15 @@ def _rotational_diffusion(history: History, kind: Kind, interval: float, lags: i
     time = interval * np.arange(first, lags)
     if len(time) < 2:
         return []
-    path = np.concatenate([np.zeros_like(turns[:1]), np.cumsum(turns, axis=0)])
 
-    def slopes(part: np.ndarray) -> np.ndarray:
-        seen = np.stack([squared_displacement(part[..., k : k + 1], lags)[first:] for k in range(3)], axis=1)
+    def slopes(part: History, own: Kind) -> np.ndarray:
+        turned = _turns(part, own)
+        path = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(turned, axis=0)])
+        seen = np.stack([squared_displacement(path[..., k : k + 1], lags)[first:] for k in range(3)], axis=1)
         return (time - time.mean()) @ seen / np.sum((time - time.mean()) ** 2) / 2
 
-    size = len(path) // BLOCKS
-    values = slopes(path)
+    values, errors = over_parts(history, kind, slopes)
     decay = 1 / (2 * max(float(values.mean()), 1e-300))
-    errors = np.std([slopes(path[k * size : (k + 1) * size]) for k in range(BLOCKS)], axis=0, ddof=1) / np.sqrt(BLOCKS)
     return [
         settled(name, "1/ps", float(D), float(error), history.span, decay, least=LEAST_EACH)
         for name, D, error in zip(names, values, errors, strict=True)
@@ -159,40 +169,56 @@ def spectrum(history: History) -> Finding:
     if history.velocities is None or history.L is None:
         raise OutputError("a spectrum needs velocities in the frames: output.trajectory = 'trajectory.trr' keeps them")
     interval, lags = evenly(history, "a spectrum")
-    velocities = history.velocities
-    size = min(len(history), 2 * lags)
+    size = len(history) // BLOCKS
     found = Finding("spectrum", "densities of states")
     wave_numbers = np.fft.rfftfreq(size, interval) / PER_CM
     power = Curve("spectrum", ("wave number (1/cm)", wave_numbers), "density of states (cm)", {})
     memory = Curve("velocity_correlation", ("Time (ps)", interval * np.arange(lags)), "correlation", {}, level=0.0)
     found.curves += [power, memory]
     for kind in history.moving:
-        m = kind.molecule
-        series = [(f"V {kind.name}", velocities[:, kind.index], m.mass)]
-        if m.degrees_of_freedom > 3:
-            L = history.L[:, kind.index]
-            lab = np.einsum("fnij,fnj->fni", history.Q[:, kind.index], L)
-            memory.columns[f"correlation L {kind.name}"] = _normalised(lab, lags)
-            if len(_axes(kind)) == 1:  # which of the two other axes is which has no meaning
-                series.append((f"omega {kind.name}", lab / m.inertia[2], float(m.inertia[2])))
-            else:
-                for k, moment in enumerate(m.inertia.tolist()):
-                    series.append((f"omega {kind.name} axis {k + 1}", L[..., k : k + 1] / moment, moment))
-        for title, values, mass in series:
-            seen = _normalised(values, lags)
+        if kind.molecule.degrees_of_freedom > 3:
+            title = f"correlation L {kind.name}"
+            memory.add(title, *over_parts(history, kind, lambda part, own: _normalised(_lab_momenta(part, own), lags)))
+        for title, (weight, of) in _rates(kind).items():
+            seen, errors = over_parts(history, kind, lambda part, own, of=of: _normalised(of(part, own), lags))
             if not seen[1] > CLOSE:
                 raise OutputError(
                     f"frames {interval:g} ps apart are too far from each other for a spectrum: {title} forgets itself "
                     "between them; output.trajectory_interval_ps = 0.004 suits water"
                 )
-            power.columns[title] = _density_of_states(values, interval, size, mass / history.thermal_energy)
-            memory.columns[f"correlation {title}"] = seen
+            memory.add(f"correlation {title}", seen, errors)
+
+            def states(part: History, own: Kind, of=of, weight=weight / history.thermal_energy) -> np.ndarray:
+                return _density_of_states(of(part, own), interval, size, weight)
+
+            power.add(title, *over_parts(history, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
             at, half = float(wave_numbers[top]), float(wave_numbers[1] / 2)
             found.values.append(Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution"))
     highest, fine = 1 / (2 * interval * PER_CM), wave_numbers[1]
     found.notes.append(f"frames {interval:g} ps apart tell wave numbers up to {highest:.4g}/cm, {fine:.2g}/cm apart")
     return found
+
+
+def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[History, Kind], Any]]]:
+    """The velocities of a species by name: mass or moment of inertia, and a function that makes their series."""
+    name, moments = kind.name, kind.molecule.inertia.tolist()
+    found: dict[str, Any] = {f"V {name}": (kind.molecule.mass, lambda part, own: part.velocities[:, own.index])}
+    if kind.molecule.degrees_of_freedom <= 3:
+        return found
+    if len(_axes(kind)) == 1:  # which of its two other axes is which has no meaning
+        found[f"omega {name}"] = moments[2], lambda part, own: _lab_momenta(part, own) / moments[2]
+    else:
+        for k, moment in enumerate(moments):
+            of = lambda part, own, k=k, moment=moment: part.L[:, own.index, k : k + 1] / moment  # noqa: E731
+            found[f"omega {name} axis {k + 1}"] = moment, of
+    return found
+
+
+def _lab_momenta(history: History, kind: Kind) -> np.ndarray:
+    """Angular momenta (f, k, 3) along the axes of the lab."""
+    assert history.L is not None
+    return np.einsum("fnij,fnj->fni", history.Q[:, kind.index], history.L[:, kind.index])
 
 
 def _normalised(values: np.ndarray, lags: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from rigidmd.forces.pairs.space import Space
 from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.molecules import Molecule, named_sites, of_each
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.forces import ROUNDED, short_cutoff
 from rigidmd.units import KJ_PER_MOL
 
 
@@ -77,8 +78,9 @@ def interactions(
         law = _lennard_jones(scene, species, index, named, chosen)
         sites = _taking_part(species, model, chosen)
         found.terms["lennard_jones"] = pair_forces(law, sites, groups(sites, frozen))
-        if scene.forces.tail_correction:
-            found = found._replace(tail=tail(law))
+        found = found._replace(
+            tail=tail(law) if scene.forces.tail_correction else None, notes=_short(law, species, index, chosen)
+        )
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
         return found
@@ -86,7 +88,12 @@ def interactions(
     charged = Charged(species, index, frozen, chosen, sites, groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(
-        found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error, added.notes
+        found.terms | added.terms,
+        added.constants,
+        added.pressure,
+        found.tail,
+        added.force_error,
+        found.notes + added.notes,
     )
 
 
@@ -120,6 +127,19 @@ def _lennard_jones(
     if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
         raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
     return law
+
+
+def _short(law: LennardJones, species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]) -> tuple[str, ...]:
+    """A note if the cutoff is within the minimum of an energy, on the pair with the most distant one."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        minimum = np.nan_to_num((2 * law.c12 / law.c6) ** (1 / 6), posinf=0.0)
+    i, j = np.unravel_index(minimum.argmax(), minimum.shape)
+    if not law.cutoff < (1 - ROUNDED) * minimum[i, j]:
+        return ()
+    names = [np.array([f"{m.name}.{m.site_names[k]}" for k in c], object) for m, c in zip(species, chosen, strict=True)]
+    of_sites = of_each(names, index)
+    first, second = (of_sites[np.flatnonzero(law.kind == kind)[0]] for kind in (i, j))
+    return (short_cutoff(law.cutoff, f"{first} and {second}", float(minimum[i, j])),)
 
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.analyse.files import drawn, read_findings
-from rigidmd.analyse.findings import with_error
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import whole_file
 from rigidmd.looking import plots
-from rigidmd.measure.summary import mean
+from rigidmd.measure.means import mean, with_error
 from rigidmd.output.folder import SCENE
 from rigidmd.output.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, section, table
 from rigidmd.output.record import Record, read_record
@@ -99,9 +98,10 @@ def _means(record: Record) -> str:
                 cells.append(f"{values[0]:.6g}")
                 continue
             value, error = mean(values)
-            cells.append("" if value is None or error is None else signed(value, error).lstrip("+"))
+            cells.append("" if value is None else with_error(value, error))
         rows.append(cells)
-    told = '<p class="faint">Means over a whole stage ± one standard error, from log.csv; none of minimisations.</p>'
+    told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, no error of too few lines."
+    told = f'<p class="faint">{told}</p>'
     return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + told
 
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from math import isnan, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigidmd.assemble.system import System
 from rigidmd.core.state import TAKEN, State
-from rigidmd.measure.drift import OF_ENERGY, inefficiency, slope
+from rigidmd.measure.drift import OF_ENERGY, slope
+from rigidmd.measure.means import mean, with_error
 from rigidmd.measure.minimum import Minimum, minimum_figures
 from rigidmd.measure.samples import Sample, Samples
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
@@ -22,11 +22,14 @@ OF_MOTION = (
     "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
     "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
 )  # fmt: skip
-#: Drift of the conserved energy, kT/ns per degree of freedom, and difference of the temperatures of translation and
-#: rotation, as a fraction, that are told, where they exceed that by so many standard errors, of so many samples.
-DRIFTS, DIFFER, SURE, LEAST = 0.1, 0.02, 5.0, 20
-#: Largest share of the translational temperature in a common drift of all molecules without a note.
-SHOWS = 1e-4
+#: Notes on the second half of a stage, of LEAST samples and where an effect exceeds SURE standard errors: drift of the
+#: conserved energy (kT/ns per degree of freedom) that has added up to ADDED kT per degree of freedom; error of the
+#: temperatures from the step, and difference of those of translation and rotation, as fractions.
+DRIFTS, ADDED, HEATS, DIFFER, SURE, LEAST = 0.1, 1e-3, 0.01, 0.01, 4.0, 20
+#: Largest fraction of the translational temperature in a common drift of all molecules without a note; where the total
+#: momentum is thermal, its largest kinetic energy in kT, which one run in two million exceeds.
+SHOWS, THERMAL = 1e-4, 16.0
+MOTIONS = ("translation", "rotation")
 #: Growth of the estimated error of Coulomb forces that is told.
 COARSER = 1.5
 
@@ -120,18 +123,24 @@ def _removed(system: System, state: State) -> dict | None:
 
 
 def _drifting(system: System, state: State, last: Sample) -> list[str]:
-    """A note if the conserved part of the total momentum, whose degrees of freedom are not counted, shows in the
-    temperatures."""
+    """A note if the molecules drift together: with a momentum that is conserved, whose degrees of freedom are not
+    counted, and shows in the temperatures; or with one that is not, and exceeds what is thermal."""
     if not system.freedom.translation or not last.temperature_translation > 0:
         return []
     mass = system.model.mass[system.model.species]
     momentum = float(np.linalg.norm((mass @ state.velocity)[system.model.keeps_momentum]))
-    gain = momentum**2 / (float(mass.sum()) * BOLTZMANN * system.freedom.translation)
+    together = f"the molecules drift together with |P| = {momentum:.3g} u Å/ps"
+    energy = momentum**2 / (2 * float(mass.sum()) * BOLTZMANN)  # K
+    if not system.keeps_momentum_in(last.stage):
+        if energy <= THERMAL * last.temperature_translation:
+            return []
+        usual = sqrt(3 * float(mass.sum()) * BOLTZMANN * last.temperature_translation)
+        return [f"{together}, where thermal motion has {usual:.3g}: the thermostat has not stopped it yet; run longer"]
+    gain = 2 * energy / system.freedom.translation
     if gain <= SHOWS * last.temperature_translation:
         return []
     return [
-        f"the molecules drift together with |P| = {momentum:.3g} u Å/ps, which adds {gain:.2g} K to T_trans; "
-        "run.remove_momentum_interval_ps removes the total momentum"
+        f"{together}, which adds {gain:.2g} K to T_trans; run.remove_momentum_interval_ps removes the total momentum"
     ]
 
 
@@ -147,40 +156,61 @@ def outgrown_sums(system: System, state: State) -> list[str]:
     before, after = (f"{error / COULOMB:.2g}" for error in (system.force_error, now))
     return [
         f"the box has changed, and with it the estimated error of Coulomb forces, from {before} to {after} e²/Å²: "
-        "alpha, waves and grid are those of the start. A run with structure.file = 'final.npz' chooses them anew"
+        "alpha, k-vectors and grid are those of the start. A run with structure.file = 'final.npz' chooses them anew"
     ]
 
 
 def _doubts(system: System, samples: Samples, k: int) -> list[str]:
-    """What tells that the averages of stage k are wrong: energy that drifts, temperatures that differ.
+    """What shows that the averages of stage k are wrong, in its second half: energy that drifts, temperatures that the
+    step changes or that differ.
 
     A thermostat hides the energy that a long step adds: it takes it out again, faster from some motions than from
-    others.
+    others, and by the temperatures at the steps, which are not those of the ensemble.
     """
     own = samples.of_stage(k)
-    if not len(own):
+    half = len(own) // 2
+    if len(own) - half < LEAST:
         return []
-    found, stage = [], system.scene.stages[k]
-    line = slope(own["time"], own["drift"])
-    thermal = BOLTZMANN / KJ_PER_MOL * (mean(own["temperature"])[0] or 0.0) * system.freedom_in(k).total
-    limit = DRIFTS * thermal / 1000  # kJ/mol/ps
+    time, drift, whole = (own[name][half:] for name in ("time", "drift", "temperature"))
+    found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
+    line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
+    limit = max(DRIFTS / 1000, ADDED / (time[-1] - time[0])) * thermal  # kJ/mol/ps
     if thermal > 0 and abs(line.value) > limit + SURE * line.error:
+        rate, error = (value * 1000 / thermal for value in (line.value, line.error))
+        smooth = "" if system.scene.forces.truncation == "smooth_switch" else " or truncation = 'smooth_switch'"
+        hides = "; the thermostat hides this and leaves temperatures wrong" if stage.has_thermostat else ""
         found.append(
-            f"stages.{k}: the conserved energy drifts by {line.value * 1000 / thermal:+.2g} kT/ns per degree of "
-            "freedom: timestep_fs is too long, or forces jump at the cut-off; a thermostat hides this and leaves "
-            "temperatures wrong"
+            f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ± {error:.1g} kT/ns per "
+            f"degree of freedom, as from a step that is too long or forces that jump at the cutoff{hides}. Try a "
+            f"shorter timestep_fs than {stage.timestep_fs:g}{smooth}"
         )
-    moving, turning, whole = (
-        own[name][len(own) // 2 :] for name in ("temperature_translation", "temperature_rotation", "temperature")
-    )
-    apart, error = mean(moving - turning)
-    if stage.has_thermostat and len(whole) >= LEAST and apart is not None and error is not None:
-        level = mean(whole)[0] or 0.0
-        if abs(apart) > DIFFER * level + SURE * error:
+    if not stage.has_thermostat:
+        return found
+    moving, turning = pair = [own[f"temperature_{motion}"][half:] for motion in MOTIONS]
+    unbiased, corrected = [own[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS], ""
+    if any(np.isfinite(values).all() for values in unbiased):
+        (moving, turning), corrected = unbiased, " without the error of the step"
+        both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
+        right = sum((values * count for values, count in both if count), np.zeros(len(whole))) / freedom.total
+        heat, doubt = mean(right - whole)
+        if heat is not None and doubt is not None and abs(heat) > max(HEATS * level, SURE * doubt):
+            parts = [f"{name} {v.mean():.4g}" for name, v in zip(("T_trans", "T_rot"), pair, strict=True) if v[0] > 0]
+            shorter = stage.timestep_fs * sqrt(HEATS * level / 2 / abs(heat))
             found.append(
-                f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {turning.mean():.4g} K, which "
-                "sampling does not explain: timestep_fs is too long, or translation and rotation hardly exchange energy"
+                f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules {abs(heat):.2g} K too "
+                f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is "
+                f"{with_error(float(right.mean()), mean(right)[1])} K; at the steps it is {level:.4g} K, "
+                f"{', '.join(parts)}, by which the thermostat goes. Try timestep_fs = {shorter:.1g}, or integrator = "
+                "'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
             )
+    apart, error = mean(moving - turning)
+    if apart is not None and error is not None and abs(apart) > max(DIFFER * level, SURE * error):
+        found.append(
+            f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {turning.mean():.4g} K"
+            f"{corrected}, {abs(apart):.2g} ± {error:.1g} K apart, which sampling does not explain: timestep_fs is too "
+            "long, or translation and rotation exchange energy too slowly for this stage. Try a shorter step, or run "
+            "longer before means are taken"
+        )
     return found
 
 
@@ -272,13 +302,3 @@ def _of_box(own: Samples) -> dict:
 
 def _known(value: float) -> float | None:
     return None if isnan(value) else float(value)
-
-
-def mean(values: ArrayLike) -> tuple[float | None, float | None]:
-    """Mean and its standard error, which accounts for correlation; None if a value is NaN."""
-    array = np.array(values, dtype=float)
-    if np.isnan(array).any():
-        return None, None
-    centred = array - array.mean()
-    error = sqrt(centred @ centred / max(1, len(array) - 1) * inefficiency(centred) / len(array))
-    return float(array.mean()), error

@@ -21,8 +21,8 @@ from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.textbook import OdeEngine
 from rigidmd.errors import SimulationError
 from rigidmd.measure.drift import slope
+from rigidmd.measure.means import mean
 from rigidmd.measure.observables import Observation
-from rigidmd.measure.summary import mean
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import KJ_PER_MOL
 
@@ -430,5 +430,5 @@ def _average(subject: Subject, trial: Trial, length: float) -> None:
         found[f"T_rot - T_trans{kind}"] = found[f"T_rot{kind}"] - found[f"T_trans{kind}"]
     for name, values in found.items():
         average, error = mean(values)
-        if average is not None and error is not None:
-            trial.averages[name] = average, error
+        if average is not None:
+            trial.averages[name] = average, np.nan if error is None else error

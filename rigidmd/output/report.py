@@ -1,7 +1,8 @@
 """Reports of a run: summary.json, the summary as text, and energy.png."""
 
 import json
-from math import floor, log10
+from collections.abc import Container
+from math import floor, isnan, log10
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,9 @@ POSITIONS = {
 }
 
 
+NO_ERROR = "too short for an error"
+
+
 def write_summary(path: Path, summary: dict) -> None:
     """summary.json."""
     with whole_file(path) as temporary:
@@ -34,8 +38,8 @@ def write_summary(path: Path, summary: dict) -> None:
         )
 
 
-def summary_text(summary: dict) -> str:
-    """The summary as text."""
+def summary_text(summary: dict, known: Container[str] = ()) -> str:
+    """The summary as text, without the notes that the reader knows."""
     species = ", ".join(f"{count} {name}" for name, count in summary["species"].items())
     freedom = summary["degrees_of_freedom"]
     lines = [
@@ -57,16 +61,16 @@ def summary_text(summary: dict) -> str:
         )
     if summary["positions"]:
         lines.append(f"  {'positions':<16}{summary['positions']}: {POSITIONS[summary['positions']]}")
-    lines += [f"\n  note: {note}" for note in summary["notes"]]
+    lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
     if summary["interrupted"]:
         lines += ["", "  interrupted: these are the results so far"]
     return "\n".join(lines)
 
 
-def body_summary_text(summary: dict) -> str:
-    """The summary of a single body's run as text."""
+def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
+    """The summary of a single body's run as text, without the notes that the reader knows."""
     lines = [f"\n{body_title(summary)}", *(f"  {name:<16}{value}" for name, value in body_rows(summary))]
-    lines += [f"\n  note: {note}" for note in summary["notes"]]
+    lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
     if summary["interrupted"]:
         lines += ["", "  interrupted: these are the results so far"]
     return "\n".join(lines)
@@ -129,15 +133,16 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     if stage["temperature_K"] is not None:
         parts = _temperatures(stage, "K")
-        rows.append(("temperature", f"{stage['temperature_K']:.2f} ± {stage['temperature_error_K']:.2f} K ({parts})"))
+        value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
+        rows.append(("temperature", f"{value} ({parts})"))
         if parts := _temperatures(stage, "unbiased_K"):
             rows.append(("", f"{parts} without the error of the time step"))
     rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
     if stage["pressure_bar"] is not None:
-        rows.append(("pressure", f"{stage['pressure_bar']:.0f} ± {stage['pressure_error_bar']:.0f} bar"))
+        rows.append(("pressure", _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")))
     if stage.get("density_g_cm3") is not None:
-        rows.append(("density", f"{stage['density_g_cm3']:.4f} ± {stage['density_error_g_cm3']:.4f} g/cm³"))
-        edges = (f"{edge} {stage[f'{edge}_A']:.3f} ± {stage[f'{edge}_error_A']:.3f}" for edge in "abc")
+        rows.append(("density", _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³")))
+        edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
         rows.append(("box", f"{', '.join(edges)} Å"))
     if stage["moves_tried"]:
         share = stage["moves_accepted"] / stage["moves_tried"]
@@ -159,6 +164,11 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     return rows
 
 
+def _with_error(value: float, error: float | None, places: int, unit: str = "") -> str:
+    told = f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+    return f"{told} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
+
+
 def _temperatures(stage: dict, ending: str) -> str:
     values = (
         ("T_trans", stage[f"temperature_translation_{ending}"]),
@@ -167,8 +177,10 @@ def _temperatures(stage: dict, ending: str) -> str:
     return ", ".join(f"{name} {value:.2f}" for name, value in values if value is not None)
 
 
-def signed(value: float, error: float) -> str:
+def signed(value: float, error: float | None) -> str:
     """value ± error, rounded to two digits of the error."""
+    if error is None or isnan(error):
+        return f"{value:+.3g} ({NO_ERROR})"
     digits = max(0, 1 - floor(log10(error))) if error > 0 else 3
     return f"{value:+.{digits}f} ± {error:.{digits}f}"
 

@@ -147,6 +147,7 @@ def _term(made: Any, name: str, system: "System", found: OwnTerms) -> NamedTuple
         law = made.bind(system)
         if law.formula.error:
             found.notes.append(f"{name}: the error of its spline is {law.formula.error:.1e} of its deepest energy")
+        found.notes.extend(f"{name}: {note}" for note in law.notes)
         if law.tail is not None:
             found.tails.append(law.tail)
         cutoff = made.cutoff_A or system.cutoff

@@ -15,7 +15,7 @@ from rigidmd.forces.laws.own import OwnLaw, tail_of
 from rigidmd.forces.pairs.loop import PairForces, pair_forces
 from rigidmd.forces.pairs.sites import groups, sites_of
 from rigidmd.molecules import Molecule, named_sites, of_each
-from rigidmd.scene.forces import usual_start
+from rigidmd.scene.forces import ROUNDED, short_cutoff, usual_start
 from rigidmd.validation import meant
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 Rule = Literal["geometric", "arithmetic", "harmonic"]
 RULES: tuple[str, ...] = get_args(Rule)
 Parameters = Mapping[str, float]
+#: Cutoffs within which a minimum is looked for.
+REACH = 20.0
 #: A table of a single law: distances (Å) and energies (kJ/mol).
 Columns = tuple[Sequence[float], Sequence[float]]
 
@@ -93,6 +95,7 @@ class PairLaw:
         ends, acts = np.zeros((4, count, count)), np.zeros((count, count))
         members, beyond = np.bincount(kind, minlength=count), Tail(0.0, 0.0)
         faults: list[str] = []
+        short: list[tuple[float, str]] = []
         for i, j, of_pair in kinds.pairs(faults):
             try:
                 numbers[:, i, j], radial = formula.numbers(of_pair), formula.radial(of_pair)
@@ -108,6 +111,9 @@ class PairLaw:
                     raise FormulaError("it has no finite value at the cut-off")
             except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
                 faults.append(f"between {kinds.words(i)} and {kinds.words(j)}: {error}")
+            else:
+                if minimum := _minimum_beyond(cutoff, radial):
+                    short.append((minimum, f"{kinds.words(i)} and {kinds.words(j)}"))
             numbers[:, j, i], ends[:, j, i] = numbers[:, i, j], ends[:, i, j]
             acts[i, j] = acts[j, i] = 1.0
         if faults:
@@ -127,8 +133,27 @@ class PairLaw:
         )
         frozen = (system.model.inverse_mass == 0)[index]
         return BoundLaw(
-            pair_forces(law, sites, groups(sites, frozen)), formula, beyond if forces.tail_correction else None
+            pair_forces(law, sites, groups(sites, frozen)),
+            formula,
+            beyond if forces.tail_correction else None,
+            [short_cutoff(cutoff, max(short)[1], max(short)[0])] if short else [],
         )
+
+
+def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
+    """The distance (Å) of the minimum of an energy, if it lies beyond the cutoff, within which sites only repel."""
+    if cutoff == inf:
+        return None
+
+    def attracts(r: float) -> bool:
+        try:
+            return radial(r)[1] < 0
+        except (FormulaError, ArithmeticError, ValueError):
+            return False
+
+    if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - ROUNDED, 32)):
+        return None
+    return next((cutoff * x for x in np.geomspace(1, REACH, 200)[1:] if attracts(cutoff * x)), None)
 
 
 def check_reach(cutoff: float, system: "System") -> None:
@@ -146,6 +171,7 @@ class BoundLaw(NamedTuple):
     term: PairForces
     formula: Formula
     tail: Tail | None  # what the cut-off takes away, where the scene asks for it
+    notes: list[str]
 
 
 class _Kinds:

@@ -38,6 +38,7 @@ class Line(NamedTuple):
 def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Line]:
     """Energies by term, forces and torques on bodies, and the virial of two engines at a state."""
     ours, theirs = observe(system, here, state), observe(system, there, state)
+    virials = [abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values()]
     every = {**ours.components, **theirs.components}
     kinetic = sum(kinetic_energies(system, state))
     size = sum(abs(ours.components[name]) for name in system.terms if name in ours.components) + kinetic
@@ -60,7 +61,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
             )
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
         a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
-        lines.append(_energy("virial", a, b, PLAIN * size + 3 * slack))
+        lines.append(_energy("virial", a, b, PLAIN * max(size, sum(virials)) + 3 * slack))
     return lines
 
 

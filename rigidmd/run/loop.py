@@ -138,6 +138,7 @@ class Simulation(Base):
         self._spot = Spot()
         self._warn = warn
         self._warnings: list[str] = []
+        self._issued: list[str] = []  # those of this process
         self._interrupted = False
         self._failed_before: list[Observer] = []
         self._error: Exception | None = None  # of an observer
@@ -193,6 +194,7 @@ class Simulation(Base):
             if hasattr(signal, "SIGUSR1"):
                 stack.enter_context(handled(self.ask_for_checkpoint, signal.SIGUSR1))
             self._warnings.clear()
+            self._issued.clear()
             self._inputs = input_digests(self.scene)
             self._reset()
             began = clock.perf_counter()
@@ -274,7 +276,7 @@ class Simulation(Base):
 
     @abstractmethod
     def conclusion(self, results: Results) -> str:
-        """The summary as text."""
+        """The summary as text, without the notes that the run has printed."""
 
     @abstractmethod
     def _reset(self) -> None:
@@ -346,6 +348,7 @@ class Simulation(Base):
     def note(self, warning: str) -> None:
         """Issue a warning; the summary repeats it."""
         self._warnings.append(warning)
+        self._issued.append(warning)
         self._warn(warning)
 
     @property

@@ -502,8 +502,8 @@ class MolecularSimulation(Simulation):
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
-        """The summary as text."""
-        return summary_text(results.summary)
+        """The summary as text, without the notes of the introduction and those that were issued as warnings."""
+        return summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
         """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².

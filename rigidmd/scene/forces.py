@@ -30,6 +30,19 @@ ELECTROSTATIC_KEYS = {
 }
 
 
+#: A cutoff within this fraction of the minimum of an energy is that minimum, rounded: its sites are meant to repel.
+ROUNDED = 0.01
+
+
+def short_cutoff(cutoff: float, sites: str, minimum: float) -> str:
+    """A note on a cutoff (Å) within the minimum of the energy of two sites."""
+    unit = "Is it in nm? " if cutoff < 2 < minimum else ""
+    return (
+        f"a cutoff of {cutoff:g} Å is shorter than {minimum:.3g} Å, where the energy of {sites} has its minimum: they "
+        f"only repel each other, and no liquid holds together. {unit}A usual cutoff is {2.2 * minimum:.2g} Å or more"
+    )
+
+
 def usual_start(truncation: str, cutoff: float) -> float:
     """Where a switch begins if a scene does not say, Å."""
     return 0.6 * cutoff if truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)

@@ -10,8 +10,8 @@ from rigidmd.core.schemes import SCHEMES, WITH_BATH
 from rigidmd.core.state import State
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure.bias import AverageRun, Averages, Quantity
+from rigidmd.measure.means import mean
 from rigidmd.measure.stable_step import stable_angle, stiffest
-from rigidmd.measure.summary import mean
 from rigidmd.run.molecules import MolecularSimulation
 from rigidmd.run.observers import Every
 from rigidmd.scene import BodyScene, MolecularScene

@@ -5,8 +5,8 @@ from math import hypot
 import numpy as np
 
 from rigidmd.core.state import State
+from rigidmd.measure.means import mean
 from rigidmd.measure.stability import Finding, Outcome, longest_step
-from rigidmd.measure.summary import mean
 from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.collisions import bent
 from rigidmd.study.stability.runs import (

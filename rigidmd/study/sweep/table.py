@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidmd.analyse.findings import with_error
 from rigidmd.analyse.source import production_of
 from rigidmd.core.files import whole_file
 from rigidmd.errors import RigidMDError
 from rigidmd.measure.columns import BODY_COLUMNS
+from rigidmd.measure.means import error_of_mean, mean, with_error
 from rigidmd.measure.samples import COLUMNS
-from rigidmd.measure.summary import mean
 from rigidmd.output.record import Record, read_record
 from rigidmd.output.sweep_folder import FINISHED, TABLE, Manifest
 from rigidmd.output.sweep_names import short_keys, value_name
@@ -59,7 +58,7 @@ class Row:
         values = np.array([value for value, _ in found])
         if np.ptp(values) == 0:  # where rounding would give it an error
             return float(values[0]), 0.0
-        return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+        return float(values.mean()), float(error_of_mean(values))
 
 
 @dataclass
