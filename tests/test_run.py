@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from conftest import MOLECULES, ROOT, built, small_scene
+from conftest import MOLECULES, ROOT, built, shaken, small_scene
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 
 import rigidmd
@@ -26,14 +27,17 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.forces.pairs.lists import BUILDS
 from rigidmd.measure.observables import observe
+from rigidmd.measure.samples import COLUMNS, Sample, Samples
+from rigidmd.measure.summary import summarise
 from rigidmd.output import log, progress
 from rigidmd.output.log import columns
 from rigidmd.output.report import summary_text
+from rigidmd.peers.checking import compare_at
 from rigidmd.run import Every, Observer, Simulation, body_observers
 from rigidmd.run.body_observers import Figures
 from rigidmd.run.minimise import minimise
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.units import BOLTZMANN
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 
 @pytest.mark.parametrize("path", MOLECULES, ids=lambda path: path.stem)
@@ -347,6 +351,138 @@ def test_a_drift_of_all_molecules_is_noted():
     mass = float(results.system.model.mass[results.system.model.species].sum())
     said = next(note for note in results.summary["notes"] if "drift together" in note)
     assert f"which adds {mass * 0.5**2 / (57 * BOLTZMANN):.2g} K to T_trans; run.remove_momentum_interval_ps" in said
+
+
+@pytest.mark.parametrize("density", [1.4, 1.95, 2.6])
+@pytest.mark.parametrize(("gap", "agrees"), [(1e-7, True), (3e-4, False)])
+def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
+    """Also where the virial is many times the energies, or these cancel: dense, on a lattice, cold."""
+    box, forces = {"density_g_cm3": density}, {"cutoff_A": 4.6, "truncation": "plain"}
+    system = build(small_scene({"argon": 32}, None, box=box, forces=forces, start={"temperature_K": 1.0}))
+    term = system.terms["lennard_jones"]
+    other = term._replace(law=term.law._replace(c12=term.law.c12 * (1 + gap), c6=term.law.c6 * (1 - gap)))
+    here, there = (system.engine_of({"lennard_jones": each}, "double") for each in (term, other))
+    state = shaken(system, 1, 0.05)[2]
+    lines = compare_at(system, state, here, there)
+    assert {line.name for line in lines if not line.agrees} == (
+        set() if agrees else {"lennard jones", "potential energy", "rms force on a molecule", "virial"}
+    )
+
+
+def noted(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made):
+    """Notes of the summary of made-up samples of one stage: values (n,) of columns; others are still or noise."""
+    rng, n = np.random.default_rng(seed), len(next(iter(made.values())))
+    given = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.05 * n, "timestep_fs": 4.0} | stage
+    scene = small_scene(
+        counts or {"spce": 40}, 16.0, stages=[given], forces={"cutoff_A": 7.9, "truncation": truncation}
+    )
+    system = build(scene)
+    state = system.state.copy()
+    mass = float(system.model.mass[system.model.species].sum())
+    state.velocity[:] = [momentum * np.sqrt(BOLTZMANN * 300.0 / mass), 0.0, 0.0]
+    rows = []
+    for k in range(n):
+        plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if name.startswith("temperature")}
+        own = {name: float(values[k]) for name, values in made.items()}
+        row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
+        rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality": 0.0} | own))
+    summary = summarise(system, Samples(rows), state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
+    return [note for note in summary["notes"] if "stages.0" in note or "together" in note]
+
+
+KEPT = {"thermostat": "velocity_rescaling"}
+
+
+@pytest.mark.parametrize("thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None])
+@pytest.mark.parametrize("momentum", [0.0, 0.5, 3.0, 12.0])  # sqrt(M kT) is thermal
+def test_a_thermal_momentum_is_noted_where_it_is_conserved(thermostat, momentum):
+    stage = {"thermostat": thermostat} if thermostat else {"ensemble": "nve", "temperature_K": None}
+    told = noted({"timestep_fs": 2.0} | stage, {"argon": 40}, momentum, temperature=np.full(40, 300.0))
+    if thermostat in ("langevin", "andersen"):
+        assert [("thermal motion has" in note, "adds" in note) for note in told] == [(True, False)] * (momentum > 10)
+    else:
+        assert ["which adds" in note for note in told] == [True] * (momentum > 0)
+
+
+@pytest.mark.parametrize(
+    ("bias", "apart", "spread", "n", "words"),
+    [
+        (0.0, 0.0, 1.0, 400, []),
+        (5.5, 0.0, 1.0, 400, ["the step of 4 fs leaves the molecules 5.5 K too hot"]),
+        (-5.5, 0.0, 1.0, 400, ["5.5 K too cold"]),
+        (1.4, 0.0, 1.0, 400, []),  # 0.5 %
+        (5.5, 0.0, 1.0, 30, []),  # too few samples in its half
+        (0.0, 6.0, 3.0, 400, ["K apart, which sampling does not explain"]),
+        (0.0, 6.0, 100.0, 400, []),  # within the scatter
+        (0.0, 1.5, 0.1, 400, []),  # certain, and small
+        (8.0, 8.0, 1.0, 400, ["too hot", "K apart"]),
+    ],
+)
+def test_temperatures_are_judged_without_the_error_of_the_step(bias, apart, spread, n, words):
+    """At the steps T_trans and T_rot are 7 K apart and the mean is that of the thermostat, as with velocity Verlet."""
+    noise = np.random.default_rng(1).standard_normal((3, n)) * spread
+    told = noted(
+        KEPT, temperature=300 + noise[0], temperature_translation=303.5 + noise[1],
+        temperature_rotation=296.5 + noise[2], temperature_translation_unbiased=300 + bias + apart / 2 + noise[0] + noise[1],
+        temperature_rotation_unbiased=300 + bias - apart / 2 + noise[0] - noise[1],
+    )  # fmt: skip
+    assert len(told) == len(words) and all(word in note for word, note in zip(words, told, strict=True))
+    for note in told:
+        assert "Try" in note and "without the error of the step" in note
+    if bias == 5.5 and words:
+        assert re.search(r"T_trans 303.\d, T_rot 296.\d.* Try timestep_fs = 2, or integrator = 'baoab'", told[0])
+
+
+def test_temperatures_of_other_integrators_are_judged_at_the_steps():
+    unknown = dict.fromkeys(("temperature_translation_unbiased", "temperature_rotation_unbiased"), np.full(200, np.nan))
+    noise = np.random.default_rng(0).standard_normal(200)
+    moved = {"temperature_translation": 310 + noise, "temperature_rotation": 290 - noise}
+    (told,) = noted(KEPT | {"integrator": "two_stage"}, **moved, **unknown)
+    assert "20 ± " in told and "without the error" not in told
+    points = {"temperature_rotation": np.full(200, np.nan), "temperature": 300 + noise}
+    warm = {"temperature_translation_unbiased": 310 + noise, "temperature_rotation_unbiased": np.full(200, np.nan)}
+    (told,) = noted(KEPT, {"argon": 40}, **points | warm)
+    assert "10 K too hot" in told and "nan" not in told
+
+
+@pytest.mark.parametrize(
+    ("rate", "n", "interval", "noise", "told"),
+    [
+        (1.0, 400, 0.05, 0.01, True),  # kT/ns over 20 ps
+        (1.0, 50, 0.004, 1e-6, False),  # over 0.2 ps, as clear as can be: 2e-4 kT in all
+        (0.05, 400, 0.05, 1e-4, False),  # small
+        (1.0, 400, 0.05, 100.0, False),  # noise
+        (1.0, 20, 0.5, 0.0, False),  # few samples
+        (20.0, 100, 0.05, 0.01, True),
+    ],
+)
+@pytest.mark.parametrize("ensemble", ["nve", "nvt"])
+def test_a_drift_is_noted_where_it_is_certain_and_has_added_up(rate, n, interval, noise, told, ensemble):
+    time = interval * np.arange(n)
+    slope = rate / 1000 * BOLTZMANN / KJ_PER_MOL * 300 * (6 * 40 - 3)  # kJ/mol/ps
+    drift = slope * time + noise * np.random.default_rng(2).standard_normal(n)
+    stage = KEPT if ensemble == "nvt" else {"ensemble": "nve", "temperature_K": None}
+    found = noted(stage, time=time, drift=drift)
+    assert len(found) == told
+    if told:
+        assert re.search(r"drifts by \+[\d.]+ ± [\d.e-]+ kT/ns per degree of freedom", found[0])
+        assert "Try a shorter timestep_fs than 4 or truncation = 'smooth_switch'" in found[0]
+        assert ("thermostat hides" in found[0]) == (ensemble == "nvt")
+        assert "smooth" not in noted(stage, truncation="smooth_switch", time=time, drift=drift)[0]
+
+
+def test_a_run_prints_each_note_once(tmp_path, capsys):
+    """Those of the introduction and warnings are not repeated; the summary has all."""
+    scene = {"watch.move": False, "stages.0.timestep_fs": 40.0, "stages.0.duration_ps": 0.4}
+    text = "[box]\nlengths_A = 20\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[start]\ntemperature_K = 90\n"
+    text += "[[stages]]\nensemble = 'nve'\n[forces]\ncutoff_A = 3.0\n[output]\nfigure = false\n"
+    (tmp_path / "s.toml").write_text(text)
+    options = [f"--set={key}={str(value).lower()}" for key, value in scene.items()]
+    assert main(["run", str(tmp_path / "s.toml"), *options, "-o", str(tmp_path / "out")]) == 0
+    said = "".join(capsys.readouterr())
+    notes = json.loads((tmp_path / "out" / "summary.json").read_text())["notes"]
+    assert any("its minimum" in note for note in notes)
+    assert [said.count(note) for note in notes] == [1] * len(notes)
 
 
 def test_warnings_reach_whoever_calls_from_python():

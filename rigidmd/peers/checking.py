@@ -12,6 +12,8 @@ from rigidmd.units import KJ_PER_MOL
 
 #: By which sums of plain pairs may part, relative to their size: engines have constants of their own, as 332.06371.
 PLAIN = 1e-6
+#: Energies of a term that its virial may be, as of 1/r¹²: the energy is the smaller where attraction cancels repulsion.
+STEEPEST = 12
 #: Estimated errors of an Ewald sum by which forces may part; each engine has one.
 ERRORS = 5.0
 #: Share of what its error of forces does over 1/alpha that every site may add to the energy of an Ewald sum. Measured:
@@ -38,10 +40,11 @@ class Line(NamedTuple):
 def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Line]:
     """Energies by term, forces and torques on bodies, and the virial of two engines at a state."""
     ours, theirs = observe(system, here, state), observe(system, there, state)
-    virials = [abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values()]
+    virial = sum(abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values())
     every = {**ours.components, **theirs.components}
     kinetic = sum(kinetic_energies(system, state))
     size = sum(abs(ours.components[name]) for name in system.terms if name in ours.components) + kinetic
+    size = max(size, virial / STEEPEST)
     force_error = system.force_error or 0.0
     reach = _reach(system)
     sites = system.site_count
@@ -61,7 +64,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
             )
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
         a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
-        lines.append(_energy("virial", a, b, PLAIN * max(size, sum(virials)) + 3 * slack))
+        lines.append(_energy("virial", a, b, PLAIN * max(size, virial) + 3 * slack))
     return lines
 
 

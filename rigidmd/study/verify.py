@@ -21,7 +21,7 @@ from rigidmd.units import FEMTOSECOND
 
 #: Steps of the short run, and of what, fs.
 STEPS, STEP = 50, 1.0
-#: Å by which positions may part after it, where forces are sums of pairs.
+#: Å by which positions may differ after it, where forces are sums of pairs; of moves beyond 1 Å a fraction.
 APART = 1e-6
 #: Times the relative error of lengths that sites may part by, relative to their move: measured 10 (216 SPC/E).
 GROWTH = 20
@@ -90,7 +90,7 @@ def _short_run(system: System, state: State, other: OtherEngine) -> list[Line]:
         ends, doubt = [end for end, _ in found], sum(error for _, error in found)
     apart = float(np.abs(ends[0] - ends[1]).max())
     far = [float(np.abs(end - system.site_positions(state)).max()) for end in ends]
-    allowed = APART + doubt + GROWTH * other.lengths_to * far[0] + _of_accuracy(system, span)
+    allowed = APART * max(1.0, far[0]) + doubt + GROWTH * other.lengths_to * far[0] + _of_accuracy(system, span)
     return [Line("largest move of a site", "Å", far[0], far[1], apart, allowed)]
 
 
