@@ -1,5 +1,6 @@
 """Analyses of frames that are made up: rigid molecules rebuilt, and values that are known beforehand."""
 
+import re
 from math import inf
 
 import numpy as np
@@ -313,6 +314,46 @@ def test_hydrogen_bonds_are_those_of_the_geometry():
         assert found.value().value == pytest.approx(expected), off
 
 
+def pairs_of(rng, edge, gaps):
+    """Molecules (f, 60, 3) in pairs far apart from each other, at distances (f, 30)."""
+    centres = 25.0 * np.array([[i, j, k] for i in range(4) for j in range(4) for k in range(2)][:30], float)
+    away = rng.standard_normal((*gaps.shape, 3))
+    second = centres + away * (gaps / np.linalg.norm(away, axis=2))[..., None]
+    return np.concatenate([np.broadcast_to(centres, second.shape), second], axis=1)
+
+
+def test_neighbours_up_to_the_first_minimum_follow_it_and_have_an_honest_error():
+    """Distances of two peaks: exactly so, with the minimum anywhere between two bins; then drawn at random."""
+    system, edge, frames = system_of({"argon": 60}, 100.0), 100.0, 250
+    r, rng, name = np.linspace(2.0, 7.5, 5501), np.random.default_rng(0), "g AR-AR: neighbours up to the first minimum"
+
+    def seen(gaps):
+        at = pairs_of(rng, edge, gaps.reshape(-1, 30))
+        return rdf(history(system, np.arange(float(len(at))), at, np.eye(3) * edge), "AR").value(name)
+
+    def distances(moved, level):
+        """Of fractions of all pairs; and the fraction within the minimum."""
+        g = sum(h * np.exp(-0.5 * ((r - moved - at) / wide) ** 2) for h, at, wide in ((2, 3.2, 0.25), (0.8, 5.2, 0.7)))
+        partners = r**2 * (g + 0.4 * (r > 2.5))
+        partners /= np.trapezoid(partners, r)
+        between = (r > 3.5) & (r < 4.5)
+        minimum = r[between][np.argmin((partners / r**2)[between])]
+        inside = float(np.trapezoid(partners[r <= minimum], r[r <= minimum]))
+        return np.interp(level, np.cumsum(partners) / partners.sum(), r), inside, np.interp(minimum, r, partners)
+
+    even = rng.permutation((np.arange(frames * 30) + 0.5) / (frames * 30))
+    for moved in (0.0, 0.01, 0.02, 0.03, 0.04):
+        gaps, inside, rate = distances(moved, even)
+        assert seen(gaps).value == pytest.approx(inside, abs=0.3 * 0.05 * rate)  # a third of what is in a bin
+    found = []
+    for _ in range(20):
+        gaps, inside, _ = distances(0.02, rng.random(frames * 30))
+        found.append(seen(gaps)[2:4])
+    values, errors = np.array(found, float).T
+    assert 0.5 < np.sqrt(np.mean(((values - inside) / errors) ** 2)) < 1.4
+    assert errors.max() < 0.05
+
+
 # motion
 
 
@@ -328,8 +369,7 @@ def test_diffusion_is_that_of_a_random_walk_and_its_error_honest():
     assert len(found) >= 55  # few are refused for what is chance
     values, errors = np.array(found).T
     assert values.mean() == pytest.approx(D / NM2_PER_S, abs=4 * values.std() / np.sqrt(len(found)))
-    assert 0.6 < values.std() / np.sqrt(np.mean(errors**2)) < 1.6
-    assert np.mean(np.abs(values - D / NM2_PER_S) < 4 * errors) > 0.95
+    assert 0.7 < np.sqrt(np.mean(((values - D / NM2_PER_S) / errors) ** 2)) < 1.3
 
 
 def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
@@ -360,9 +400,11 @@ def test_what_does_not_diffuse_gives_no_value():
     cage = noise_with_memory(rng, 400, (16, 3), 1.0, 5.0, 0.5)
     for path in (flight, cage):
         (told,) = diffusion(history(system, time, path, SLANTED)).values
-        assert told.value is None and "too short for a value" in told.note
+        assert told.value is None and "too short for a value; a run of 798 ps follows it" in told.note
+        assert re.search(r"So far: -?\d.* 1e-9 m²/s$", told.note)
     (told,) = diffusion(history(system, time, brownian(rng, 400, 16, 0.25, 0.5), SLANTED)).values
     assert told.value is None and "correlation times" in told.note
+    assert re.search(r"5 of them are \d+ ps. So far: [\d.]+ ± [\d.]+ 1e-9 m²/s$", told.note)
     with pytest.raises(OutputError, match="needs at least 40 frames; there are 39"):
         diffusion(history(system, time[:39], flight[:39], box))
     assert diffusion(history(system, time[:40], flight[:40], box)).values
@@ -400,12 +442,45 @@ def test_free_rotational_diffusion_decays_as_it_must():
         assert told.error < 0.1 * D
 
 
+def test_errors_of_a_gas_are_those_of_its_molecules():
+    """Free rotors in free flight: all blocks of a run are alike, and tell nothing of the scatter over molecules."""
+    system, n, time = system_of({"nitrogen": 100}, 60.0), 100, 0.01 * np.arange(200)
+    rate, speed = np.sqrt(BOLTZMANN * 300 / system.species[0].inertia[1]), 3.0
+    many = rate * np.hypot(*np.random.default_rng(0).standard_normal((2, 200_000)))
+    pulls, doubts = [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        frame, omega = random_rotations(rng, n), rate * np.hypot(*rng.standard_normal((2, n)))
+        angle = omega * time[:, None]
+        plane = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        along, beside = (
+            np.einsum("fni,nij->fnj", plane @ turn, frame[:, :2]) for turn in ([[1, 0], [0, 1]], [[0, 1], [-1, 0]])
+        )
+        Q = np.stack([along, beside, np.broadcast_to(frame[:, 2], along.shape)], axis=-1)
+        flight = speed * time[:, None, None] * rng.standard_normal((n, 3))
+        gas = history(system, time, flight, np.eye(3) * 60, Q)
+        turned, moved = orientation(gas), msd(gas)
+        late = slice(3, None)
+        lag = turned["Time (ps)"][late]
+        for found, title, truth in (
+            (turned, "C1 nitrogen axis 1", np.cos(many[:, None] * lag).mean(axis=0)),
+            (moved, "MSD nitrogen (A^2)", 3 * (speed * lag) ** 2),
+        ):
+            pulls.append((found[title][late] - truth) / found[f"{title} error"][late])
+        doubts.append(turned["C1 nitrogen axis 1 error"][late][-1] / np.std(np.cos(many * lag[-1])) * np.sqrt(n))
+    for which in (0, 1):
+        assert 0.6 < np.sqrt(np.mean(np.array(pulls[which::2]) ** 2)) < 1.3
+    assert np.mean(doubts) == pytest.approx(1.0, abs=0.25)
+
+
 def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
     system = system_of({"ccl4": 8}, 40.0, 9.0)
     rng, time = np.random.default_rng(0), np.arange(100.0)
     still = np.broadcast_to(random_rotations(rng, 8), (100, 8, 3, 3))
     told = orientation(history(system, time, None, np.eye(3) * 40, still)).value("tau1 of ccl4, axis 1")
-    assert told.value is None and told.note == "C1 is still 1.00 after 10 ps: too short for a value"
+    assert told.value is None and told.note == (
+        "C1 is still 1.00 after 10 ps, too short for a value; it needs more than 8e+03 ps. So far: 10 ps"
+    )
     wild = random_rotations(rng, 800).reshape(100, 8, 3, 3)
     told = orientation(history(system, time, None, np.eye(3) * 40, wild)).value("D_rot of ccl4, axis 1")
     assert told.value is None and "between frames, 1 ps apart: write them more often" in told.note
@@ -414,10 +489,10 @@ def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
 
 
 def test_one_sentence_tells_what_is_too_short():
-    assert (
-        settled("x", "", 1.0, 0.1, 19.9, 1.0).note
-        == "this run is 20 correlation times (1 ps) long: too short for a value"
+    assert settled("x", "D", 1.0, 0.1, 11.0, 1.0).note == (
+        "11 ps are 11 correlation times of 1 ps, too short for a value; 20 of them are 20 ps. So far: 1.00 ± 0.10 D"
     )
+    assert settled("x", "", 1.0, None, 40.0, 1.0).note == "too short for an error. So far: 1"
     assert settled("x", "", 1.0, 0.1, 20.0, 1.0).value == 1.0
     assert settled("x", "", 1.0, 0.1, 5.0, 1.0, least=5.0).value == 1.0
     assert settled("x", "", 1.0, 0.1, 4.9, 1.0, least=5.0).value is None
@@ -545,7 +620,8 @@ def test_dipoles_without_a_dielectric_constant():
                 vacuum, 0.5 * np.arange(4000), None, box, dipoles(np.random.default_rng(4), vacuum, 4000, 2.0, 0.5)[0]
             )
         )
-    assert told.value is None and "too short for a value" in told.note
+    assert told.value is None
+    assert re.search(r"too short for a value; 20 of them are [\d.]+ ps. So far: [\d.]+ ± [\d.]+$", told.note)
 
 
 # flow
@@ -589,7 +665,8 @@ def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
         viscosity(history(system, time, None, tensor=tensor))
     slow = stresses(np.random.default_rng(0), 2000, 0.85, 20.0, 0.02, 25.0**3)
     told = viscosity(history(system, time, None, box, tensor=slow)).value()
-    assert told.value is None and "too short for a value" in told.note
+    assert told.value is None and "too short for a value; a run of 160 ps follows it" in told.note
+    assert re.search(r"So far: [\d.]+ ± [\d.]+ mPa s$", told.note)
 
 
 # production

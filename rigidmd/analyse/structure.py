@@ -122,15 +122,15 @@ def _peaks(
     width = r[1] - r[0]
     edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
 
-    def valley(g: np.ndarray) -> float:
-        """Place of the first minimum: that of a parabola through its surroundings, which noise of single bins moves
-        little."""
-        top = _first_top(g)
+    def valley(g: np.ndarray, top: int) -> float:
+        """Place of the first minimum after a peak: that of a cubic through its surroundings, which noise of single
+        bins moves little."""
         low = top + int(np.argmin(g[top : top + max(3, int(0.9 * top))]))
         reach = max(2, (low - top) // 3)
         near = slice(max(top, low - reach), low + reach + 1)
-        bend, tilt, _ = np.polyfit(r[near] - r[low], g[near], 2) if len(r[near]) > 3 else (0.0, 0.0, 0.0)
-        shift = -0.5 * tilt / bend if bend > 0 else 0.0
+        skew, bend, tilt, _ = np.polyfit(r[near] - r[low], g[near], 3) if len(r[near]) > 4 else np.zeros(4)
+        root = bend**2 - 3 * skew * tilt
+        shift = -tilt / (bend + np.sqrt(root)) if bend > 0 and root >= 0 else 0.0
         return float(r[low] + np.clip(shift, -reach * width, reach * width))
 
     def within(g: np.ndarray, end: float) -> np.ndarray:
@@ -138,21 +138,22 @@ def _peaks(
         share = np.clip((end - edges[:-1]) / width, 0.0, 1.0)  # of each bin
         return (g * filled) @ share
 
-    def seen(g: np.ndarray) -> np.ndarray:
-        top = _first_top(g)
+    def seen(g: np.ndarray, top: int) -> np.ndarray:
         low, middle, high = g[top - 1 : top + 2]
         bend = low - 2 * middle + high
         shift = 0.5 * (low - high) / bend if bend < 0 else 0.0
         place, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
-        return np.array([place, height, within(g, valley(g))])
+        return np.array([place, height, within(g, valley(g, top))])
 
     g = frames.mean(axis=0)
-    if g.max() < 1.05 or not 0 < _first_top(g) < len(g) - 3:
+    top = _first_top(g)
+    if g.max() < 1.05 or not 0 < top < len(g) - 3:
         return []
-    whole = seen(g)
-    usable = [seen(part) for part in parts if part.max() > 1.05 and 0 < _first_top(part) < len(g) - 3]
+    whole = seen(g, top)
+    around = slice(max(1, top - max(3, top // 5)), min(len(g) - 3, top + max(3, top // 5) + 1))
+    usable = [seen(part, around.start + int(part[around].argmax())) for part in parts]
     errors = list(error_of_mean(usable)) if len(usable) > 1 else [None] * 3
-    inside = within(frames, valley(g))
+    inside = within(frames, valley(g, top))
     tau = correlation_time(inside, gap) if len(frames) > 2 else None
     if len(usable) > 1:
         errors[2] = max(errors[2], mean(inside)[1] or 0.0)
