@@ -408,13 +408,13 @@ def noted(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made)
     state = system.state.copy()
     mass = float(system.model.mass[system.model.species].sum())
     state.velocity[:] = [momentum * np.sqrt(BOLTZMANN * 300.0 / mass), 0.0, 0.0]
-    rows = []
+    rows = Samples(["nvt"])
     for k in range(n):
         plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if name.startswith("temperature")}
         own = {name: float(values[k]) for name, values in made.items()}
         row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
         rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality": 0.0} | own))
-    summary = summarise(system, Samples(rows), state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
+    summary = summarise(system, rows, state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
     return [note for note in summary["notes"] if "stages.0" in note or "together" in note]
 
 

@@ -100,7 +100,7 @@ def _means(record: Record) -> str:
             value, error = mean(values)
             cells.append("" if value is None else with_error(value, error))
         rows.append(cells)
-    told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, no error of too few lines."
+    told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, of few lines no error."
     told = f'<p class="faint">{told}</p>'
     return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + told
 
