@@ -6,8 +6,11 @@ from conftest import small_scene
 from scipy.signal import lfilter
 
 from rigidmd import Simulation
+from rigidmd.measure.bias import AverageRun, Averages, Quantity
 from rigidmd.measure.drift import slope
 from rigidmd.measure.means import correlation_time, error_of_mean, inefficiency, mean
+from rigidmd.output.averages_report import brief_rows, faults
+from rigidmd.output.report import signed
 
 SERIES = 400
 
@@ -84,6 +87,19 @@ def test_few_independent_values_have_the_error_of_student():
         error = error_of_mean(values[:, :count].T)
         within = np.mean(np.abs(values[:, :count].mean(axis=1)) < error)
         assert within == pytest.approx(0.683, abs=0.012)
+
+
+def test_values_without_an_error_are_printed_as_such():
+    assert signed(1.5, None) == "+1.5 (too short for an error)" == signed(1.5, float("nan"))
+    assert signed(1.5, 0.25) == "+1.50 ± 0.25"
+    quantities = [Quantity("U", "kJ/mol", 2.5), Quantity("T_trans", "K", 300.0, 300.0)]
+    run = AverageRun("baoab", "langevin", 2.0, 500.0, averages={"T_trans": (300.5, 1.0)}, short=["U", "density"])
+    found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, quantities, [run])
+    (told,) = faults(found)
+    assert told == (
+        "baoab + langevin at 2 fs: U: 5 ps are too short for an error; sample longer (--sample-ps)"
+    )  # of what is reported
+    assert brief_rows(found)[0][-2:] == ["-", "+0.5 ± 1.0"]
 
 
 def test_inefficiency_of_correlated_samples():

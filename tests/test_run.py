@@ -353,6 +353,34 @@ def test_a_drift_of_all_molecules_is_noted():
     assert f"which adds {mass * 0.5**2 / (57 * BOLTZMANN):.2g} K to T_trans; run.remove_momentum_interval_ps" in said
 
 
+MIE = {"energy": "4*e*((s/r)**14 - (s/r)**7)", "parameters": {"AR": {"e": 1.0, "s": 3.4}}}
+SCREENED = {"energy": "a*exp(-r/2)/r", "parameters": {"AR": {"a": 5.0}}}
+
+
+@pytest.mark.parametrize(
+    ("counts", "cutoff", "entry", "words"),
+    [
+        ({"spce": 20}, 0.9, None, "0.9 Å is shorter than 3.55 Å, where the energy of spce.OW and spce.OW .* in nm"),
+        ({"spce": 20}, 3.0, None, "3 Å is shorter than 3.55 Å"),
+        ({"spce": 20}, 3.54, None, ""),  # WCA, rounded
+        ({"spce": 20}, 7.0, None, ""),
+        ({"argon": 10, "ccl4": 5}, 3.7, None, "shorter than 3.82 Å, where the energy of argon.AR"),
+        ({"argon": 20}, 0.34, MIE, "mie: a cutoff of 0.34 Å is shorter than 3.7. Å, .* argon.AR and argon.AR .* in nm"),
+        ({"argon": 20}, 3.0, MIE, "mie: .* 3 Å is shorter than 3.7"),
+        ({"argon": 20}, 3.9, MIE, ""),
+        ({"argon": 20}, 3.0, SCREENED, ""),  # repels everywhere
+    ],
+)
+def test_a_cutoff_within_the_minimum_of_an_energy_is_noted(counts, cutoff, entry, words):
+    forces = {"cutoff_A": cutoff}
+    if entry:
+        forces = {"cutoff_A": 8.0, "lennard_jones": False, "custom": [entry | {"name": "mie", "cutoff_A": cutoff}]}
+    scene = small_scene(counts, 20.0, forces=forces)
+    found = [note for note in build(scene).notes if "has its minimum" in note]
+    assert len(found) == bool(words) and all(re.search(words, note) for note in found)
+    assert all(note in describe(scene) for note in found)
+
+
 @pytest.mark.parametrize("density", [1.4, 1.95, 2.6])
 @pytest.mark.parametrize(("gap", "agrees"), [(1e-7, True), (3e-4, False)])
 def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
@@ -380,13 +408,13 @@ def noted(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made)
     state = system.state.copy()
     mass = float(system.model.mass[system.model.species].sum())
     state.velocity[:] = [momentum * np.sqrt(BOLTZMANN * 300.0 / mass), 0.0, 0.0]
-    rows = []
+    rows = Samples(["nvt"])
     for k in range(n):
         plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if name.startswith("temperature")}
         own = {name: float(values[k]) for name, values in made.items()}
         row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
         rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality": 0.0} | own))
-    summary = summarise(system, Samples(rows), state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
+    summary = summarise(system, rows, state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
     return [note for note in summary["notes"] if "stages.0" in note or "together" in note]
 
 

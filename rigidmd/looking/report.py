@@ -99,7 +99,7 @@ def _means(record: Record) -> str:
             value, error = mean(values)
             cells.append("" if value is None else with_error(value, error))
         rows.append(cells)
-    told = "Means over a whole stage ± one standard error, from the lines of log.csv; of too few, without one."
+    told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, of few lines no error."
     told = f'<p class="faint">{told}</p>'
     return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + told
 

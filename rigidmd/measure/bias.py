@@ -110,6 +110,7 @@ class AverageRun:
     forces_per_ps: float
     seconds_per_ns: float | None = None
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
+    short: list[str] = field(default_factory=list)  # names of those that are sampled too short for an error
     fault: str = ""  # why there are none
 
     @property

@@ -168,45 +168,40 @@ def _doubts(system: System, samples: Samples, k: int) -> list[str]:
     others, and by the temperatures at the steps, which are not those of the ensemble.
     """
     own = samples.of_stage(k)
-    late = slice(len(own) // 2, None)
-    if len(own) - len(own) // 2 < LEAST:
+    half = len(own) // 2
+    if len(own) - half < LEAST:
         return []
-    found, stage, freedom = [], system.scene.stages[k], system.freedom_in(k)
-    time, temperature = own["time"][late], own["temperature"][late]
-    level = float(temperature.mean())
-    line = slope(time, own["drift"][late])
-    thermal = BOLTZMANN / KJ_PER_MOL * level * freedom.total
+    time, drift, whole = (own[name][half:] for name in ("time", "drift", "temperature"))
+    found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
+    line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
     limit = max(DRIFTS / 1000, ADDED / (time[-1] - time[0])) * thermal  # kJ/mol/ps
     if thermal > 0 and abs(line.value) > limit + SURE * line.error:
-        drift, error = (value * 1000 / thermal for value in (line.value, line.error))
+        rate, error = (value * 1000 / thermal for value in (line.value, line.error))
         smooth = "" if system.scene.forces.truncation == "smooth_switch" else " or truncation = 'smooth_switch'"
         hides = "; the thermostat hides this and leaves temperatures wrong" if stage.has_thermostat else ""
         found.append(
-            f"stages.{k}: in its second half the conserved energy drifts by {drift:+.2g} ± {error:.1g} kT/ns per "
+            f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ± {error:.1g} kT/ns per "
             f"degree of freedom, as from a step that is too long or forces that jump at the cutoff{hides}. Try a "
             f"shorter timestep_fs than {stage.timestep_fs:g}{smooth}"
         )
     if not stage.has_thermostat:
         return found
-    moving, turning = (own[f"temperature_{motion}"][late] for motion in MOTIONS)
-    both = ((name, values.mean()) for name, values in (("T_trans", moving), ("T_rot", turning)))
-    on = ", ".join([f"at the steps it is {level:.4g} K", *(f"{name} {value:.4g}" for name, value in both if value > 0)])
-    unbiased = [own[f"temperature_{motion}_unbiased"][late] for motion in MOTIONS]
-    corrected = ""
+    moving, turning = pair = [own[f"temperature_{motion}"][half:] for motion in MOTIONS]
+    unbiased, corrected = [own[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS], ""
     if any(np.isfinite(values).all() for values in unbiased):
-        moving, turning = unbiased
-        corrected = " without the error of the step"
-        counts = freedom.translation, freedom.rotation
-        whole = sum((v * n for v, n in zip(unbiased, counts, strict=True) if n), np.zeros(len(time))) / freedom.total
-        value, error = float(whole.mean()), mean(whole)[1]
-        heat, doubt = mean(whole - temperature)
+        (moving, turning), corrected = unbiased, " without the error of the step"
+        both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
+        right = sum((values * count for values, count in both if count), np.zeros(len(whole))) / freedom.total
+        heat, doubt = mean(right - whole)
         if heat is not None and doubt is not None and abs(heat) > max(HEATS * level, SURE * doubt):
+            parts = [f"{name} {v.mean():.4g}" for name, v in zip(("T_trans", "T_rot"), pair, strict=True) if v[0] > 0]
             shorter = stage.timestep_fs * sqrt(HEATS * level / 2 / abs(heat))
             found.append(
                 f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules {abs(heat):.2g} K too "
-                f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is {with_error(value, error)} K; "
-                f"{on}, by which the thermostat goes. Try timestep_fs = {shorter:.1g}, or integrator = 'baoab' with "
-                "thermostat = 'langevin', whose positions have hardly such an error"
+                f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is "
+                f"{with_error(float(right.mean()), mean(right)[1])} K; at the steps it is {level:.4g} K, "
+                f"{', '.join(parts)}, by which the thermostat goes. Try timestep_fs = {shorter:.1g}, or integrator = "
+                "'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
             )
     apart, error = mean(moving - turning)
     if apart is not None and error is not None and abs(apart) > max(DIFFER * level, SURE * error):

@@ -117,7 +117,15 @@ def _off_words(found: Averages) -> list[str]:
 
 def faults(found: Averages) -> list[str]:
     """Sentences: what failed."""
-    return [f"{run.method} at {run.timestep:g} fs: {run.fault}" for run in found.runs if run.fault]
+    asked = {quantity.name for quantity in found.quantities}
+    failed = [(run, run.fault) for run in found.runs if run.fault]
+    short = [(run, [name for name in run.short if name in asked]) for run in found.runs]
+    failed += [
+        (run, f"{', '.join(names)}: {found.sampled:g} ps are too short for an error; sample longer (--sample-ps)")
+        for run, names in short
+        if names
+    ]
+    return [f"{run.method} at {run.timestep:g} fs: {words}" for run, words in failed]
 
 
 def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:

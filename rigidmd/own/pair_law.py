@@ -153,7 +153,7 @@ def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | 
 
     if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - ROUNDED, 32)):
         return None
-    return next((cutoff * x for x in np.geomspace(1, REACH, 200)[1:] if attracts(cutoff * x)), None)
+    return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
 
 
 def check_reach(cutoff: float, system: "System") -> None:

@@ -209,6 +209,8 @@ def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, 
         average, error = mean(values[late])
         if average is not None and error is not None:
             run.averages[name] = average, error
+        elif average is not None:
+            run.short.append(name)
 
 
 def _rounded(step: float) -> float:
