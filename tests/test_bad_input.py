@@ -1,5 +1,7 @@
 """Bad input: each gets one message that says what, where and what to do; no traceback, nothing half-written."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from conftest import MOLECULES, ROOT, small_scene
@@ -227,9 +229,84 @@ def test_all_faults_at_once(capsys, tmp_path):
         assert key in message
 
 
-def test_a_missing_scene(capsys):
-    assert main(["run", "nowhere.toml"]) == 2
-    assert "nowhere.toml: there is no such file" in capsys.readouterr().err
+@pytest.mark.parametrize("command", ["run", "check", "energy", "precision", "sweep"])
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("nowhere.toml", "nowhere.toml: there is no such file; `rigidmd examples` lists scenes"),
+        ("water", "water: there is no such file; `rigidmd new water` copies a shipped scene"),
+        ("systems/water.toml", "there is no such file; `rigidmd new water` copies a shipped scene"),
+        ("heavy_top.toml", "there is no such file; `rigidmd new heavy_top_1` copies a shipped scene"),
+        ("mien.toml", "there is no such file; did you mean mine.toml?"),
+    ],
+)
+def test_a_missing_scene(command, path, expected, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text(GOOD)
+    assert main([command, path, *(["--set", "seed=1,2"] if command == "sweep" else [])]) == 2
+    assert expected in capsys.readouterr().err
+    with pytest.raises(SceneError, match="there is no such file"):
+        Scene.read(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["analyze", "runs/x"], "there is no command 'analyze'; did you mean analyse?"),
+        (["precison", "x.toml"], "there is no command 'precison'; did you mean precision?"),
+        (["foo"], "there is no command 'foo'; `rigidmd --help` lists them"),
+        (["run", "x.toml", "--forse"], "rigidmd run: error: there is no argument '--forse'; did you mean --force?"),
+        (["run", "x.toml", "--wall-time=1:00"], "'--wall-time=1:00'; did you mean --walltime?"),
+        (["film", "x", "--fps", "3"], "rigidmd film: error: there is no argument '--fps'"),
+        (["check", "x.toml", "y.toml"], "rigidmd check: error: there is no argument 'y.toml'"),
+    ],
+)
+def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [("restarts", "there are top, water"), ("rdf", "the word is in water ("), ("maesuring", "did you mean measuring?")],
+)
+def test_help_finds_words_in_chapters(word, expected, capsys):
+    assert main(["help", word]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("until", ["1e999ps", "nanps", "-1ps"])
+def test_times_of_the_command_line_are_finite(until, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "x.toml", f"--until={until}"])
+    assert "is not a time with a unit" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["run", "x.toml", f"--walltime={'9' * 400}:00"])
+    assert "is not H:MM:SS" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--span", "nan"], "must be finite and greater than 0"),
+        (["--timesteps", "1,inf"], "must be finite and greater than 0"),
+        (["--averages", "nan"], "must be finite and greater than 0"),
+    ],
+)
+def test_times_of_precision_are_finite(options, expected, capsys, tmp_path):
+    (tmp_path / "good.toml").write_text(GOOD)
+    assert main(["precision", str(tmp_path / "good.toml"), *options, "-o", str(tmp_path / "out")]) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_a_trusted_file_that_nothing_names_is_refused(capsys, tmp_path):
+    (tmp_path / "own.py").write_text("")
+    own = str(tmp_path / "own.py")
+    assert "own.py is not a file that [[forces.custom]]" in refused(capsys, tmp_path, GOOD, "--trust", own)
+    assert main(["sweep", str(tmp_path / "bad.toml"), "--set", "seed=1,2", "--trust", own]) == 2
+    assert "names no Python file by module in [[forces.custom]]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -237,6 +314,9 @@ def test_a_missing_scene(capsys):
     [
         ("stages.1.timestep_fs=4", "stages has entries 0 to 0"),
         ("stages.x.timestep_fs=4", "stages has entries 0 to 0"),
+        ("molecules.spce.cont=4", "--set molecules.0.cont: unknown key; did you mean count?"),
+        ("molecules.spc.count=4", "molecules has entries 0 to 0 ('spce'), not 'spc'"),
+        ("box.density_g_cm3=1", "give lengths_A or density_g_cm3, not both; --set box.lengths_A= removes it"),
         ("stages.0.timestep_fs.y=4", "stages.0.timestep_fs is not a table"),
         ("stages.0.timestep_fs=fast", "'fast', must be a number"),
         ("timestep_fs", "is not KEY=VALUE"),
@@ -254,6 +334,23 @@ def test_a_missing_scene(capsys):
 )
 def test_a_bad_override(override, expected, capsys, tmp_path):
     assert expected in refused(capsys, tmp_path, GOOD, "--set", override)
+
+
+def test_entries_of_lists_are_overridden_by_name(capsys, tmp_path):
+    stages = '[[stages]]\nname = "production"\nduration_ps = 1\n[[stages]]\nensemble = "nvt"\ntemperature_K = 300\nduration_ps = 1\n'
+    path = tmp_path / "two.toml"
+    path.write_text(f"{GOOD}{stages}")
+    found = Scene.read(
+        path, {"stages.production.timestep_fs": 2, "stages.nvt.temperature_K": 310, "molecules.spce.count": 3}
+    )
+    assert [stage.timestep_fs for stage in found.stages][1] == 2
+    assert (found.stages[2].temperature_K, found.molecules[0].count) == (310, 3)
+    assert len(Scene.read(path, {"stages.production": None}).stages) == 2
+    assert main(["check", str(path), "--set", "stages.production.timestep_fs=-2"]) == 2
+    assert "--set stages.1.timestep_fs: is -2, must be greater than 0" in capsys.readouterr().err
+    path.write_text(path.read_text().replace('ensemble = "nvt"', 'name = "production"'))
+    assert main(["check", str(path), "--set", "stages.production.timestep_fs=2"]) == 2  # which of the two?
+    assert "stages has entries 0 to 2 ('', 'production', 'production')" in capsys.readouterr().err
 
 
 def test_overrides_are_read_as_toml():

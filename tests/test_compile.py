@@ -4,6 +4,7 @@ sources keep."""
 import ast
 import ctypes
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -299,6 +300,47 @@ def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
     asked = "from rigidmd.compile.cache import cache_folder; cache_folder()"
     subprocess.run([sys.executable, "-c", asked], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True)
     assert [folder.exists() for folder in old] == [True, False, True]
+
+
+MACHINE = "from rigidmd.compile import cache, machine; print(machine.SIMD_BITS, cache.source_digest())"
+
+
+def machine_with(**settings):
+    """Bits of vectors, and the name of the cache, where the environment has these settings."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")} | settings
+    done = subprocess.run([sys.executable, "-c", MACHINE], env=environment, cwd=ROOT, capture_output=True, text=True)
+    return done.stdout.split()
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the processors are those of x86")
+@pytest.mark.parametrize(
+    ("name", "bits"), [("generic", "128"), ("nehalem", "128"), ("haswell", "256"), ("skylake-avx512", "512")]
+)
+def test_vectors_are_as_wide_as_those_of_the_processor_that_is_named(name, bits):
+    assert machine_with(NUMBA_CPU_NAME=name, NUMBA_CPU_FEATURES="")[0] == bits
+
+
+def test_settings_that_change_code_have_a_cache_of_their_own():
+    usual = machine_with()
+    assert machine_with(NUMBA_OPT="3", NUMBA_NUM_THREADS="1", NUMBA_DEBUG_CACHE="0") == usual
+    changed = [machine_with(**{name: value}) for name, value in
+               (("NUMBA_OPT", "0"), ("NUMBA_BOUNDSCHECK", "1"), ("NUMBA_SLP_VECTORIZE", "1"))]  # fmt: skip
+    assert len({digest for _, digest in [usual, *changed]}) == 4
+
+
+def test_a_folder_in_which_nothing_is_kept_is_named(tmp_path, monkeypatch):
+    from rigidmd.compile import cache
+
+    (tmp_path / "file").touch()
+    for named, expected in (("new", "kept on disk: the next run starts at once"), ("file/x", "RIGIDMD_CACHE names")):
+        monkeypatch.setenv("RIGIDMD_CACHE", str(tmp_path / named))
+        cache.cache_folder.cache_clear()
+        cache.shared_folder.cache_clear()
+        assert expected in cache.kept_in_words()
+    assert f"not kept, as {tmp_path / 'file/x'} cannot be written" in cache.kept_in_words()
+    monkeypatch.undo()
+    cache.cache_folder.cache_clear()
+    cache.shared_folder.cache_clear()
 
 
 def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):

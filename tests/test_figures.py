@@ -1,6 +1,8 @@
 """Figures: long curves have no gaps, many curves are told apart."""
 
 import io
+import re
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,7 +11,10 @@ from conftest import ROOT, small_scene
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.text import Text
 
+from rigidmd.analyse.files import drawn
+from rigidmd.analyse.findings import Curve
 from rigidmd.assemble.system import build
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.looking.columns import columns_figure, record_of
@@ -17,8 +22,11 @@ from rigidmd.looking.plots import draw_panel, panels
 from rigidmd.measure.samples import NUMBERS, Sample, Samples
 from rigidmd.measure.subjects import COMPARATORS, body_subject
 from rigidmd.measure.trials import Precision, Trial
+from rigidmd.molecules import load_model
 from rigidmd.output import precision_report
 from rigidmd.output.figure import AT_ONCE, save_figure, shown_range
+from rigidmd.output.molecule_figure import draw_molecule
+from rigidmd.output.picture import Picture
 from rigidmd.output.report import energy_figure
 from rigidmd.scene import Scene
 
@@ -51,6 +59,52 @@ def test_no_figure_is_written_past_this():
     assert written == ["figure.py"]
 
 
+def test_every_figure_shows_names_as_they_are_written():
+    made = [path.name for path in (ROOT / "rigidmd").rglob("*.py") if re.search(r"\bFigure\b", path.read_text())]
+    assert made == ["picture.py"]  # see below for its texts
+
+
+#: Names that users give: Matplotlib reads formulas between dollar signs, and fails at most of these.
+NAMES = ["$`$", "$a$ $", r"\frac{$x$", "$$", "$(x) ${v}", r"\$a$", "a_b^c", "%(x)s {} <b>"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_texts_of_a_figure_are_no_formulas(name):
+    figure = Picture(figsize=(6, 4), layout="constrained")
+    axis, other = figure.subplots(1, 2)
+    figure.suptitle(name)
+    figure.text(0.1, 0.1, name)
+    axis.set(title=name, xlabel=name, ylabel=name, yscale="log")
+    axis.plot([1, 1000], [1e-5, 1], label=name)
+    axis.legend(title=name)
+    axis.annotate(name, (1, 1), (5, 1e-3))
+    other.set_title(name, loc="left")
+    other.inset_axes((0, 0, 0.5, 0.5)).set_title(name)
+    for ending in ("png", "svg"):
+        save_figure(figure, io.BytesIO(), format=ending)
+    shown = [text for text in figure.findobj(Text) if text.get_text() == name]
+    assert len(shown) == 10
+    assert not any(text.get_parse_math() for text in shown)
+    assert any(label.get_parse_math() and "10^" in label.get_text() for label in axis.get_yticklabels())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_figures_of_a_run_and_of_a_molecule_take_any_name(name, staged, tmp_path):
+    system, samples, summary = staged
+    stages = tuple(stage.model_copy(update={"name": name}) for stage in system.scene.stages)
+    named = replace(system, scene=system.scene.model_copy(update={"stages": stages}))
+    rows = samples.table()
+    figures = [energy_figure(named, Samples([name] * len(stages), table=rows), summary)]
+    record = record_of(named, samples, summary)
+    figures.append(columns_figure(record, ["potential"], samples.described))
+    figures.append(drawn(Curve("curve", ("r (Å)", np.arange(3.0)), name, {name: np.arange(3.0), "other": np.ones(3)})))
+    for figure in figures:
+        save_figure(figure, io.BytesIO(), format="png")
+    molecule = load_model("spce")
+    own = replace(molecule, name=name, title=name, source=name, site_names=(name,) * 3)
+    draw_molecule(tmp_path / "own.png", own, force=False)
+
+
 STAGES = ["minimise", "equilibration", "a short one", "another", "quench", "production at 300 K"]
 STEPS = [0, 5, 3, 4, 0, 500]
 
@@ -66,7 +120,7 @@ def samples_of(rng, start=-1000.0):
             given = {"step": step, "time": 0.1 * step, "stage": k, "stage_name": name, "potential": value}
             noise = {"kinetic": rng.normal(), "temperature_translation": 300 + rng.normal(), "drift": rng.normal()}
             rows.append(Sample(**blank | given | noise | {"temperature_rotation": float("nan")}))
-    return Samples.of_table(np.array([[float(getattr(row, name)) for name in NUMBERS] for row in rows]), STAGES)
+    return Samples(STAGES, table=np.array([[float(getattr(row, name)) for name in NUMBERS] for row in rows]))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import types
 from itertools import pairwise
 
 import MDAnalysis
@@ -18,6 +19,7 @@ from PIL import Image, ImageSequence
 from rigidmd import Scene, Simulation, cli
 from rigidmd.assemble.body import build_body
 from rigidmd.looking import molecule_film
+from rigidmd.looking.film import write_film
 from rigidmd.looking.mesh import UNITS, mesh_of
 from rigidmd.mechanics.solids import SOLIDS, solid
 from rigidmd.output.connections import connections
@@ -244,9 +246,19 @@ def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
     from rigidmd.looking import film
 
     monkeypatch.setattr(film.shutil, "which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
     assert film.default_name() == "film.gif"
     assert cli.main(["film", str(top), "-o", str(tmp_path / "film.mp4")]) == 2
-    assert "needs ffmpeg" in capsys.readouterr().err
+    assert "needs ffmpeg: install the program, or `pip install imageio-ffmpeg`" in capsys.readouterr().err
+    program = tmp_path / "its-ffmpeg"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\nsys.stdin.buffer.read()\nopen(sys.argv[-1], 'wb').write(b'film')\n"
+    )
+    program.chmod(0o700)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", types.SimpleNamespace(get_ffmpeg_exe=lambda: str(program)))
+    assert film.default_name() == "film.mp4"
+    assert cli.main(["film", str(top), "-o", str(tmp_path / "its.mp4"), "--seconds", "0.2", "--height", "100"]) == 0
+    assert (tmp_path / "its.mp4").read_bytes() == b"film"
     assert cli.main(["film", str(top), "-o", str(tmp_path / "film.avi")]) == 2
     assert "ends in .mp4 or .gif" in capsys.readouterr().err
 
@@ -391,6 +403,84 @@ def test_the_drawn_surface_is_that_of_the_solid(shape):
     assert 0 < sum(mesh.painted) < len(mesh.faces)
     outline = solid(shape, 1.0, given).outline
     assert np.allclose(np.ptp(outline, axis=0), np.ptp(mesh.vertices, axis=0), rtol=0.01)
+
+
+def inertia_of_mesh(mesh, mass):
+    """Centre (3,) and inertia tensor (3, 3) about it, of a homogeneous body inside a closed surface."""
+    products, first, whole = np.zeros((3, 3)), np.zeros(3), 0.0
+    for face in mesh.faces:
+        p = mesh.vertices[face]
+        for k in range(1, len(p) - 1):
+            corners = np.stack([p[0], p[k], p[k + 1]])
+            part, total = np.linalg.det(corners) / 6, corners.sum(axis=0)
+            whole, first = whole + part, first + part * total / 4
+            products += part / 20 * (corners.T @ corners + np.outer(total, total))
+    centre = first / whole
+    products = mass / whole * products - mass * np.outer(centre, centre)
+    return centre, np.trace(products) * np.eye(3) - products
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("across", "along"), [(1.0, 1.9), (1.0, 0.3), (1.0, 1.0)])
+@pytest.mark.parametrize("offset", [0.0, -3.0, 3.0])
+def test_a_symmetric_body_is_drawn_as_the_solid_of_revolution_of_its_inertia(axis, across, along, offset):
+    moments, centre = np.full(3, across), np.zeros(3)
+    moments[axis], centre[axis] = along, offset
+    body = {"mass_kg": 2.0, "inertia_kg_m2": moments.tolist(), "pinned": True, "centre_of_mass_m": centre.tolist()}
+    mesh = mesh_of(build_body(Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})))
+    assert mesh.stem == (offset != 0)
+    if not mesh.stem:
+        place, tensor = inertia_of_mesh(mesh, 2.0)
+        assert np.allclose(place, centre, atol=1e-9)
+        assert np.allclose(tensor, np.diag(moments), rtol=0.05, atol=0.02)  # of polygons of 24 sides
+        return
+    assert np.linalg.norm(mesh.vertices, axis=1).min() < 1e-12  # it reaches to the pivot, with a tip
+    flat = np.delete(mesh.vertices, axis, axis=1)
+    assert np.allclose(np.ptp(flat, axis=0), 2 * np.linalg.norm(flat, axis=1).max(), rtol=0.02)  # round about the axis
+    assert np.sign(mesh.vertices[:, axis]).sum() * np.sign(offset) > 0  # on the side of the centre of mass
+
+
+@pytest.mark.parametrize(
+    ("drawn_as", "about"),
+    [
+        ("ellipsoid", "the ellipsoid of the same mass and inertia"),
+        ("cuboid", "the cuboid of the same mass and inertia"),
+        ("top", "the cylinder of the same mass and inertia, on a stem"),
+        ({"shape": "cone", "radius_m": 0.04, "height_m": 0.06}, "a cone"),
+        ({"shape": "ring", "radius_m": 0.04}, "a ring"),
+    ],
+)
+def test_a_scene_chooses_what_a_body_is_drawn_as(drawn_as, about):
+    system = build_body(Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"output.drawn_as": drawn_as}))
+    mesh = mesh_of(system)
+    assert mesh.about == about
+    if about == "a cone":  # on its tip
+        assert np.linalg.norm(mesh.vertices, axis=1).min() < 1e-12
+        assert np.isclose(mesh.vertices[:, 2].max(), 0.06)
+    elif drawn_as in ("ellipsoid", "cuboid"):
+        place, tensor = inertia_of_mesh(mesh, 0.15)
+        assert np.allclose(place, [0, 0, 0.04])
+        assert np.allclose(np.diag(tensor), [0.66e-4, 0.66e-4, 1.2e-4], rtol=0.06)
+
+
+@pytest.mark.parametrize(
+    ("sets", "expected"),
+    [
+        (["output.drawn_as=tpo"], "did you mean top?"),
+        (["output.drawn_as.shape=cone"], "a cone has height_m and radius_m, not none"),
+        (["output.drawn_as=top", "body.inertia_kg_m2=[3e-4,3.2e-4,1e-4]"], "a top has two equal moments of inertia"),
+    ],
+)
+def test_a_shape_that_a_body_cannot_be_drawn_as(sets, expected, capsys):
+    arguments = [word for text in sets for word in ("--set", text)]
+    assert cli.main(["check", str(ROOT / "systems" / "heavy_top_3.toml"), *arguments]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("seconds", "strobes"), [(0.2, True), (2.0, False)])
+def test_a_film_in_which_a_body_turns_too_far_between_frames_says_so(seconds, strobes, top, tmp_path):
+    _, told = write_film(top, tmp_path / "top.gif", seconds, height=100)
+    assert any("times between two frames" in sentence for sentence in told) == strobes
 
 
 def test_a_body_without_a_solid_is_drawn_as_the_cuboid_of_its_inertia():

@@ -226,6 +226,37 @@ def test_a_setting_of_the_machine_that_cannot_be(name, value, expected, tmp_path
     assert expected in found.stderr
 
 
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"NUMBA_DISABLE_JIT": "1"}, "NUMBA_DISABLE_JIT is set: Numba would compile nothing"),
+        ({"NUMBA_OPT": "abc"}, "NUMBA_OPT is 'abc', which Numba cannot read: unset it"),
+        ({"NUMBA_DEBUG_CACHE": "x"}, "NUMBA_DEBUG_CACHE is 'x', which Numba cannot read: unset it"),
+        ({"NUMBA_CPU_NAME": "generic", "RIGIDMD_SIMD_BITS": "256"}, "vectors have at most 128 bits on generic"),
+    ],
+)
+def test_a_setting_with_which_nothing_can_be_compiled(settings, expected, tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD)
+    command = [sys.executable, "-m", "rigidmd", "check", "scene.toml"]
+    found = subprocess.run(command, cwd=tmp_path, env=os.environ | settings, capture_output=True, text=True)
+    assert (found.returncode, found.stdout, found.stderr.count("\n")) == (2, "", 1)
+    assert expected in found.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the limit is one of Linux")
+@pytest.mark.parametrize("kilobytes", [200_000, 420_000])
+def test_a_limit_of_memory_that_is_too_low_for_libraries(kilobytes, tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD)
+    command = f"ulimit -v {kilobytes}; exec {sys.executable} -m rigidmd check scene.toml"
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    found = subprocess.run(
+        ["sh", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert (found.returncode, found.stdout, found.stderr.count("\n")) == (2, "", 1)
+    assert "not enough memory" in found.stderr
+    assert "ulimit -v" in found.stderr
+
+
 def test_a_terminal_without_the_letters_ends_no_command(monkeypatch, tmp_path):
     (tmp_path / "scene.toml").write_text(GOOD)
     written = io.BytesIO()

@@ -41,6 +41,9 @@ class Sites(NamedTuple):
     element: np.ndarray  # (s,) text
     mass: np.ndarray  # (s,)
 
+    def __repr__(self) -> str:
+        return f"<Sites: {len(self.name)} of {len(np.unique(self.molecule))} molecules>"
+
 
 @dataclass(frozen=True)
 class System:

@@ -94,6 +94,9 @@ class Samples:
             if not ((np.abs(step) < 2**53) & (np.floor(step) == step)).all():
                 raise ValueError("samples have steps that are not whole numbers")
 
+    def __repr__(self) -> str:
+        return f"<Samples: {len(self)} of {', '.join(self.described)}>"
+
     def append(self, sample: Sample) -> None:
         """Add a sample at the end."""
         self._values.extend((*_VALUES(sample), *sample.own))
