@@ -296,6 +296,7 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
         (0.0003, 1.0, None, 0.00025),
         (0.3, 1.0, 0.7390851, 0.25),  # no common measure
         (3.0, 1.0, None, 1.0),
+        (0.021, 1.7, 5e-4, 0.0209876543209876543),  # nor does an interval much shorter than the step
     ],
 )
 def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(timestep, duration, interval, wanted):

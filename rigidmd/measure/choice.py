@@ -21,7 +21,7 @@ from rigidmd.measure.walk import Walk, walk
 #: Tried in this order. A later one is given up at a step that is too long and costs more.
 CANDIDATES = ("srkn_4", "two_stage", "velocity_verlet", "pefrl", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
 #: Most trials of each, the part of its longest step that is short enough to give up, and the gain worth another trial.
-TRIALS, SHORTEST, GAIN = 16, 4096, 1.05
+TRIALS, SHORTEST, GAIN = 16, 4096, 1.1
 #: Most halvings of the reference's step.
 HALVINGS = 12
 #: An interpolated step is shortened by this factor, so that its error falls below the target.
@@ -30,7 +30,7 @@ MARGIN = 0.95
 SAFE = 0.65
 #: Part of a run that the pilot of the best step takes; the least and the most of it, in short pilots; how often the
 #: step is corrected by it.
-PART, LEAST, MOST, CORRECTIONS = 0.05, 10.0, 100.0, 4
+PART, LEAST, MOST, CORRECTIONS = 0.05, 10.0, 100.0, 3
 #: What makes a walk of the energy smaller.
 REMEDIES = "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy smaller"
 
@@ -114,22 +114,21 @@ class _Search:
         good, bad = None, inf
         for _ in range(TRIALS):
             trial = self.trial(name, step)
+            if not trial.diverged:
+                self.measured[name] = trial
             if not trial.diverged and self.expected(trial) <= self.target:
                 good = trial
-            elif good is not None:
-                return good
-            elif self.cost(trial) > cheapest or step < longest / SHORTEST:
+            elif good is None and (self.cost(trial) > cheapest or step < longest / SHORTEST):
                 return None  # a step that is too long costs more than another integrator
             else:
                 bad = trial.timestep
-            if trial.diverged:
-                step /= 2
+            if good is None:
+                step = step / 2 if trial.diverged else max(rounded_down(MARGIN * self.step_for(trial)), step / 4)
                 continue
-            self.measured[name] = trial
-            step = _rounded(min(MARGIN * self.step_for(trial), longest, MARGIN * bad))
-            if good is not None and step < GAIN * good.timestep:
+            step = min(MARGIN * self.step_for(good), longest)
+            step = rounded_down(step if step < bad else sqrt(good.timestep * bad))
+            if step < GAIN * good.timestep:
                 return good
-            step = max(step, trial.timestep / 4)
         return good
 
 
@@ -197,8 +196,8 @@ def _over(search: _Search, first: Trial, duration: float) -> tuple[Trial, float,
     return best, value, f" (expected, from {seen.energy_rms:.1e} in a pilot of {pilot:.3g} ps)"
 
 
-def _rounded(step: float) -> float:
-    """Rounded down to three digits."""
+def rounded_down(step: float) -> float:
+    """A step rounded down to three digits."""
     unit = 10.0 ** (floor(log10(step)) - 2)
     return float(f"{floor(step / unit) * unit:.3g}")
 

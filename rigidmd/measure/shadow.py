@@ -20,7 +20,7 @@ with it at any step. In a liquid the two parts do not cancel, and BAOAB's bias i
 """
 
 from dataclasses import replace
-from math import floor, inf, isfinite, log10, sqrt
+from math import inf, isfinite, sqrt
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from rigidmd.assemble.system import System
 from rigidmd.core.state import State
 from rigidmd.engines import Engine
 from rigidmd.errors import SimulationError
+from rigidmd.measure.choice import rounded_down
 from rigidmd.measure.stable_step import stable_angle, stiffest
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
@@ -86,7 +87,7 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
         stable = LONGEST * stable_angle(decided.scheme) / found.rate if found else inf
         good = sqrt(target / (ALLOWANCE[integrator] * BIAS[integrator] * rate)) if rate > 0 else inf
         step = min(good, stable, stage.duration)
-        steps[integrator] = _rounded(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
+        steps[integrator] = rounded_down(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
     best = max(steps, key=lambda name: (steps[name], -BIAS[name]))
     step = steps[best] * FEMTOSECOND
     bias = ALLOWANCE[best] * bias_of_potential(best, rate, step)
@@ -140,9 +141,3 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     if not isfinite(rate):
         raise SimulationError("the pilot run that measures frequencies for bias_kT has no finite forces")
     return rate
-
-
-def _rounded(step: float) -> float:
-    """Down to three digits."""
-    unit = 10.0 ** (floor(log10(step)) - 2)
-    return floor(step / unit) * unit

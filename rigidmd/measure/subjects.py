@@ -32,6 +32,8 @@ COMPARATORS = {
 SPAN_PS = 0.1
 #: Step of velocity Verlet and span of a pilot run, in radians of the mean vibration or libration.
 PILOT_STEP, PILOT_SPAN = 0.15, 10.0
+#: For an error of the energy over a stage, a pilot takes this part of the stage, at least these radians.
+PILOT_PART, LEAST_SPAN = 0.01, 3.0
 #: Looks and steps of a body's first run, which only measures how fast it moves.
 LOOKS, STEPS = 200, 20_000
 
@@ -215,8 +217,15 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
     stage = system.scene.stages[k]
     natural = natural_time(system, state)
     step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
-    subject = molecular_subject(system, state, None, PILOT_SPAN * natural if natural else SPAN_PS)
-    longest = {name: float(f"{4 * step * SCHEMES[name].force_evaluations:.3g}") for name in SCHEMES}
+    span = PILOT_SPAN * natural if natural else SPAN_PS
+    if stage.energy_error_kT:
+        span = min(span, max(PILOT_PART * stage.duration, LEAST_SPAN / PILOT_SPAN * span))
+    subject = molecular_subject(system, state, None, span)
+    longest = {
+        name: float(f"{4 * step * scheme.force_evaluations:.3g}")
+        for name, scheme in SCHEMES.items()
+        if scheme.exact_rotor or scheme.order == 2  # the others take more forces, and suit bodies without that rotor
+    }
     asked = stage.energy_error_kT, stage.trajectory_error
     integrator, timestep, reason = _chosen(subject, longest, *asked, stage.duration)
     return stage.decided(integrator, timestep), reason
@@ -241,7 +250,9 @@ def decided_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple
 
 def _fitted(timestep: float, duration: float, interval: float | None) -> float:
     """A step no longer than this one, of which the duration and the interval of samples are whole numbers; of the
-    duration alone where their common measure would make it much shorter."""
+    duration alone where the interval or their common measure would make it much shorter; each step is then a sample."""
+    if interval is not None and interval < SHORTEST * timestep:
+        interval = duration
     if interval is None:
         interval = duration / SAMPLES if duration / SAMPLES >= timestep else duration
     (a, b), (c, d) = (Fraction(repr(span)).as_integer_ratio() for span in (duration, interval))

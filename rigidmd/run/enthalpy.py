@@ -40,7 +40,9 @@ class Enthalpy:
         strains of the cell, one for each coordinate of the coupling: R <- R T, cell <- cell T, where T is lower
         triangular as in `boxes`, with the exponentials of the first three strains on its diagonal and the others below.
         A strain is multiplied by sqrt(m N) (V/N)^(1/3), for N molecules and m components that share the coordinate:
-        in a strain all N distances to neighbours, about (V/N)^(1/3), change together
+        in a strain all N distances to neighbours, about (V/N)^(1/3), change together. A flexible cell of ice Ih (192
+        TIP4P/2005) took 50 iterations; 54 and 338 with strains scaled by 0.3 and 3 times as much, 63 and 59 with
+        rotations scaled by 0.5 and 2 times as much
 
     Axes without inertia do not turn. The derivative for the strain follows from the molecular virial W = sum F (x) R,
     dU/dT_ij = -W_ji. Forces between sites are in double precision, because energies in single precision have too few
