@@ -178,8 +178,9 @@ def _doubts(system: System, samples: Samples, k: int) -> list[str]:
         level = mean(whole)[0] or 0.0
         if abs(apart) > DIFFER * level + SURE * error:
             found.append(
-                f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {turning.mean():.4g} K, which "
-                "sampling does not explain: timestep_fs is too long, or translation and rotation hardly exchange energy"
+                f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {turning.mean():.4g} K, "
+                "which sampling does not explain: timestep_fs is too long, or translation and rotation hardly exchange "
+                "energy"
             )
     return found
 

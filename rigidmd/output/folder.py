@@ -6,6 +6,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from rigidmd.core.files import file_fault
 from rigidmd.core.toml_text import cut
 from rigidmd.errors import OutputError
 
@@ -137,7 +138,8 @@ def never_began(folder: Path) -> bool:
     if CHECKPOINT not in written_by_runs(folder) or any((folder / name).exists() for name in ended):
         return False
     log = folder / LOG
-    return not log.exists() or len(log.read_bytes().splitlines()) <= 2  # its header, its start
+    is_short = not file_fault(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
+    return is_short or not log.exists()
 
 
 def is_empty(folder: Path) -> bool:

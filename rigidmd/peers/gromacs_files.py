@@ -222,9 +222,10 @@ def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarra
     mass[where] = body.mass
     types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra(m, body)]
     names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra(m, body)))]
+    residue = as_word(m.residue_names[0])
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     lines += [
-        f"{i + 1} {types[i]} 1 {as_word(m.residue_names[0])} {names[i]} 1 {charges[i] if i < count else 0.0:.12g} {mass[i]:.12g}"
+        f"{i + 1} {types[i]} 1 {residue} {names[i]} 1 {charges[i] if i < count else 0.0:.12g} {mass[i]:.12g}"
         for i in range(len(mass))
     ]
     at = [int(p) + 1 for p in where]
