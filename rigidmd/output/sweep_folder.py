@@ -69,7 +69,7 @@ class Manifest:
     inputs : dotted key -> SHA-256 of the files that all points read
     """
 
-    __pydantic_config__ = ConfigDict(strict=True)
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
 
     name: str
     scene: str
@@ -78,6 +78,7 @@ class Manifest:
     common: dict[str, Any]
     inputs: dict[str, str]
     points: list[Point] = field(default_factory=list)
+    schema: int = SCHEMA
 
     def overrides(self, point: Point) -> dict[str, Any]:
         """Dotted key -> value of a point, for `Scene.read`."""
@@ -119,7 +120,7 @@ def read_manifest(folder: Path) -> Manifest:
     names = [point.folder for point in found.points]
     fault = ""
     if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
-        fault = "names of folders that a sweep does not give"
+        fault = "points with names of folders that a sweep does not give"
     if any(point.values.keys() != found.keys.keys() for point in found.points):
         fault = "points without values of all keys"
     if any(key not in together for key, together in found.keys.items()):
@@ -132,7 +133,7 @@ def read_manifest(folder: Path) -> Manifest:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write sweep.json as a whole. Raises OutputError."""
     with whole_file(folder / MANIFEST) as temporary:
-        temporary.write_text(json.dumps({"schema": SCHEMA, **asdict(manifest)}, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(asdict(manifest), indent=1) + "\n", encoding="utf-8")
 
 
 def check_sweep_folder(folder: Path) -> None:
