@@ -190,7 +190,7 @@ def test_a_film_of_a_thousand_frames_of_water(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("summary.json", "[]", "is no summary of a run"),
+        ("summary.json", "[]", "summary.json: is [], must be a table"),
         ("summary.json", "{", "cannot be read"),
         ("motion.csv", "t,x\n0,1\n", "has no column"),
         ("motion.csv", "", "has no column"),

@@ -677,4 +677,7 @@ def test_a_manifest_of_a_stranger_is_held_against_what_it_should_be(copied, argo
         (copied / "sweep.json").write_text(json.dumps(whole | change))
         for command in (["sweep", str(argon), *GRID, "-o"], ["analyse"]):
             assert cli.main([*command, str(copied)]) == 2, change
-            assert "is no manifest of a sweep" in capsys.readouterr().err, change
+            said = capsys.readouterr().err
+            assert f"{copied / 'sweep.json'}" in said, change
+            assert next(iter(change)) in said, change
+            assert "--force begins the sweep anew" in said, change

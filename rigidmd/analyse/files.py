@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from rigidmd.analyse.findings import Curve, Finding, Value
 from rigidmd.analyse.history import History
@@ -16,6 +17,7 @@ from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
 from rigidmd.output.figure import COLORS, FAINT, INK, drawing, few_decades, save_figure, thin_series
 from rigidmd.output.folder import add_to_folder, written_by_runs
+from rigidmd.output.run_files import Bounded, read_columns, read_json
 
 ANALYSIS = "analysis.json"
 #: Inches of a figure, and curves that one holds.
@@ -43,7 +45,8 @@ def write_findings(
     stretch : see `stretch_of`. failed : analysis -> the sentence that tells why it found nothing. Raises OutputError.
     """
     known = read_table(folder)
-    owner, marked = _owners(known, folder), written_by_runs(folder)
+    owner = {name: analysis for analysis, entry in known.items() for name in entry["files"]}
+    marked = written_by_runs(folder)
     own = {}
     for finding in findings:
         for name in (f"{curve.file}{ending}" for curve in finding.curves for ending in (".csv", ".png")):
@@ -55,7 +58,7 @@ def write_findings(
                 raise OutputError(f"{folder / name} is there and no file of an analysis; name {finding.name} otherwise")
     add_to_folder(folder, [ANALYSIS, *own])
     written, pictures = [], {}
-    entries = dict(known.get("analyses", {}))
+    entries = dict(known)
     for finding in findings:
         files = []
         for curve in finding.curves:
@@ -82,14 +85,6 @@ def write_findings(
     return [folder / ANALYSIS, *(path for path in written if path.is_file())]
 
 
-def _owners(known: dict[str, Any], folder: Path) -> dict[str, str]:
-    """File -> the analysis that wrote it. Raises OutputError."""
-    try:
-        return {str(name): analysis for analysis, entry in known.get("analyses", {}).items() for name in entry["files"]}
-    except (KeyError, TypeError):
-        raise OutputError(f"{folder / ANALYSIS} is no list of analyses; remove it, and analyse again") from None
-
-
 def _described(curve: Curve) -> dict[str, Any]:
     return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level, "bars": curve.bars}
 
@@ -110,57 +105,74 @@ def _text(curve: Curve) -> str:
     return stream.getvalue()
 
 
+class _Curve(BaseModel):
+    file: str
+    label: str
+    log: tuple[bool, bool]
+    level: Bounded | None
+    bars: bool
+
+
+class _Value(BaseModel):
+    name: str
+    unit: str
+    value: Bounded | None
+    error: Bounded | None
+    correlation_ps: Bounded | None = None
+    note: str = ""
+
+
+class _Stretch(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+    frames: int
+    from_ps: Bounded
+    to_ps: Bounded
+
+
+class _Entry(BaseModel):
+    about: str
+    values: list[_Value]
+    notes: list[str]
+    curves: list[_Curve]
+    files: list[str]
+    stretch: _Stretch
+
+
+class _Analyses(BaseModel):
+    """analysis.json."""
+
+    analyses: dict[str, _Entry]
+
+
 def read_table(folder: Path) -> dict[str, Any]:
-    """analysis.json as it is; empty without one. Raises OutputError."""
-    path = folder / ANALYSIS
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{path} cannot be read: {error}; remove it, and analyse again") from None
-    if not isinstance(found, dict) or not isinstance(found.get("analyses"), dict):
-        raise OutputError(f"{path} is no list of analyses; remove it, and analyse again")
-    return found
+    """The entries of analysis.json by analysis; empty without one. Raises OutputError."""
+    found = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
+    return {} if found is None else found.model_dump()["analyses"]
 
 
 def read_findings(folder: Path) -> list[tuple[Finding, str]]:
     """What analyses found in the folder of a run, each with its stretch in words. Raises OutputError."""
     found = []
-    try:
-        for name, entry in read_table(folder).get("analyses", {}).items():
-            curves = [_read_curve(folder, told) for told in entry["curves"]]
-            values = [Value(**value) for value in entry["values"]]
-            stretch = entry["stretch"]
-            words = f"{stretch['frames']} frames from {stretch['from_ps']:g} to {stretch['to_ps']:g} ps"
-            found.append((Finding(name, str(entry["about"]), values, curves, list(entry["notes"])), words))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise OutputError(f"{folder / ANALYSIS} is no list of analyses: {error}") from None
+    for name, entry in read_table(folder).items():
+        curves = [_read_curve(folder, told) for told in entry["curves"]]
+        values = [Value(**value) for value in entry["values"]]
+        stretch = entry["stretch"]
+        words = f"{stretch['frames']} frames from {stretch['from_ps']:g} to {stretch['to_ps']:g} ps"
+        found.append((Finding(name, entry["about"], values, curves, entry["notes"]), words))
     return found
 
 
 def _read_curve(folder: Path, told: dict[str, Any]) -> Curve:
-    path = folder / f"{Path(str(told['file'])).name}.csv"
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            head, *lines = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise OutputError(f"{path} cannot be read: {error}") from None
-    table = {title: np.array([float(line[k] or "nan") for line in lines]) for k, title in enumerate(head)}
-    axis = head[0]
+    path = folder / f"{Path(told['file']).name}.csv"
+    read = read_columns(path)
+    if read is None or not read.cells:
+        raise OutputError(f"{path} cannot be read: there is no curve in it; analyse again")
+    head = list(read.cells)
+    table = {title: read.numbers(title) for title in head}
     columns = {title: table[title] for title in head[1:] if title.removesuffix(" error") not in set(head) - {title}}
     errors = {title.removesuffix(" error"): table[title] for title in head[1:] if title not in columns}
-    log = (bool(told["log"][0]), bool(told["log"][1]))
-    return Curve(
-        str(told["file"]),
-        (axis, table[axis]),
-        str(told["label"]),
-        columns,
-        errors,
-        log,
-        told["level"],
-        bool(told["bars"]),
-    )
+    return Curve(**told | {"axis": (head[0], table[head[0]]), "columns": columns, "errors": errors})
 
 
 def drawn(curve: Curve):

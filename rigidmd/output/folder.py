@@ -6,7 +6,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from rigidmd.core.files import write_text
+from rigidmd.core.files import file_fault, write_text
 from rigidmd.core.toml_text import cut
 from rigidmd.errors import OutputError
 
@@ -155,7 +155,8 @@ def never_began(folder: Path) -> bool:
     if CHECKPOINT not in written_by_runs(folder) or any((folder / name).exists() for name in ended):
         return False
     log = folder / LOG
-    return not log.exists() or len(log.read_bytes().splitlines()) <= 2  # its header, its start
+    is_short = not file_fault(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
+    return is_short or not log.exists()
 
 
 def offsets_of(trajectory: Path) -> list[Path]:

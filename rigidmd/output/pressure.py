@@ -1,6 +1,5 @@
 """pressure_tensor.csv: the pressure tensor over time at an interval of its own, for viscosities."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from rigidmd.core.files import AppendedFile
 from rigidmd.errors import OutputError
+from rigidmd.output.run_files import read_columns
 
 TENSOR_FILE = "pressure_tensor.csv"
 COMPONENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -34,19 +34,8 @@ class TensorFile(AppendedFile):
 
 def read_tensor(path: Path) -> np.ndarray | None:
     """Lines (n, 7) of the file; None without one. A last line that is cut off is left out. Raises OutputError."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            head, *lines = list(csv.reader(file)) or [[]]
-    except FileNotFoundError:
+    if (found := read_columns(path)) is None:
         return None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise OutputError(f"{path} cannot be read: {error}") from None
-    if head != HEADER:
+    if list(found.cells) != HEADER:
         raise OutputError(f"{path} is no pressure tensor of rigidmd: its columns must be {', '.join(HEADER)}")
-    try:
-        found = np.array([line for line in lines if len(line) == len(HEADER)], float).reshape(-1, len(HEADER))
-    except ValueError:
-        raise OutputError(f"{path} holds what is no number") from None
-    if not np.isfinite(found).all():
-        raise OutputError(f"{path} holds what is no finite number")
-    return found
+    return np.array([found.numbers(header, finite=True) for header in HEADER]).T

@@ -1,7 +1,6 @@
 """What the folder of a run holds: its scene, its summary, and the columns of its log or motion."""
 
-import csv
-import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from rigidmd.measure.columns import BODY
 from rigidmd.measure.motion import Snapshot, motion
 from rigidmd.output.checkpoint import latest
 from rigidmd.output.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
+from rigidmd.output.run_files import Summary, read_columns, read_json
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.scene.stage import Stage
 
@@ -91,55 +91,34 @@ def read_record(folder: Path) -> Record:
         system = build(scene, bare=True)
         columns = _log(folder, scene.stages)
     if not columns or len(next(iter(columns.values()))) == 0:
-        raise OutputError(f"{folder}: the run wrote no samples yet; `rigidmd resume {folder}` goes on with it")
+        raise OutputError(
+            f"{folder}: the run wrote no samples yet; `rigidmd resume {shlex.quote(str(folder))}` goes on with it"
+        )
     return Record(folder, scene, system, summary, columns, missing)
 
 
 def _summary(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    path = folder / SUMMARY
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    found = read_json(folder / SUMMARY, Summary)
+    if found is None:
         return None, [
             f"This run has not ended: there is no {SUMMARY}. What follows is what it wrote so far; "
-            f"`rigidmd resume {folder}` goes on with it."
+            f"`rigidmd resume {shlex.quote(str(folder))}` goes on with it."
         ]
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{path} cannot be read: {error}") from None
-    if not isinstance(found, dict):
-        raise OutputError(f"{path} is no summary of a run")
     ended = "This run was interrupted; what follows is what it wrote so far."
-    return found, [ended] if found.get("interrupted") else []
-
-
-def _table(path: Path) -> dict[str, list[str]]:
-    """The columns of a CSV file by their headers; a last line that is cut off is left out. Raises OutputError."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            head, *lines = list(csv.reader(file)) or [[]]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise OutputError(f"{path} cannot be read: {error}") from None
-    lines = [line for line in lines if len(line) == len(head)]
-    return {header: [line[k] for line in lines] for k, header in enumerate(head)}
-
-
-def _numbers(path: Path, header: str, cells: list[str]) -> np.ndarray:
-    """A column as numbers; what is empty is NaN. Raises OutputError."""
-    try:
-        return np.array([float(cell or "nan") for cell in cells])
-    except ValueError:
-        raise OutputError(f"{path}: column {header!r} holds what is no number") from None
+    return found.model_dump(exclude_unset=True), [ended] if found.interrupted else []
 
 
 def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
     """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
-    path = folder / LOG
-    table = {HEADERS[header]: (header, cells) for header, cells in _table(path).items() if header in HEADERS}
-    if lacking := [name for name in ("time", "stage_name") if name not in table]:
-        raise OutputError(f"{path} is no log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
+    read = read_columns(folder / LOG)
+    if read is None:
+        raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
+    headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
+    if lacking := [name for name in ("time", "stage_name") if name not in headers]:
+        raise OutputError(f"{read.path} is no log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
     found = {
-        name: np.array(cells) if name == "stage_name" else _numbers(path, header, cells)
-        for name, (header, cells) in table.items()
+        name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
+        for name, header in headers.items()
     }
     return found | {"stage": _stage_of(found["stage_name"], found["time"], stages)}
 
@@ -166,15 +145,11 @@ def _columns_of(system: BodySystem) -> list[str]:
 
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv; of a run that did not write it, those of its last checkpoint."""
-    path = folder / MOTION
-    if path.is_file():
-        found = {header: _numbers(path, header, cells) for header, cells in _table(path).items()}
-        for name in _columns_of(system):
-            if name not in found:
-                raise OutputError(f"{path} is not the motion of this run: it has no column {name!r}")
-            if not np.isfinite(found[name]).all():
-                raise OutputError(f"{path}: column {name!r} holds what is no finite number")
-        return found
+    if (found := read_columns(folder / MOTION)) is not None:
+        needed = _columns_of(system)
+        if lacking := [name for name in needed if name not in found.cells]:
+            raise OutputError(f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}")
+        return {header: found.numbers(header, finite=header in needed) for header in found.cells}
     try:
         kept, _ = latest(folder)
     except CheckpointError:

@@ -5,7 +5,9 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
@@ -19,7 +21,9 @@ from rigidmd.output.folder import (
     offsets_of,
     written_by_runs,
 )
+from rigidmd.output.run_files import Bounded, Summary, read_json
 from rigidmd.output.sweep_names import point_name, short_keys
+from rigidmd.validation import settled
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
 #: While it is there, points that run elsewhere stop at their next look.
@@ -30,6 +34,12 @@ SCHEMA = 1
 WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED = "waiting", "running", "finished", "interrupted", "failed"
 #: The key whose values make replicas.
 SEED = "seed"
+
+
+class Schema(BaseModel):
+    """The version of a manifest."""
+
+    schema_: int = Field(alias="schema")
 
 
 @dataclass
@@ -44,13 +54,15 @@ class Point:
     seconds : that it ran, in all
     """
 
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
     folder: str
     values: dict[str, Any]
     scene_sha256: str
-    state: str = WAITING
+    state: Annotated[str, Field(pattern="^(waiting|running|finished|interrupted|failed)$")] = WAITING
     ran_sha256: str | None = None
     message: str | None = None
-    seconds: float = 0.0
+    seconds: Bounded = 0.0
 
 
 @dataclass
@@ -64,6 +76,8 @@ class Manifest:
     inputs : dotted key -> SHA-256 of the files that all points read
     """
 
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
     name: str
     scene: str
     keys: dict[str, list[str]]
@@ -71,6 +85,7 @@ class Manifest:
     common: dict[str, Any]
     inputs: dict[str, str]
     points: list[Point] = field(default_factory=list)
+    schema: int = SCHEMA
 
     def overrides(self, point: Point) -> dict[str, Any]:
         """Dotted key -> value of a point, for `Scene.read`."""
@@ -100,49 +115,31 @@ def is_sweep(folder: Path) -> bool:
 
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of a sweep. Raises OutputError if it is none."""
-    path = folder / MANIFEST
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        schema = told.pop("schema")
-        if schema > SCHEMA:
-            raise OutputError(
-                f"{path}: was written by a later rigidmd (version {schema} of the format; this one reads {SCHEMA})"
-            )
-        points = [Point(**point) for point in told.pop("points")]
-        found = Manifest(**told, points=points)
-        names = [point.folder for point in points]
-        if not _is_whole(found):
-            raise ValueError("values of other types")
-        if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
-            raise ValueError("names of folders that a sweep does not give")
-        if any(point.values.keys() != found.keys.keys() for point in points):
-            raise ValueError("points without values of all keys")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise OutputError(f"{path} is no manifest of a sweep: {error}; --force begins the sweep anew") from None
+    path, remedy = folder / MANIFEST, "; --force begins the sweep anew"
+    schema = read_json(path, Schema, remedy)
+    if schema is None:
+        raise OutputError(f"{path} cannot be read: there is no such file")
+    if schema.schema_ > SCHEMA:
+        raise OutputError(
+            f"{path}: was written by a later rigidmd (version {schema.schema_} of the format; this one reads {SCHEMA})"
+        )
+    found = settled(read_json(path, Manifest, remedy))
+    names = [point.folder for point in found.points]
+    fault = ""
+    if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
+        fault = "points with names of folders that a sweep does not give"
+    if any(point.values.keys() != found.keys.keys() for point in found.points):
+        fault = "points without values of all keys"
+    if any(key not in together for key, together in found.keys.items()):
+        fault = "keys that are not set with themselves"
+    if fault:
+        raise OutputError(f"{path} is no manifest of a sweep: {fault}{remedy}")
     return found
-
-
-def _is_whole(found: Manifest) -> bool:
-    """Whether all that a manifest tells has the types that it should have."""
-    tables = (found.keys, found.fixed, found.common, found.inputs, *(point.values for point in found.points))
-    words = [found.name, found.scene, *(word for point in found.points for word in (point.folder, point.scene_sha256))]
-    perhaps = [word for point in found.points for word in (point.ran_sha256, point.message)]
-    return (
-        all(isinstance(table, dict) for table in tables)
-        and all(isinstance(word, str) for word in words)
-        and all(word is None or isinstance(word, str) for word in perhaps)
-        and all(point.state in (WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED) for point in found.points)
-        and all(isinstance(point.seconds, int | float) for point in found.points)
-        and all(isinstance(together, list) and key in together for key, together in found.keys.items())
-        and all(isinstance(key, str) for together in found.keys.values() for key in together)
-    )
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write sweep.json as a whole. Raises OutputError."""
-    write_text(folder / MANIFEST, json.dumps({"schema": SCHEMA, **asdict(manifest)}, indent=1) + "\n")
+    write_text(folder / MANIFEST, json.dumps(asdict(manifest), indent=1) + "\n")
 
 
 def check_sweep_folder(folder: Path) -> None:
@@ -184,9 +181,9 @@ def state_on_disk(folder: Path, point: Point) -> str:
     """What the folder of a point says: finished, interrupted, or waiting if nothing has run there."""
     own = folder / point.folder
     try:
-        summary = json.loads((own / SUMMARY).read_text(encoding="utf-8"))
-        ended = summary["interrupted"] is False and point.ran_sha256 in (None, summary["scene_sha256"])
-    except (OSError, ValueError, KeyError, TypeError):
+        summary = read_json(own / SUMMARY, Summary) or Summary(interrupted=True)
+        ended = not summary.interrupted and point.ran_sha256 in (None, summary.scene_sha256)
+    except OutputError:
         ended = False
     if ended:
         return FINISHED

@@ -221,6 +221,7 @@ def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarra
     mass[where] = body.mass
     types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra(m, body)]
     names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra(m, body)))]
+    residue = as_word(m.residue_names[0])
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     residue = as_word(m.residue_names[0])
     lines += [

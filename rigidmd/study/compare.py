@@ -1,18 +1,19 @@
 """`rigidmd compare`: where two runs part, and what differs in what they were made from."""
 
-import csv
 import hashlib
-import json
-import tomllib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidmd.core.files import file_fault
 from rigidmd.core.state_file import read_state
-from rigidmd.errors import OutputError, RigidMDError
+from rigidmd.core.toml_text import read_toml
+from rigidmd.errors import OutputError, RigidMDError, SceneError
 from rigidmd.output.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
+from rigidmd.output.run_files import Columns, Summary, read_columns, read_json
 from rigidmd.run.provenance import differences, keys_of
 
 #: Of summary.json: what is compared besides the scene.
@@ -83,24 +84,23 @@ def compare(first: Path, second: Path) -> Comparison:
     for folder in (first, second):
         check_is_run(folder)
     found = Comparison((str(first), str(second)))
-    scenes = [_read(folder / SCENE, found, tomllib.loads) for folder in (first, second)]
+    scenes = [_read(folder / SCENE, found, lambda path: read_toml(path, SceneError)[0]) for folder in (first, second)]
     if None not in scenes:
         found.scene = differences(*(keys_of(scene, ("name", "threads")) for scene in scenes))
-    summaries = [_read(folder / SUMMARY, found, json.loads) for folder in (first, second)]
+    summaries = [_read(folder / SUMMARY, found, lambda path: read_json(path, Summary)) for folder in (first, second)]
     if None not in summaries:
-        one, other = (_made(summary) for summary in summaries)
+        one, other = (_made(summary.model_dump(exclude_unset=True)) for summary in summaries)
         found.made = differences(one, other, "not told")
     for name in (LOG, MOTION):
         if any((folder / name).exists() for folder in (first, second)):
-            tables = [_read(folder / name, found, _table) for folder in (first, second)]
+            tables = [_read(folder / name, found, read_columns) for folder in (first, second)]
             if None not in tables:
                 found.course = _course(name, *tables)
     _compare_states(first / FINAL, second / FINAL, found)
-    output = [scene.get("output", {}) for scene in scenes if scene]
-    for key in ("topology", "trajectory"):
-        names = {part[key] for part in output if part.get(key)}
-        if len(output) == 2 and len(names) == 1:
-            _compare_bytes(first / (name := names.pop()), second / name, found)
+    for key in ("output.topology", "output.trajectory"):
+        names = [keys_of(scene, ()).get(key) for scene in scenes if scene]
+        if len(names) == 2 and isinstance(name := names[0], str) and names[1] == name and Path(name).name == name:
+            _compare_bytes(first / name, second / name, found)
     return found
 
 
@@ -111,34 +111,28 @@ def _made(summary: dict[str, Any]) -> dict[str, Any]:
     return made | {f"file of {key}": digest[:12] for key, digest in summary.get("input_sha256", {}).items()}
 
 
-def _read(path: Path, found: Comparison, read: Any) -> Any:
-    """What a text file holds; None, with a word on it, if it cannot be read."""
+def _read(path: Path, found: Comparison, read: Callable[[Path], Any]) -> Any:
+    """What a file holds; None, with a word on it, if it cannot be read."""
     try:
-        return read(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        found.missing.append(f"{path}: there is no such file")
-    except (OSError, ValueError) as error:
-        found.missing.append(f"{path}: cannot be read: {error}")
+        if (content := read(path)) is None:
+            found.missing.append(f"{path}: there is no such file")
+        return content
+    except RigidMDError as error:
+        found.missing.append(str(error))
     return None
 
 
-def _table(text: str) -> dict[str, list[str]]:
-    """Header -> cells of a CSV file. A last line that was torn is left out."""
-    rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
-    if not rows:
-        raise ValueError("it holds no header")
-    whole = [row for row in rows[1:] if len(row) == len(rows[0])]
-    return {header: [row[k] for row in whole] for k, header in enumerate(rows[0])}
-
-
-def _course(file: str, first: dict[str, list[str]], second: dict[str, list[str]]) -> Course:
-    """Where the columns of two files part."""
+def _course(file: str, one: Columns, other: Columns) -> Course:
+    """Where the columns of two files part. Raises OutputError."""
+    first, second = one.cells, other.cells
     columns = [name for name in first if name in second]
     only = [name for name in (*first, *second) if name not in columns]
     time = next((name for name in TIMES if name in columns), None)
     if time is None:
         raise OutputError(f"{file}: there is no column of times")
     clock = STEP if STEP in columns and _agree(first, second, time) else time
+    for columns_of in (one, other):
+        columns_of.numbers(clock)
     lengths = len(first[clock]), len(second[clock])
     places = _places(second[clock])
     rows = [(k, places[value]) for value, k in _places(first[clock]).items() if value in places]
@@ -204,8 +198,8 @@ def _compare_states(first: Path, second: Path, found: Comparison) -> None:
 
 def _compare_bytes(first: Path, second: Path, found: Comparison) -> None:
     """Whether two files have the same bytes."""
-    if missing := [path for path in (first, second) if not path.is_file()]:
-        found.missing += [f"{path}: there is no such file" for path in missing]
+    if missing := [f"{path}: {fault}" for path in (first, second) if (fault := file_fault(path))]:
+        found.missing += missing
         return
     digests = []
     for path in (first, second):
