@@ -10,6 +10,7 @@ from rigidmd.assemble.body import BodySystem, Pose, build_body
 from rigidmd.compile.cache import kept_in_words
 from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.cpu import Engine
+from rigidmd.engines.textbook import OdeEngine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.measure.body_summary import summarise_body
 from rigidmd.measure.motion import Motion, Snapshot, motion
@@ -73,6 +74,8 @@ class BodySimulation(Simulation):
 
     def _reset(self) -> None:
         self.engine = self.system.engine()
+        if isinstance(self.engine, OdeEngine):
+            self.engine.halts = lambda: self._interrupted or self._keeper.time_is_up
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
@@ -160,6 +163,11 @@ class BodySimulation(Simulation):
             self.system, samples, steps, costs.preparing, costs.wall, sum(costs.computing), self._interrupted
         )
         found["stable_timestep_s"] = self._stable
+        if getattr(self.engine, "is_stiff", False):
+            self.note(
+                "the motion is stiff: stability, not accuracy, limits the steps of dop853; integrator = 'radau' takes "
+                "much longer ones"
+            )
         found["notes"] = [*([self._choice] if self._choice else []), *found["notes"], *self.notes]
         return found
 
