@@ -14,6 +14,7 @@ from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.output.scene_file import write_scene
 from rigidmd.run import Every, Simulation
+from rigidmd.run.keeper import Keeper
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -235,3 +236,76 @@ def test_a_topology_holds_the_first_place(output, position, topology):
         )
     with pytest.raises(SceneError, match=r"are both topology\.pdb"):
         Scene.from_dict(data | {"output": {"trajectory": "topology.pdb"}})
+
+
+STIFF = """\
+[body]
+mass_kg = 1.0
+inertia_kg_m2 = [0.02, 0.02, 0.01]
+pinned = true
+centre_of_mass_m = [0.0, 0.0, 0.1]
+[gravity]
+acceleration_m_s2 = [0.0, 0.0, -9.81]
+[friction]
+viscous_N_m_s = [{friction}, {friction}, {friction}]
+[start]
+euler_angles_deg = [0, 40, 0]
+angular_velocity_body_rad_s = [0.0, 0.0, 50.0]
+[run]
+integrator = "{integrator}"
+duration_s = 0.02
+timestep_s = 1e-3
+[output]
+figures = false
+"""
+
+
+def stiff(tmp_path, friction, integrator="dop853"):
+    (tmp_path / "stiff.toml").write_text(STIFF.format(friction=friction, integrator=integrator))
+    return Scene.read(tmp_path / "stiff.toml")
+
+
+@pytest.mark.parametrize("integrator", ["dop853", "radau"])
+def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to_the_same_bits(tmp_path, integrator):
+    scene = stiff(tmp_path, 1e3, integrator)
+    whole = Simulation(scene, tmp_path / "whole", warn=str).run()
+    for name, after in (("early", 3), ("late", 10 if integrator == "radau" else 250)):
+        run = Simulation(scene, tmp_path / name, warn=str)
+        counted = iter(range(after))
+        reset = run._reset
+
+        def counting(reset=reset, run=run, counted=counted):
+            reset()
+            halts = run.engine.halts
+            run.engine.halts = lambda: halts() or (next(counted, None) is None and (run.stop(15) or True))
+
+        run._reset = counting
+        results = run.run()
+        assert (results.interrupted, results.signal, results.out_of_time) == (True, 15, False)
+        assert run.engine.own_steps == after + 1
+        assert results["t"][-1] < 0.02
+        if integrator == "dop853":
+            Simulation(scene, tmp_path / name, resume=True, warn=str).run()
+            for file in ("motion.csv", "trajectory.xtc"):
+                assert (tmp_path / name / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
+    assert whole["t"][-1] == pytest.approx(0.02)
+
+
+def test_a_stiff_motion_ends_in_its_time_with_advice(tmp_path, monkeypatch):
+    scene = stiff(tmp_path, 1e7)
+    looks = iter(range(400))
+    monkeypatch.setattr(Keeper, "time_is_up", property(lambda self: next(looks, None) is None))
+    results = Simulation(scene, tmp_path / "out", warn=str).run()
+    assert results.interrupted
+    assert results.out_of_time
+    assert results["t"].tolist() == [0.0]
+    assert any("stiff" in note and "radau" in note for note in results.summary["notes"])
+
+
+def test_a_motion_that_is_not_stiff_gets_no_such_advice():
+    scene = Scene.read(TOP, {"run.integrator": "dop853", "run.duration_s": 0.5, "output.interval_s": 0.01})
+    run = Simulation(scene)
+    run.run()
+    assert run.engine.own_steps > 50
+    assert not run.engine.is_stiff
+    assert run.engine._stiff == 0

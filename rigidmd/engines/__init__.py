@@ -15,6 +15,10 @@ class Tally(NamedTuple):
     virial: np.ndarray  # (3, 3) molecular, sum F (x) R, u Å²/ps²
 
 
+class Halted(Exception):
+    """An engine was asked to end between two looks; the state is that of the last one."""
+
+
 class Engine(Protocol):
     """The methods of an engine that a run uses."""
 

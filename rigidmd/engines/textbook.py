@@ -17,6 +17,7 @@ from rigidmd.compile import kernel
 from rigidmd.core.schemes import DOP853, FORMULATIONS, RADAU, RK4, Scheme, Solver
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
 from rigidmd.dynamics.body import Body, relative_motion
+from rigidmd.engines import Halted
 from rigidmd.engines.cpu import Engine, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import frame_rate
@@ -37,6 +38,9 @@ from rigidmd.mechanics.rotor import moment_rates
 
 FORMS: dict[str, Form] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
+#: A step of DOP853 is at the limit of stability if it times the eigenvalue is beyond this; how many such steps are
+#: stiff, and how many others in a row are not. Changes within a step below this share of the variables are rounding.
+STABLE, STIFF, MILD, ROUNDED = 6.1, 200, 6, 1e-14
 SINGULAR = 5  # beyond the codes of core.state: Euler angles too near theta = 0 or pi
 #: Half of the digits of phi and psi are lost there, because theta has an error of 1e-16.
 SMALLEST_SINE = 1e-8
@@ -155,6 +159,9 @@ class OdeEngine(Engine):
     _between: Callable[[float], np.ndarray] | None = None
     _anew = False  # whether forces have changed, so that earlier steps are of no use
     own_steps = 0  # that DOP853 or Radau has taken
+    halts: Callable[[], bool] = staticmethod(lambda: False)  # whether to end now; asked at each of these steps
+    _stiff, _mild = 0, 0  # steps in a row at the limit of stability, and not, as Hairer counts them
+    is_stiff = False  # whether DOP853 was held there for long
 
     @property
     def evaluations(self) -> int:
@@ -176,7 +183,7 @@ class OdeEngine(Engine):
         return y
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
-        """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError."""
+        """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError, Halted."""
         solver = _solver_of(row)
         self._prepare(state)
         keep_time(state, dt)
@@ -253,6 +260,7 @@ class OdeEngine(Engine):
             there[:] = running.y
             with np.errstate(all="ignore"):
                 problem = running.step()
+                self._count_stiff(running)
             self.own_steps += 1
             if singular(form, running.y, running.y, 0.0):
                 raise SingularError(running.y[1], running.t)
@@ -262,10 +270,29 @@ class OdeEngine(Engine):
                     f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
                 )
             self._between = running.dense_output()
+            if self.halts():  # the slopes have moved the state
+                read(form, self.model, state, state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt, y)
+                raise Halted
         if self._between is not None:
             y[:] = self._between(end)
         state.step[NOW] = until
         read(form, self.model, state, end, y)
+
+    def _count_stiff(self, running: Dop853 | Radau) -> None:
+        """See whether stability, not accuracy, limits the steps of DOP853, from the largest eigenvalue as the code of
+        Hairer & Wanner estimates it (Solving Ordinary Differential Equations II, section IV.2)."""
+        if isinstance(running, Radau):
+            return
+        h, stages = running.t - running.t_old, running.K
+        last = running.y_old + h * (running.A[-1, :-1] @ stages[: len(running.A) - 1])
+        change = np.linalg.norm(running.y - last)
+        moved = change > ROUNDED * np.linalg.norm(running.y)
+        if moved and h * np.linalg.norm(stages[len(running.A)] - stages[len(running.A) - 1]) > STABLE * change:
+            self._stiff, self._mild = self._stiff + 1, 0
+            self.is_stiff |= self._stiff >= STIFF
+        else:
+            self._mild += 1
+            self._stiff *= self._mild < MILD
 
     def _new_solver(self, form: Form, state: State, solver: Solver, begun, there, sizes) -> Dop853 | Radau:
         """SciPy's solver at the begin of one of its steps; it chooses the length if none is known."""

@@ -83,6 +83,8 @@ class BodySimulation(Simulation):
 
     def _reset(self) -> None:
         self.engine = self.system.engine()
+        if isinstance(self.engine, OdeEngine):
+            self.engine.halts = lambda: self._interrupted or self._keeper.time_is_up
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
@@ -169,6 +171,11 @@ class BodySimulation(Simulation):
             self.system, samples, steps, costs.preparing, costs.wall, sum(costs.computing), self._interrupted
         )
         found["stable_timestep_s"] = self._record.stable
+        if getattr(self.engine, "is_stiff", False):
+            self.note(
+                "the motion is stiff: stability, not accuracy, limits the steps of dop853; integrator = 'radau' takes "
+                "much longer ones"
+            )
         found["notes"] = [*([self._choice] if self._choice else []), *found["notes"], *self.notes]
         return found
 

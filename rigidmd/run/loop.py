@@ -9,7 +9,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from math import isclose
+from math import inf, isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, cast, overload
 
@@ -18,7 +18,7 @@ import numpy as np
 from rigidmd.core.process import ONE_AT_A_TIME
 from rigidmd.core.schemes import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
-from rigidmd.engines import Engine
+from rigidmd.engines import Engine, Halted
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SimulationError
 from rigidmd.output.checkpoint import Checkpoint, latest
@@ -491,16 +491,21 @@ class Simulation(Base):
                     place = place._replace(seconds=clock.perf_counter() - began)
                     due = [observer.interval is not None or observer.ends for observer in observers]
                     self._show(observers, Moment(self, place.first, place.time, k), due)
-                shown, pace = None, 0.0
+                shown, pace = None, inf
                 bar.unpause()
                 while done < stretch.steps and not self._interrupted:
                     to = agenda.next_look(done)
                     if pace > 0:
-                        to = min(to, done + max(1, int(PIECE / pace)))
+                        to = min(to, done + max(1, int(PIECE / pace)))  # the first step alone: it may take long
                     shown = agenda.due(to)
                     looked = agenda.reads_energies(shown)
                     began = clock.perf_counter()
-                    self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
+                    try:
+                        self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
+                    except Halted:
+                        self._out_of_time = not self._interrupted
+                        self._interrupted = True
+                        break
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
                     place = place._replace(seconds=place.seconds + seconds)
