@@ -32,7 +32,7 @@ RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 
 LIBRARIES = {
     "ase": {
-        "assemble/atoms.py", "assemble/ase_formats.py", "assemble/own_formats.py", "assemble/structure_files.py",
+        "assemble/atoms.py", "assemble/ase_formats.py", "assemble/lammps_formats.py", "assemble/own_formats.py", "assemble/structure_files.py",
         "assemble/matching.py", "assemble/cells.py", "assemble/own_model.py", "assemble/from_atoms.py", "assemble/to_atoms.py", "assemble/traj_format.py",
         "output/traj_file.py", "run/atoms.py", "ase.py",
     },

@@ -9,35 +9,33 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.ase_formats import ASE_VELOCITY
 from rigidmd.assemble.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
 from rigidmd.assemble.own_formats import numbers, promised_atoms, table
 from rigidmd.core.toml_text import whole_number
 from rigidmd.errors import StructureError
 
-#: Columns of the section Atoms by atom style; three image numbers may follow.
+#: Columns of the section Atoms by atom style; three image numbers may follow. Numbers that are not used are a, b, c.
 STYLES = {
-    "atomic": "id type x y z",
-    "charge": "id type q x y z",
-    "molecular": "id mol type x y z",
-    "full": "id mol type q x y z",
-    "angle": "id mol type x y z",
-    "bond": "id mol type x y z",
-    "body": "id type flag mass x y z",
-    "dipole": "id type q x y z mux muy muz",
-    "dpd": "id type theta x y z",
-    "electron": "id type q spin radius x y z",
-    "ellipsoid": "id type flag density x y z",
-    "line": "id mol type flag density x y z",
-    "peri": "id type volume density x y z",
-    "sphere": "id type diameter density x y z",
-    "template": "id type mol index atom x y z",
-    "tri": "id mol type flag density x y z",
+    style: columns.split()
+    for columns, styles in {
+        "id type x y z": "atomic",
+        "id type q x y z": "charge dpd peri",
+        "id mol type x y z": "molecular angle bond",
+        "id mol type q x y z": "full",
+        "id type a b x y z": "sphere ellipsoid body",
+        "id type q a b x y z": "electron",
+        "id type q x y z a b c": "dipole",
+        "id mol type a b x y z": "line tri",
+        "id type mol a b x y z": "template",
+    }.items()
+    for style in styles.split()
 }
 #: Styles by which a section Atoms without a style is read, where only one of them fits.
 GUESSED = ("atomic", "charge", "molecular", "full")
 #: Names of columns in a comment after Atoms.
 COLUMN = {"atom-id": "id", "mol-id": "mol", "molecule-id": "mol", "molecule": "mol", "atom-type": "type", "charge": "q"}
-UNITS = re.compile(r"\b(real|metal|si|cgs|electron)\b")
+UNITS = re.compile(r"units\s*=?\s*(real|metal|si|cgs|electron)\b")
 #: Coordinates in a dump: as they are, unwrapped, and both in units of the edges.
 COORDINATES = (("x", "y", "z"), ("xs", "ys", "zs"), ("xu", "yu", "zu"), ("xsu", "ysu", "zsu"))
 
@@ -80,6 +78,7 @@ def _sections(lines: list[str]) -> tuple[list[Row], dict[str, str], dict[str, li
 
 
 def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, list[Row]], atom_types) -> Atoms:
+    """The atoms in order of their numbers. style: the comment after Atoms"""
     rows = sections["Atoms"]
     labels = {row.words[0]: row.words[1] for row in sections.get("Atom Type Labels", []) if len(row.words) == 2}
     number_of = {label: number for number, label in labels.items()}
@@ -90,7 +89,8 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
         if kind not in names and len(row.comment.split()) == 1:
             names[kind] = row.comment
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
-    known = {*mass_of, *labels, *number_of, *map(str, range(1, 1 + (whole_number(declared) or 0)))}
+    numbered = range(1, 1 + min(whole_number(declared) or 0, len(rows)))
+    known = {*mass_of, *labels, *number_of, *map(str, numbered)}
     column = _columns(path, style, rows, known)
     width, whole = len(column), [column[name] for name in ("id", "mol") if name in column]
     for line, words, _ in rows:
@@ -130,25 +130,22 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
         none = (0, ["nan"] * 3)
         given = [moving.get(row.words[column["id"]], none) for row in rows]
         velocity = table(path, given, "an atom and its three velocities")
-    units = UNITS.search(title) if re.search(r"\bunits\b", title) else None
-    return _in_our_units(
-        found, velocity, units[1] if units else None, "its first line does not say its units ('units = real')"
-    )
+    return _in_our_units(found, velocity, title, "its first line does not say its units ('units = real')")
 
 
 def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[str, int]:
     """The column of what each atom has: by the style or the names of columns after Atoms, else as the only one that
     fits. Raises StructureError."""
     words = [COLUMN.get(word, word) for word in re.split(r"[\s,]+", style.lower())]
-    width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"].split()
+    width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"]
     if words[0] == "hybrid":
-        columns = list(dict.fromkeys([*basic, *(name for part in words[1:] for name in STYLES.get(part, "").split())]))
+        columns = list(dict.fromkeys([*basic, *(name for part in words[1:] for name in STYLES.get(part, ()))]))
     elif words[0] in STYLES:
-        columns = STYLES[words[0]].split()
+        columns = STYLES[words[0]]
     elif set(basic) <= set(words):
         columns = words
     else:
-        fitting = [STYLES[name].split() for name in GUESSED if _fits(STYLES[name].split(), rows, known)]
+        fitting = [STYLES[name] for name in GUESSED if _fits(STYLES[name], rows, known)]
         if len(fitting) != 1:
             raise StructureError(
                 str(path),
@@ -222,31 +219,29 @@ def _residues(numbers_of: Iterable[str]) -> list[tuple]:
     return [(number, "") for number in found] if any(found) else []
 
 
-def _in_our_units(found: Atoms, velocity: np.ndarray | None, units: str | None, unknown: str) -> Atoms:
-    """Atoms in Å, ps and u. Without units the lengths are in Å, and velocities are not used."""
+def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
+    """Atoms in Å, ps and u. Where the title names no units, lengths are in Å, and velocities are not used."""
     from ase.calculators.lammps import convert
 
-    from rigidmd.assemble.ase_formats import ASE_VELOCITY
-
-    if units is None:
+    if (units := UNITS.search(title)) is None:
         more = [] if velocity is None else [f"{unknown}: its velocities are not used"]
         return found._replace(notes=[*found.notes, *more])
 
     def converted(values, quantity):
-        return None if values is None else convert(values, quantity, units, "ASE")
+        return None if values is None else convert(values, quantity, units[1], "ASE")
 
     speed = converted(velocity, "velocity")
     return found._replace(
         position=converted(found.position, "distance"),
         cell=converted(found.cell, "distance"),
         masses=converted(found.masses, "mass"),
-        velocity=None if speed is None else speed * ASE_VELOCITY,
+        velocity=None if speed is None else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
     )
 
 
 def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
     """The frames of a text dump (`dump custom` or `dump atom`)."""
-    units = next((lines[k + 1].strip() for k, line in enumerate(lines[:-1]) if line.startswith("ITEM: UNITS")), None)
+    units = next((lines[k + 1].strip() for k, line in enumerate(lines[:-1]) if line.startswith("ITEM: UNITS")), "")
     starts = [k for k, line in enumerate(lines) if line.startswith("ITEM: TIMESTEP")]
     return [
         partial(_dump_frame, path, lines[first:last], first, units, atom_types)
@@ -254,7 +249,7 @@ def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -
     ]
 
 
-def _dump_frame(path: Path, lines: list[str], first: int, units: str | None, atom_types) -> Atoms:
+def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types) -> Atoms:
     """The frame in lines that follow line number `first`."""
     at = {" ".join(line.split()[1:3]): k for k, line in enumerate(lines) if line.startswith("ITEM: ")}
     atoms = next((k for k, line in enumerate(lines) if line.startswith("ITEM: ATOMS")), None)
@@ -289,15 +284,15 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str | None, ato
     position = of(*there)
     if there[0].startswith("xs"):
         position = low + position @ cell
-    flags, notes = lines[begin].split()[-3:], []
-    if not all("p" in flag for flag in flags if re.fullmatch(r"[pfsm]{2}", flag)):
-        axes = ", ".join(x for x, flag in zip("abc", flags, strict=True) if "p" in flag)
+    flags, notes = re.findall(r"(?<=\s)[pfsm]{2}(?=\s|$)", lines[begin]), []
+    if not all("p" in flag for flag in flags):
+        axes = ", ".join(x for x, flag in zip("abc", flags, strict=False) if "p" in flag)
         notes = [f"its cell is periodic along {axes} only and is not used"] if axes else []
         cell = None
     masses = of("mass")[:, 0] if "mass" in columns else None
     named = texts("element") if "element" in columns else []
     elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
-    types = texts("type") if "type" in columns else named
+    types = texts("type") if "type" in columns else named or [""] * count
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
         elements = [element[mass] for mass in masses.tolist()]
@@ -315,18 +310,22 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str | None, ato
         notes,
     )
     velocity = of("vx", "vy", "vz") if {"vx", "vy", "vz"} <= set(columns) else None
-    known = units if units and UNITS.fullmatch(units) else None
-    return _in_our_units(found, velocity, known, "it does not say its units (dump_modify units yes)")
+    return _in_our_units(found, velocity, f"units {units}", "it does not say its units (dump_modify units yes)")
 
 
 def _dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
     """The origin (3,) and the cell (3, 3) of a dump."""
-    bounds = table(path, rows, "the bounds of the box")
-    if kinds[:1] == ["abc"]:
+    bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
+    if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
+        told = f"line {rows[0][0]}: expected the bounds of the box along x, found {' '.join(rows[0][1])!r}"
+        raise StructureError(str(path), [told])
+    if general:
         return bounds[:, 3], bounds[:, :3]
-    low, high = bounds[:, 0], bounds[:, 1]
-    xy, xz, yz = bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)
-    # the bounds are those of the smallest upright box around a slanted cell
+    return box_in_bounds(bounds[:, 0], bounds[:, 1], *(bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)))
+
+
+def box_in_bounds(low: np.ndarray, high: np.ndarray, xy: float, xz: float, yz: float) -> tuple[np.ndarray, np.ndarray]:
+    """The origin (3,) and the cell (3, 3) of a dump, whose bounds are those of the smallest upright box around it."""
     low = low - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
     high = high - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
     cell = np.diag(high - low)

@@ -1,6 +1,7 @@
 """Which atoms form which molecule: by residues, or else by bonding distance. Rigid templates are fitted to them."""
 
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Hashable, Iterable
 from itertools import groupby
 from math import inf
 from typing import Any, NamedTuple
@@ -270,8 +271,7 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     wanted = [(molecule.site_names[s], labels[s]) for s in sites]
     if names == molecule.site_names and all(kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites):
         # as in the files of a run, whatever names sites share
-        order, same = sites.tolist(), np.array([[labels[s] == labels[t] for t in sites] for s in sites])
-        return _Candidate(k, order, [np.eye(len(sites), dtype=bool), same], nameless=False)
+        return _Candidate(k, sites.tolist(), [np.eye(len(sites), dtype=bool), _same(labels[s] for s in sites)], False)
     places = [i for i, kind in enumerate(kinds) if kind != "X"]
     if len(places) > len(sites):
         massless = {name for name, mass in zip(molecule.site_names, molecule.masses, strict=True) if mass == 0}
@@ -286,16 +286,18 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     count, count_wanted = Counter(there), Counter(wanted)
     shared = {atom for atom in count if count[atom] == count_wanted[atom]}
     group, group_wanted = ([key if key in shared else key[1] for key in keys] for keys in (there, wanted))
-    waiting: dict[Any, list[int]] = {}
+    queues: dict[Any, deque[int]] = {key: deque() for key in group_wanted}
     for place, key in zip(places, group, strict=True):
-        waiting.setdefault(key, []).append(place)
-    queues = {key: iter(atoms) for key, atoms in waiting.items()}
-    order = [next(queues[key]) for key in group_wanted]
-    by_name, by_element = (
-        np.array([[one == other for other in keys] for one in keys])
-        for keys in (group_wanted, [label for _, label in wanted])
-    )
-    return _Candidate(k, order, [by_name, by_element], nameless=False)
+        queues[key].append(place)
+    order = [queues[key].popleft() for key in group_wanted]
+    return _Candidate(k, order, [_same(group_wanted), _same(label for _, label in wanted)], nameless=False)
+
+
+def _same(keys: Iterable[Hashable]) -> np.ndarray:
+    """Which of n keys are the same (n, n)."""
+    numbers: dict[Hashable, int] = {}
+    number = np.array([numbers.setdefault(key, len(numbers)) for key in keys])
+    return number[:, None] == number
 
 
 def _place(atoms, runs, members, candidates, species, cell, tolerance, found: Matched, faults: dict) -> None:

@@ -86,7 +86,8 @@ def read_atoms(
         size = path.stat().st_size if held is None else len(held)
         if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
             raise StructureError(str(path), [f"not enough memory: {fault}"])
-        atoms = _choose(path, _frames(path, atom_types, held), frame)()
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            atoms = _choose(path, _frames(path, atom_types, held), frame)()
     if len(atoms.position) == 0:
         raise StructureError(str(path), ["holds no atoms"])
     for what, values in (("position", atoms.position), ("velocity", atoms.velocity), ("cell", atoms.cell)):

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.lammps_formats import box_in_bounds
 from rigidmd.errors import EngineError
 
 #: Of a dump custom.
@@ -56,10 +57,6 @@ def read_dump(path: Path) -> Dump:
             at += 8 * count
     except (struct.error, ValueError) as error:
         raise EngineError(f"LAMMPS wrote a dump that cannot be read: {error}") from None
-    # the bounds are those of the smallest upright box around a slanted cell
-    low = np.array([xlo - min(0.0, xy, xz, xy + xz), ylo - min(0.0, yz), zlo])
-    high = np.array([xhi - max(0.0, xy, xz, xy + xz), yhi - max(0.0, yz), zhi])
-    cell = np.diag(high - low)
-    cell[1, 0], cell[2, 0], cell[2, 1] = xy, xz, yz
+    low, cell = box_in_bounds(np.array([xlo, ylo, zlo]), np.array([xhi, yhi, zhi]), xy, xz, yz)
     table = np.concatenate(rows)
     return Dump(step, low, cell, table[table[:, 0].argsort()])
