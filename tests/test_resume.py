@@ -478,6 +478,17 @@ def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys
         assert everything(run) == before
 
 
+def test_force_replaces_only_what_an_export_has_written(again, capsys):
+    made = again / "made"
+    command = ["export", str(again / "water.toml"), "--to", "gromacs", "-o", str(made)]
+    assert cli.main(command) == 0 and cli.main([*command, "--force"]) == 0
+    change(made / ".rigidmd-export", "run.sh\n", "")
+    (made / "run.sh").write_text("precious")
+    before = everything(made)
+    assert cli.main([*command, "--force"]) == 2
+    assert "run.sh exists, was not written by rigidmd" in capsys.readouterr().err and everything(made) == before
+
+
 def test_a_callback_that_changes_the_directory(again, monkeypatch):
     """Paths are those of the start: neither another run is overwritten nor are files missing."""
     elsewhere = again / "elsewhere"
