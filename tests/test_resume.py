@@ -656,7 +656,7 @@ FREE = re.compile(
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    [("molecules", 120), ("verlet", 300), ("dop853", 300)]
+    [("molecules", 25), ("verlet", 60), ("dop853", 60)]
     + [pytest.param(kind, 10**6, marks=pytest.mark.slow) for kind in ("molecules", "verlet", "dop853", "rk4")],
 )
 def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
