@@ -478,6 +478,17 @@ def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys
         assert everything(run) == before
 
 
+def test_force_replaces_only_what_an_export_has_written(again, capsys):
+    made = again / "made"
+    command = ["export", str(again / "water.toml"), "--to", "gromacs", "-o", str(made)]
+    assert cli.main(command) == 0 and cli.main([*command, "--force"]) == 0
+    change(made / ".rigidmd-export", "run.sh\n", "")
+    (made / "run.sh").write_text("precious")
+    before = everything(made)
+    assert cli.main([*command, "--force"]) == 2
+    assert "run.sh exists, was not written by rigidmd" in capsys.readouterr().err and everything(made) == before
+
+
 def test_a_callback_that_changes_the_directory(again, monkeypatch):
     """Paths are those of the start: neither another run is overwritten nor are files missing."""
     elsewhere = again / "elsewhere"
@@ -645,7 +656,7 @@ FREE = re.compile(
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    [("molecules", 120), ("verlet", 300), ("dop853", 300)]
+    [("molecules", 25), ("verlet", 60), ("dop853", 60)]
     + [pytest.param(kind, 10**6, marks=pytest.mark.slow) for kind in ("molecules", "verlet", "dop853", "rk4")],
 )
 def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):

@@ -55,9 +55,9 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: 
         raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")
 
 
-def check_names(folder: Path, names: Iterable[str]) -> None:
+def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
     """Raise OutputError if a file of one of these names is in a folder whose marker does not list it."""
-    known = {*written_by_runs(folder), MARKER, LOCK}
+    known = {*written_by_runs(folder, marker), marker, LOCK}
     if strange := [name for name in names if name not in known and os.path.lexists(folder / name)]:
         raise OutputError(
             f"{folder / strange[0]} exists, was not written by rigidmd, and would be replaced; "
@@ -169,13 +169,8 @@ def is_empty(folder: Path) -> bool:
     return not folder.exists() or all(path.name == LOCK for path in folder.iterdir())
 
 
-def written_by_runs(folder: Path) -> list[str]:
+def written_by_runs(folder: Path, marker: str = MARKER) -> list[str]:
     """Files that an earlier run in this folder may have written; only plain names, whatever its marker contains."""
-    marker = folder / MARKER
-    if not marker.is_file():
-        return []
-    return [
-        name
-        for name in marker.read_text(encoding="utf-8", errors="replace").split("\n")
-        if name and Path(name).name == name
-    ]
+    path = folder / marker
+    names = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
+    return [name for name in names if name and Path(name).name == name]

@@ -1,6 +1,7 @@
 """A scene as a folder that another engine runs by itself."""
 
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -8,7 +9,7 @@ from typing import NamedTuple
 from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.output.folder import SCENE, write_marker
+from rigidmd.output.folder import SCENE, check_names, write_marker, written_by_runs
 from rigidmd.output.scene_file import input_names, write_scene
 from rigidmd.peers.portrait import Portrait, portrait
 from rigidmd.run import MolecularSimulation
@@ -58,10 +59,14 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     state = start_of(system)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in _written(folder):
-            (folder / name).unlink(missing_ok=True)
-        write_scene(folder, system.scene)
-        names = [SCENE, *input_names(system.scene).values(), *writer.write(folder, drawn, state)]
+        with tempfile.TemporaryDirectory(prefix=".export", dir=folder) as made:
+            write_scene(Path(made), system.scene)
+            names = [SCENE, *input_names(system.scene).values(), *writer.write(Path(made), drawn, state)]
+            check_names(folder, names, MARKER)
+            for name in written_by_runs(folder, MARKER):
+                (folder / name).unlink(missing_ok=True)
+            for name in names:
+                (Path(made) / name).replace(folder / name)
         write_marker(folder, names, MARKER)
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
@@ -108,10 +113,3 @@ def _check(folder: Path, force: bool) -> None:
         parent = parent.parent
     if not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")
-
-
-def _written(folder: Path) -> list[str]:
-    """Files of an earlier export; plain names only, whatever its marker contains."""
-    marker = folder / MARKER
-    names = marker.read_text(encoding="utf-8", errors="replace").splitlines() if marker.is_file() else []
-    return [name for name in names if name and Path(name).name == name]
