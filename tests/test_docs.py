@@ -183,7 +183,7 @@ class Reader:
 def parse(arguments: list[str]) -> argparse.Namespace:
     """The options of a command line, its scene read with them if it is there. Fails where the commands would."""
     try:
-        options = cli._parser().parse_args(arguments)
+        options = cli._parsed(arguments)
     except SystemExit as error:
         pytest.fail(f"rigidmd {shlex.join(arguments)}: exit code {error.code}")
     scene = getattr(options, "scene", None)
@@ -231,7 +231,7 @@ def section(title: str) -> str:
     return text[: after.start()] if after else text
 
 
-COMMANDS = next(a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+_, COMMANDS = cli._parser()
 PLACEHOLDERS = {
     "SCENE": "scene.toml", "[NAME]": "", "[CHAPTER]": "", "NAME": "x", "CHAPTER": "x", "KEY=VALUE": "a=1", "KEY=": "a=",
     "N": "1", "PS": "1", "DIR": "x", "FILE": "x",

@@ -16,6 +16,7 @@ from rigidmd.errors import SceneError
 from rigidmd.measure.columns import BODY, BODY_COLUMNS
 from rigidmd.measure.observables import Reading
 from rigidmd.measure.samples import COLUMNS
+from rigidmd.molecules import load_model
 from rigidmd.output.log import TENSOR
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
@@ -145,6 +146,23 @@ def test_without_pandas_one_sentence_says_so(monkeypatch):
         results.to_dataframe()
 
 
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), -1.0])
+def test_times_from_python_are_finite(time):
+    scene = Scene.read(TOP, SHORT)
+    with pytest.raises(ValueError, match=r"walltime is .*, must be a finite number of seconds, not negative"):
+        Simulation(scene, walltime=time)
+    with pytest.raises(ValueError, match=r"the interval of Every is .*, must be a finite time above 0"):
+        Every(time, print)
+
+    class Seldom(rigidmd.Observer):
+        interval = time
+
+    with pytest.raises(ValueError, match=r"the interval of Seldom is .*, must be a finite time above 0"):
+        Simulation(scene, observers=Seldom()).run()
+    with pytest.raises(TypeError, match="3 is not a Simulation"):
+        rigidmd.run_together([3])  # pyright: ignore[reportArgumentType]
+
+
 def test_values_show_what_they_are(tmp_path):
     water = Scene.read(ROOT / "systems" / "water.toml")
     assert repr(water) == "<MolecularScene water: 216 spce; nvt 10 ps, nve 20 ps>"
@@ -160,6 +178,13 @@ def test_values_show_what_they_are(tmp_path):
     written = Simulation(scene, folder)
     assert f"writes to {folder}" in repr(written)
     assert f"5 files in {folder}" in repr(written.run())
+    states = [simulation.system, simulation.state, results.samples, results.system, load_model("tip4p2005")]
+    seen = Simulation(scene, observers=Every(0.01, lambda moment: states.append(moment)))
+    seen.run()
+    assert type(states[-1]).__name__ in repr(states[-1])
+    for value in (water, scene, simulation, results, *states):
+        assert len(str(value)) < 700
+        assert "\n" not in str(value)
     for value in (water, scene, simulation, results):
         assert len(repr(value)) < 250
         assert "\n" not in repr(value)
