@@ -197,8 +197,8 @@ class BodySimulation(Simulation):
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes that were issued as warnings."""
-        return body_summary_text(results.summary, self._issued)
+        """The summary as text, without the notes of the introduction and those that were issued as warnings."""
+        return body_summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def start_energy(self) -> dict:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""
