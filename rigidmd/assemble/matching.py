@@ -149,7 +149,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
         if residue and residue[1] in points and residue[1] not in shared:
             return points[residue[1]]
         if not residue or residue[1] == name:  # an ion or a noble gas: NA, CL, AR, SOD
-            ion = CHARMM_IONS.get(name.upper())
+            ion = CHARMM_IONS.get(name.upper(), "")
             name = ion if ion in vocabulary else name.capitalize() if residue else name
         guess = isotope(element_of(name, vocabulary))
         return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
