@@ -663,7 +663,7 @@ def _own_model(options: argparse.Namespace) -> int:
     from rigidmd.assemble.own_model import own_model
     from rigidmd.errors import MoleculeError
     from rigidmd.output.model_file import write_model
-    from rigidmd.output.target import check_target
+    from rigidmd.output.write import check_target
 
     if options.model is not None:
         faults = [f"--from writes a model of your own: leave out {options.model}, or name the model by --name"]

@@ -179,7 +179,7 @@ def test_what_range_is_shown(values, stage, wanted):
     assert found == (wanted and pytest.approx(wanted))
 
 
-def test_as_many_integrators_as_there_are_are_told_apart(monkeypatch, tmp_path):
+def test_as_many_integrators_as_there_are_are_told_apart():
     subject, _ = body_subject(Scene.read(ROOT / "systems" / "heavy_top_3.toml"), 0.1)
     names = [*SCHEMES, *COMPARATORS]
     trials = [
@@ -187,10 +187,7 @@ def test_as_many_integrators_as_there_are_are_told_apart(monkeypatch, tmp_path):
         for n, name in enumerate(names)
         for k in (1, 2, 3)
     ]
-    figures = []
-    monkeypatch.setattr(precision_report, "save_figure", lambda figure, *_, **__: figures.append(figure))
-    precision_report.draw(tmp_path / "precision.png", Precision(subject, trials, 10, 1e-30))
-    for axis in figures[0].axes:
+    for axis in precision_report.figure_of(Precision(subject, trials, 10, 1e-30)).axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names
         styles = {(line.get_color(), line.get_linestyle(), str(line._dash_pattern)) for line in curves}

@@ -1,9 +1,8 @@
 """Files of analyses in the folder of a run: analysis.json, a CSV file and a figure for each curve; and reading them."""
 
 import csv
-import io
-import json
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,11 @@ from pydantic import BaseModel, ConfigDict
 from rigidmd.analyse.findings import Curve, Finding, Value
 from rigidmd.analyse.history import History
 from rigidmd.analyse.registry import ORDER, place
-from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
-from rigidmd.output.figure import COLORS, FAINT, INK, drawing, few_decades, save_figure, thin_series
+from rigidmd.output.figure import COLORS, FAINT, INK, bare_axis, few_decades, thin_series, write_figure
 from rigidmd.output.folder import add_to_folder, written_by_runs
 from rigidmd.output.run_files import Bounded, read_columns, read_json
+from rigidmd.output.write import write_csv, write_json
 
 ANALYSIS = "analysis.json"
 #: Inches of a figure, and curves that one holds.
@@ -63,7 +62,7 @@ def write_findings(
         files = []
         for curve in finding.curves:
             path, picture = folder / f"{curve.file}.csv", folder / f"{curve.file}.png"
-            write_text(path, _text(curve))
+            write_csv(path, _rows(curve), csv.QUOTE_NONNUMERIC)
             pictures[picture] = curve
             written += [path, picture]
             files += [path.name, picture.name]
@@ -78,10 +77,9 @@ def write_findings(
     for name, why in failed.items():
         entries[name] = {"about": name, "values": [], "notes": [why], "curves": [], "files": [], "stretch": stretch}
     entries = dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
-    write_text(folder / ANALYSIS, json.dumps({"analyses": entries}, indent=1, ensure_ascii=False) + "\n")
+    write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for picture, curve in pictures.items():
-        with drawing(picture) as temporary:
-            save_figure(drawn(curve), temporary, dpi=150)
+        write_figure(picture, partial(drawn, curve))
     return [folder / ANALYSIS, *(path for path in written if path.is_file())]
 
 
@@ -89,20 +87,15 @@ def _described(curve: Curve) -> dict[str, Any]:
     return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level, "bars": curve.bars}
 
 
-def _text(curve: Curve) -> str:
-    """The curve as CSV: the axis, each column, and after it its error where it has one."""
+def _rows(curve: Curve) -> list[list[Any]]:
+    """Rows of the curve's file: the axis, each column, and after it its error where it has one."""
     columns = {curve.axis[0]: curve.axis[1]}
     for header, values in curve.columns.items():
         columns[header] = values
         if header in curve.errors:
             columns[f"{header} error"] = curve.errors[header]
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(
-        [float(f"{x:.9g}") if np.isfinite(x) else None for x in row] for row in zip(*columns.values(), strict=True)
-    )
-    return stream.getvalue()
+    lines = zip(*columns.values(), strict=True)
+    return [list(columns), *([float(f"{x:.9g}") if np.isfinite(x) else None for x in line] for line in lines)]
 
 
 class _Curve(BaseModel):
@@ -201,9 +194,7 @@ def drawn(curve: Curve):
             few_decades(line)
     axis.set_xlabel(header.replace("(A)", "(Å)").replace("1/A", "1/Å"), fontsize=9, color=INK)
     axis.set_ylabel(curve.label, fontsize=9, color=INK)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=8, colors=INK)
-    axis.spines[:].set_color(INK)
+    bare_axis(axis, labelsize=8)
     if len(shown) > 1 and not curve.bars:
         figure.legend(
             *axis.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=7,

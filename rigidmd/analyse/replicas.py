@@ -1,7 +1,6 @@
 """Analyses of all runs of a sweep: each run by itself, then means over replicas with the errors that these show."""
 
 import csv
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,12 +10,12 @@ import numpy as np
 from rigidmd.analyse.all import Task, analyse_folder
 from rigidmd.analyse.files import stretch_of, write_findings
 from rigidmd.analyse.findings import Curve, Finding, Value
-from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
 from rigidmd.measure.means import error_of_mean
 from rigidmd.output.folder import add_to_folder
 from rigidmd.output.sweep_folder import FINISHED, Manifest, Point, read_manifest, state_on_disk
 from rigidmd.output.sweep_names import in_words, short_keys
+from rigidmd.output.write import write_csv
 
 ANALYSES = "analysis.csv"
 
@@ -210,9 +209,7 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
             line += [None, None] if value is None else [_number(value.value), _number(value.error)]
         lines.append(line)
     add_to_folder(folder, [ANALYSES])
-    stream = io.StringIO(newline="")
-    csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n").writerows(lines)
-    write_text(folder / ANALYSES, stream.getvalue())
+    write_csv(folder / ANALYSES, lines, csv.QUOTE_NONNUMERIC)
 
 
 def _cell(value: Any) -> Any:

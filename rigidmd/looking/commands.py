@@ -72,7 +72,7 @@ def _target(options: argparse.Namespace, default: str, endings: tuple[str, ...])
     Raises OutputError.
     """
     from rigidmd.output.folder import add_to_folder, check_is_run
-    from rigidmd.output.target import check_target
+    from rigidmd.output.write import check_target
 
     folder = Path(options.folder)
     check_is_run(folder)
@@ -123,7 +123,7 @@ def _film(options: argparse.Namespace) -> int:
 
 def _gallery(options: argparse.Namespace) -> int:
     from rigidmd.looking.gallery import INDEX, chosen, write_gallery
-    from rigidmd.output.target import check_target
+    from rigidmd.output.write import check_target
 
     folder = Path(options.output)
     bodies = chosen(options.names)

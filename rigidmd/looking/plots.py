@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, shown_range, thin_series
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, bare_axis, shown_range, thin_series
 from rigidmd.output.page import figure as figure_part
 from rigidmd.output.record import Record
 
@@ -113,9 +113,7 @@ def draw_panel(axis, record: Record, panel: Panel) -> None:
     for k in np.flatnonzero(stages[1:] != stages[:-1]):
         axis.axvline(time[k], color=FAINT, lw=0.6, ls=":")
     axis.margins(x=0)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=8, colors=INK)
-    axis.spines[:].set_color(INK)
+    bare_axis(axis, labelsize=8)
     if len(panel.curves) > 1:
         axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.02), handlelength=1.2,
                     borderaxespad=0.2, labelcolor=INK)  # fmt: skip

@@ -1,14 +1,12 @@
 """What `rigidmd precision --averages` found: a table, sentences, precision.csv and .json, averages.png and .html."""
 
-import csv
-import json
 from itertools import groupby
 from pathlib import Path
 
-from rigidmd.core.files import whole_file, write_text
 from rigidmd.measure.bias import SHARE, AverageRun, Averages, Quantity
-from rigidmd.output.figure import FAINT, INK, curve_style, drawing, save_figure
+from rigidmd.output.figure import FAINT, INK, bare_axis, curve_style, drawing, write_figure
 from rigidmd.output.report import signed
+from rigidmd.output.write import columns_text, write_csv, write_json
 
 FILES = ("precision.csv", "precision.json", "averages.png", "averages.html")
 
@@ -63,13 +61,8 @@ def brief_rows(found: Averages) -> list[list[str]]:
 
 def table_text(found: Averages) -> str:
     """The table as a person reads it."""
-    lines = [brief_headers(found), *brief_rows(found)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     text = f"bias of averages over {found.sampled:g} ps of {found.stage} (U in kT per degree of freedom)\n"
-    return text + "\n".join(
-        "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
-        for line in lines
-    )
+    return text + columns_text([brief_headers(found), *brief_rows(found)])
 
 
 def advice(found: Averages) -> list[str]:
@@ -132,12 +125,10 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
     """All files; the paths written."""
     from rigidmd.output.averages_page import averages_page
 
-    with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(headers(found))
-        writer.writerows(row(found, run) for run in found.runs)
-    write_text(folder / FILES[1], json.dumps(as_data(found, command), indent=2, allow_nan=False) + "\n")
-    draw(folder / FILES[2], found)
+    write_csv(folder / FILES[0], [headers(found), *(row(found, run) for run in found.runs)])
+    write_json(folder / FILES[1], as_data(found, command), indent=2, allow_nan=False)
+    title = f"{found.name}: bias of averages over {found.sampled:g} ps"
+    write_figure(folder / FILES[2], lambda: figure_of(found), title)
     with drawing(folder / FILES[3]) as temporary:
         temporary.write_text(averages_page(found, command), encoding="utf-8")
     return [folder / name for name in FILES if (folder / name).is_file()]
@@ -192,15 +183,6 @@ def _told(found: Averages, run: AverageRun) -> dict:
     }
 
 
-def draw(path: Path, found: Averages) -> None:
-    """averages.png."""
-    with drawing(path) as temporary:
-        figure = figure_of(found)
-        title = f"{found.name}: bias of averages over {found.sampled:g} ps"
-        figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
-        save_figure(figure, temporary, dpi=150)
-
-
 def figure_of(found: Averages):
     """Bias against the step, a panel a quantity, with error bars and the band within 1 %."""
     from rigidmd.output.picture import Picture
@@ -226,9 +208,7 @@ def figure_of(found: Averages):
         axis.annotate(f"band: {SHARE:.0%} of {scale(quantity)}", (0, 1), (0, 4), xycoords="axes fraction",
                       textcoords="offset points", fontsize=7, color=FAINT)  # fmt: skip
         axis.set_xlim(left=0)
-        axis.tick_params(colors=INK)
-        axis.spines[:].set_color(INK)
-        axis.spines[["top", "right"]].set_visible(False)
+        bare_axis(axis)
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
     for axis in axes[max(0, len(shown) - columns) : len(shown)]:

@@ -1,10 +1,11 @@
 """Shared by all figures: writing, and styles for many curves."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,22 @@ def save_figure(figure, target, **options) -> None:
                 line.set_path_effects([InPieces()])
     with settings({"agg.path.chunksize": 0}):
         figure.savefig(target, **options)
+
+
+def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
+    """Draw a figure and write it under a title; see `drawing`."""
+    with drawing(path) as temporary:
+        figure = draw()
+        if title:
+            figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
+        save_figure(figure, temporary, dpi=150)
+
+
+def bare_axis(axis, **ticks) -> None:
+    """Draw an axis without a frame: two sides, and ticks with these settings, all in ink."""
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[:].set_color(INK)
+    axis.tick_params(colors=INK, **ticks)
 
 
 def thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:

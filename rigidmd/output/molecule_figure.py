@@ -9,7 +9,7 @@ from rigidmd.core.files import whole_file
 from rigidmd.molecules import Molecule
 from rigidmd.output.figure import COOL, FAINT, INK, save_figure, settings
 from rigidmd.output.molecule_report import COVALENT, bonds, short_source
-from rigidmd.output.target import check_target
+from rigidmd.output.write import check_target
 
 ENDINGS = (".png", ".svg", ".pdf")
 #: Colours of the elements, after Corey, Pauling and Koltun, and of all others.

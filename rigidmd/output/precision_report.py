@@ -1,16 +1,15 @@
 """Report of `rigidmd precision`: a table, advice in words, precision.csv, .png and a self-contained page."""
 
-import csv
 from math import hypot
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
 from rigidmd.measure.trials import Precision, Reached, Trial
-from rigidmd.output.figure import FAINT, INK, curve_style, drawing, few_decades, save_figure
+from rigidmd.output.figure import FAINT, INK, bare_axis, curve_style, drawing, few_decades, write_figure
 from rigidmd.output.report import signed
+from rigidmd.output.write import columns_text, write_csv
 
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
 #: Shorter titles, so that the table fits a terminal.
@@ -109,10 +108,7 @@ def _columns(rows: list[list]) -> str:
     """Rows as text in columns; columns without values are omitted."""
     lines = [[short(cell) for cell in line] for line in rows]
     kept = [k for k in range(len(lines[0])) if any(line[k] not in ("", "-") for line in lines[1:])]
-    widths = [max(len(line[k]) for line in lines) for k in kept]
-    text = ["  ".join(line[k].ljust(w) if k == 0 else line[k].rjust(w) for k, w in zip(kept, widths, strict=True))
-            for line in lines]  # fmt: skip
-    return "\n".join(text)
+    return columns_text([[line[k] for k in kept] for line in lines])
 
 
 def short(cell) -> str:
@@ -260,29 +256,15 @@ def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
     """Write all files. Returns their paths."""
     from rigidmd.output.precision_page import precision_page
 
-    with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(headers(found))
-        writer.writerows(row(found, trial) for trial in found.trials)
+    write_csv(folder / FILES[0], [headers(found), *(row(found, trial) for trial in found.trials)])
     written: list[str] = list(FILES[:3])
-    if sampled := [trial for trial in found.trials if trial.averages]:
+    if sampled := [average_row(found, trial) for trial in found.trials if trial.averages]:
         written.append(FILES[3])
-        with whole_file(folder / FILES[3]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(average_headers(found))
-            writer.writerows(average_row(found, trial) for trial in sampled)
-    draw(folder / FILES[1], found)
+        write_csv(folder / FILES[3], [average_headers(found), *sampled])
+    write_figure(folder / FILES[1], lambda: figure_of(found), f"{found.subject.name}: error against run time")
     with drawing(folder / FILES[2]) as temporary:
         temporary.write_text(precision_page(found, command), encoding="utf-8")
     return [folder / name for name in written if (folder / name).is_file()]
-
-
-def draw(path: Path, found: Precision) -> None:
-    """precision.png."""
-    with drawing(path) as temporary:
-        figure = figure_of(found)
-        figure.suptitle(f"{found.subject.name}: error against run time", color=INK, x=0.01, ha="left", fontsize=11)
-        save_figure(figure, temporary, dpi=150)
 
 
 def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
@@ -329,9 +311,7 @@ def figure_of(found: Precision):
         axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
         _label_steps(axis, [(t.time / s.span, getattr(t, error), t.timestep) for t in front])
         axis.set_title(title, loc="left", fontsize=9, color=INK)
-        axis.tick_params(colors=INK, which="both")
-        axis.spines[:].set_color(INK)
-        axis.spines[["top", "right"]].set_visible(False)
+        bare_axis(axis, which="both")
         few_decades(axis.xaxis)
         few_decades(axis.yaxis)
     figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)

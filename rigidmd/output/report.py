@@ -1,6 +1,5 @@
 """Reports of a run: summary.json, the summary as text, and energy.png."""
 
-import json
 from collections.abc import Container
 from math import floor, isnan, log10
 from pathlib import Path
@@ -9,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.assemble.system import System
-from rigidmd.core.files import whole_file
 from rigidmd.measure.samples import Samples, moving
 from rigidmd.output.figure import COOL, FAINT, INK, WARM, shown_range, thin_series
+from rigidmd.output.write import write_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,10 +31,7 @@ NO_ERROR = "too short for an error"
 
 def write_summary(path: Path, summary: dict) -> None:
     """summary.json."""
-    with whole_file(path) as temporary:
-        temporary.write_text(
-            json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-        )
+    write_json(path, summary, indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def summary_text(summary: dict, known: Container[str] = ()) -> str:

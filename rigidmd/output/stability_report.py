@@ -1,15 +1,15 @@
 """Report of `rigidmd stability`: a table, failures in words, stability.csv, .md and a self-contained page."""
 
-import csv
 from collections import Counter
 from math import inf, isfinite, isnan
 from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.files import whole_file, write_text
+from rigidmd.core.files import write_text
 from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
-from rigidmd.output.figure import INK, curve_style, drawing, few_decades
+from rigidmd.output.figure import INK, bare_axis, curve_style, drawing, few_decades
+from rigidmd.output.write import columns_text, write_csv
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
@@ -59,14 +59,7 @@ def _short(x: float) -> str:
 
 def table_text(findings: list[Finding]) -> str:
     """The table as text."""
-    lines = [list(HEADERS), *(line for finding in findings for line in rows(finding))]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(HEADERS))]
-    return "\n".join(
-        "  ".join(
-            x.ljust(w) if k in (0, 1, 3, 7) else x.rjust(w) for k, (x, w) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    return columns_text([HEADERS, *(line for finding in findings for line in rows(finding))], left=(0, 1, 3, 7))
 
 
 def words(findings: list[Finding]) -> list[str]:
@@ -98,13 +91,9 @@ def write_stability(folder: Path, findings: list[Finding], command: str, machine
     """Write all files. Returns their paths."""
     from rigidmd.output.stability_page import stability_page
 
-    with whole_file(folder / FILES[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(
-            ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
-             "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]
-        )  # fmt: skip
-        writer.writerows(line for finding in findings for line in _csv_lines(finding))
+    titles = ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
+              "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
+    write_csv(folder / FILES[0], [titles, *(line for finding in findings for line in _csv_lines(finding))])
     write_text(folder / FILES[2], markdown(findings, command, machine))
     with drawing(folder / FILES[1]) as temporary:
         temporary.write_text(stability_page(findings, command, machine), encoding="utf-8")
@@ -161,9 +150,7 @@ def picture(finding: Finding, styles: dict[str, dict] | None = None):
             (_draw_trials if kind == "trials" else _draw_limits)(axis, finding, family, styles[family])
         axis.set_xscale("log" if _positive(axis) else "linear")
         axis.set_yscale("log")
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.spines[:].set_color(INK)
-        axis.tick_params(labelsize=7, colors=INK, which="both")
+        bare_axis(axis, labelsize=7, which="both")
         for line in (axis.xaxis, axis.yaxis):
             line.label.set(size=8, color=INK)
             if line.get_scale() == "log":

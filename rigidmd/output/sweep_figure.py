@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.output.figure import FAINT, INK, curve_style, drawing, save_figure
+from rigidmd.output.figure import FAINT, INK, bare_axis, curve_style, write_figure
 
 #: Inches of a panel; panels beside each other; curves in the legend.
 WIDTH, HEIGHT, ACROSS, MOST_NAMED = 4.4, 3.0, 2, 20
@@ -58,8 +58,7 @@ def draw_sweep(path: Path, title: str, axis: Axis, panels: list[Panel]) -> None:
             *grid.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8,
             labelcolor=INK,
         )  # fmt: skip
-    with drawing(path) as temporary:
-        save_figure(figure, temporary, dpi=150)
+    write_figure(path, lambda: figure)
 
 
 def _draw(place, axis: Axis, panel: Panel) -> None:
@@ -95,9 +94,7 @@ def _draw(place, axis: Axis, panel: Panel) -> None:
         place.set_yscale("log")
     elif not _is_tiny(panel):
         place.ticklabel_format(axis="y", useOffset=False)
-    place.spines[["top", "right"]].set_visible(False)
-    place.spines[:].set_color(INK)
-    place.tick_params(labelsize=8, colors=INK)
+    bare_axis(place, labelsize=8)
 
 
 def _spans_decades(panel: Panel) -> bool:

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rigidmd.core.files import write_text
 from rigidmd.errors import OutputError
 from rigidmd.output.folder import (
     LOCK,
@@ -23,6 +22,7 @@ from rigidmd.output.folder import (
 )
 from rigidmd.output.run_files import Bounded, Summary, read_json
 from rigidmd.output.sweep_names import point_name, short_keys
+from rigidmd.output.write import write_json
 from rigidmd.validation import settled
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
@@ -139,7 +139,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write sweep.json as a whole. Raises OutputError."""
-    write_text(folder / MANIFEST, json.dumps(asdict(manifest), indent=1) + "\n")
+    write_json(folder / MANIFEST, asdict(manifest), indent=1)
 
 
 def check_sweep_folder(folder: Path) -> None:

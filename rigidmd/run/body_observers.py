@@ -11,8 +11,8 @@ from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
 from rigidmd.output.body_figures import FIGURES, draw_motion
 from rigidmd.output.checkpoint import Checkpoint
 from rigidmd.output.folder import MOTION, MOTION_NPZ
-from rigidmd.output.motion_file import write_csv, write_npz
 from rigidmd.output.run_figures import body_figures
+from rigidmd.output.write import write_columns, write_npz
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
 from rigidmd.run.resuming import state_from
@@ -91,7 +91,7 @@ class MotionFiles(Observer):
     def end(self, run: "BodySimulation", results: "Results") -> None:
         if not isinstance(samples := results.samples, Motion):
             raise TypeError("these are samples of molecules")
-        write_csv(run.path(MOTION), samples.columns)
+        write_columns(run.path(MOTION), samples.columns)
         results.files.append(run.path(MOTION))
         if self._npz:
             write_npz(run.path(MOTION_NPZ), samples.columns)
@@ -99,7 +99,7 @@ class MotionFiles(Observer):
 
     def failed(self, run: "BodySimulation") -> str:
         """Save the motion so far."""
-        write_csv(run.path(MOTION), motion(run.system, self._sampler.snapshots).columns)
+        write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).columns)
         return f". The motion so far: {run.path(MOTION)}"
 
 

@@ -1,7 +1,6 @@
 """The table of a sweep: a line for each combination of values, with means and errors over its replicas."""
 
 import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import nan
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.analyse.source import production_of
-from rigidmd.core.files import whole_file
 from rigidmd.errors import RigidMDError
 from rigidmd.measure.columns import BODY_COLUMNS
 from rigidmd.measure.means import error_of_mean, mean, with_error
@@ -19,6 +17,7 @@ from rigidmd.measure.samples import COLUMNS
 from rigidmd.output.record import Record, read_record
 from rigidmd.output.sweep_folder import FINISHED, TABLE, Manifest
 from rigidmd.output.sweep_names import short_keys, value_name
+from rigidmd.output.write import columns_text, write_csv
 
 if TYPE_CHECKING:
     import pandas
@@ -198,12 +197,8 @@ def _of_body(record: Record) -> dict[str, Measured]:
 
 def write_table(table: Table) -> Path:
     """Write sweep.csv. Raises OutputError."""
-    path = table.folder / TABLE
-    with whole_file(path) as temporary:
-        stream = io.StringIO(newline="")
-        csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n").writerows(table.lines())
-        temporary.write_text(stream.getvalue(), encoding="utf-8")
-    return path
+    write_csv(table.folder / TABLE, table.lines(), csv.QUOTE_NONNUMERIC)
+    return table.folder / TABLE
 
 
 def table_text(table: Table) -> str:
@@ -214,8 +209,7 @@ def table_text(table: Table) -> str:
     for row in table.rows:
         cells = [value_name(row.values[key]) for key in table.keys] + [str(len(row.runs))]
         lines.append([*cells, *(_told(row, column) for column in shown)])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+    return columns_text(lines, left=())
 
 
 def _told(row: Mapping[str, Measured] | Row, column: str) -> str:
