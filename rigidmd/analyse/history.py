@@ -34,7 +34,6 @@ class Kind(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name."""
         return self.molecule.name
 
 
@@ -86,7 +85,6 @@ class History:
 
     @property
     def has_box(self) -> bool:
-        """Whether there is a box."""
         return bool(np.isfinite(self.cell[0, 0, 0]))
 
     @property

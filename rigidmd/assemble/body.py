@@ -113,7 +113,6 @@ class BodySystem:
 
     @property
     def method(self) -> Scheme | Solver:
-        """Its integrator."""
         run = self.scene.run
         if run.is_open:
             return SCHEMES["velocity_verlet"]
@@ -220,7 +219,6 @@ class BodySystem:
 
     @property
     def residue_names(self) -> np.ndarray:
-        """One molecule."""
         return np.array(["BODY"], dtype=object)
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:

@@ -79,7 +79,6 @@ class GsdReader:
         self.count: int = self._file.nframes
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def size(self, frame: int) -> int:

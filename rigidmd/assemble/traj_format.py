@@ -66,7 +66,6 @@ class TrajReader:
         return not len(self._atoms) or (self._atoms[0] >= 0 and self._atoms[-1] < self.sites)
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def read(self, k: int) -> Stored:

@@ -55,7 +55,6 @@ class Motion:
 
     @property
     def described(self) -> dict[str, Column]:
-        """Name -> column."""
         found = {name: BODY_COLUMNS[name] for name in self.columns}
         if BODY["rotation"].names[0] in found:
             found[MATRIX] = Column("", "1", "the rotation matrices (n, 3, 3): lab = Q body")

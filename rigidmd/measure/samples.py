@@ -151,7 +151,6 @@ class Samples:
 
     @property
     def described(self) -> dict[str, Column]:
-        """Name -> column."""
         return COLUMNS | own_columns(self.own)
 
 

@@ -106,7 +106,6 @@ class Finding:
         step: float = nan,
         expected: tuple[str, ...] = (RIGHT,),
     ) -> None:
-        """One more trial."""
         self.trials.append(Trial(setting, family, x, step, allowed, expected, outcome))
 
     @property

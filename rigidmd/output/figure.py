@@ -36,7 +36,6 @@ class InPieces:
     """
 
     def draw_path(self, renderer, gc, path, affine, rgbFace=None):
-        """Draw a path of straight sides."""
         sides = len(path.vertices) - 1
         pieces = -(-sides // (AT_ONCE - 1))  # of equal length: a short level one would be snapped to whole pixels
         for first, last in pairwise(sides * k // pieces for k in range(pieces + 1)):

@@ -28,7 +28,6 @@ class TensorFile(AppendedFile):
             self.append((",".join(f'"{title}"' for title in HEADER) + "\n").encode())
 
     def write(self, row: list[float]) -> None:
-        """Add a line."""
         self.append((",".join(map(repr, row)) + "\n").encode())
 
 

@@ -41,7 +41,6 @@ class _Sites(ReaderBase):
 
     @property
     def n_frames(self) -> int:
-        """Frames of the file."""
         return self._file.count
 
     def _reopen(self):
@@ -58,7 +57,6 @@ class _Sites(ReaderBase):
         raise NotImplementedError
 
     def close(self):
-        """Close the file."""
         if hasattr(self, "_file"):
             self._file.close()
 

@@ -36,7 +36,6 @@ class OtherEngine(ABC):
         return np.zeros(0)
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state."""
         return state.copy()._replace(bath=self.variables(state, row))
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
@@ -54,7 +53,6 @@ class OtherEngine(ABC):
         self._has = state.copy()
 
     def snapshot(self) -> State:
-        """A copy of the state that was last moved."""
         if self._moved is None:
             raise ValueError("this engine has moved no state yet")
         return self._moved.copy()

@@ -97,7 +97,6 @@ class LammpsEngine(OtherEngine):
         return {}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
-        """Go on from a state."""
         self.forget()
 
     def rotor(self, model: Model) -> "NamedTuple | None":

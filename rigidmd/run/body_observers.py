@@ -66,7 +66,6 @@ class BodyWatch(Observer):
         return Checkpoint({"moved": self.check.moved}, {})
 
     def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        """Restore it, and check the state."""
         least, self.check.moved = self.check.moved, float(kept.told["moved"])
         if not least <= self.check.moved < inf:
             raise ValueError(f"it has exchanged an energy of {self.check.moved:g} J")

@@ -43,7 +43,6 @@ class Verified(NamedTuple):
         return all(line.agrees for line in (*self.start, *self.run))
 
     def in_words(self) -> str:
-        """As text."""
         name = self.other.split()[0]
         parts = [f"{self.scene}: rigidmd and {self.other} at the start"]
         parts += [in_words(self.start, name), f"after {STEPS} steps of {STEP:g} fs at constant energy"]

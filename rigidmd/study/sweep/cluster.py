@@ -90,7 +90,6 @@ class Cluster:
         return Message("died", f"dask gave it up: {future.exception()}")
 
     def messages(self, seconds: float) -> list[tuple[str, Message]]:
-        """(name of the point, message) of those that come within so many seconds."""
         found: list[tuple[str, Message]] = []
         try:
             found.append(self._heard.get(timeout=seconds))

@@ -128,11 +128,9 @@ class _Told:
 
     @property
     def any(self) -> bool:
-        """Whether there are any."""
         return bool(self._points)
 
     def add(self, point: str, faults: Sequence[str]) -> None:
-        """Add those of a point."""
         for fault in faults:
             self._points.setdefault(fault, []).append(point)
 

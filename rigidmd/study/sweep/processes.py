@@ -73,7 +73,6 @@ class Worker:
         self._stopped = True
 
     def kill(self) -> None:
-        """End it at once."""
         self._signal(signal.SIGKILL)
 
     def close(self) -> None:
@@ -90,7 +89,6 @@ class Worker:
             self._process.send_signal(number)
 
     def _why(self) -> str:
-        """Why it died."""
         code = self._process.wait()
         self._said.seek(0)
         said = self._said.read().decode(errors="replace").strip()[-TOLD:].splitlines()
@@ -116,7 +114,6 @@ class Pool:
         return self.jobs - len(self._busy)
 
     def give(self, task: Task) -> None:
-        """Run a task."""
         worker = self._idle.pop() if self._idle else Worker(self._threads)
         worker.give(task)
         self._busy.append(worker)
@@ -142,11 +139,9 @@ class Pool:
             worker.stop()
 
     def kill(self) -> None:
-        """End all at once."""
         for worker in self._busy:
             worker.kill()
 
     def close(self) -> None:
-        """End all workers."""
         for worker in [*self._busy, *self._idle]:
             worker.close()
