@@ -48,7 +48,7 @@ LIBRARIES = {
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
-        "looking/film.py", "analyse/files.py", "output/sweep_figure.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
+        "looking/film.py", "analyse/files.py", "study/sweep/figure.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
     "pydantic": {
         "analyse/files.py", "molecules.py", "output/run_files.py", "output/sweep_folder.py", "run/body.py",

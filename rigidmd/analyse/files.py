@@ -16,7 +16,7 @@ from rigidmd.errors import OutputError
 from rigidmd.output.figure import COLORS, FAINT, INK, bare_axis, few_decades, thin_series, write_figure
 from rigidmd.output.folder import add_to_folder, written_by_runs
 from rigidmd.output.run_files import Bounded, read_columns, read_json
-from rigidmd.output.write import write_csv, write_json
+from rigidmd.output.write import nine_digits, write_csv, write_json
 
 ANALYSIS = "analysis.json"
 #: Inches of a figure, and curves that one holds.
@@ -95,7 +95,7 @@ def _rows(curve: Curve) -> list[list[Any]]:
         if header in curve.errors:
             columns[f"{header} error"] = curve.errors[header]
     lines = zip(*columns.values(), strict=True)
-    return [list(columns), *([float(f"{x:.9g}") if np.isfinite(x) else None for x in line] for line in lines)]
+    return [list(columns), *(list(map(nine_digits, line)) for line in lines)]
 
 
 class _Curve(BaseModel):

@@ -15,7 +15,7 @@ from rigidmd.measure.means import error_of_mean
 from rigidmd.output.folder import add_to_folder
 from rigidmd.output.sweep_folder import FINISHED, Manifest, Point, read_manifest, state_on_disk
 from rigidmd.output.sweep_names import in_words, short_keys
-from rigidmd.output.write import write_csv
+from rigidmd.output.write import nine_digits, write_csv
 
 ANALYSES = "analysis.csv"
 
@@ -206,7 +206,7 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
         line: list[Any] = [_cell(combination.values[key]) for key in keys] + [combination.runs]
         for title in titles:
             value = measured.get(title)
-            line += [None, None] if value is None else [_number(value.value), _number(value.error)]
+            line += [None, None] if value is None else [nine_digits(value.value), nine_digits(value.error)]
         lines.append(line)
     add_to_folder(folder, [ANALYSES])
     write_csv(folder / ANALYSES, lines, csv.QUOTE_NONNUMERIC)
@@ -214,7 +214,3 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
 
 def _cell(value: Any) -> Any:
     return value if isinstance(value, int | float | str) and not isinstance(value, bool) else str(value)
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(f"{value:.9g}")

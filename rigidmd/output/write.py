@@ -57,6 +57,11 @@ def write_npz(path: Path, columns: dict[str, np.ndarray]) -> None:
         np.savez(temporary, **columns)  # pyright: ignore[reportArgumentType]  (no column is called allow_pickle)
 
 
+def nine_digits(value: float | None) -> float | None:
+    """A number as tables in files have it; None without one."""
+    return None if value is None or not np.isfinite(value) else float(f"{value:.9g}")
+
+
 def columns_text(lines: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
     """Lines of cells as a table; the columns of these numbers are aligned left, all others right."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]

@@ -17,7 +17,6 @@ from rigidmd.output.sweep_folder import (
 )
 from rigidmd.run.provenance import differences
 from rigidmd.study.sweep.axes import Axis
-from rigidmd.study.sweep.points import Asked
 
 #: Differences that are told.
 MOST_TOLD = 8
@@ -33,21 +32,17 @@ def known_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
     return sorted(known, key=lambda axis: order.index(axis.keys[0]) if axis.keys[0] in order else len(order))
 
 
-def planned(folder: Path, asked: Asked, force: bool) -> Manifest:
-    """The manifest of a folder with what is asked for, each point in the state that its folder tells.
+def planned(folder: Path, fresh: Manifest, force: bool) -> Manifest:
+    """The manifest of a folder with what is asked for, in place, each point in the state that its folder tells.
 
     A sweep that is there keeps its points, and gets those that are new. force : remove it and begin anew. Raises
     OutputError, also if the scene is another one.
     """
-    scene = str(Path(asked.source).absolute())
-    fresh = Manifest(
-        asked.name, scene, asked.keys, asked.fixed, asked.common, asked.inputs, list(asked.points)
-    )  # fmt: skip
     if not is_sweep(folder):
         return fresh
     if force:
         names = _names(folder)
-        clear_sweep(folder, [*names, *(point.folder for point in asked.points)])
+        clear_sweep(folder, [*names, *(point.folder for point in fresh.points)])
         return fresh
     there = read_manifest(folder)
     if faults := _apart(there, fresh):
@@ -57,7 +52,7 @@ def planned(folder: Path, asked: Asked, force: bool) -> Manifest:
             "folder"
         )
     known = {point.folder for point in there.points}
-    fresh.points = [*there.points, *(point for point in asked.points if point.folder not in known)]
+    fresh.points = [*there.points, *(point for point in fresh.points if point.folder not in known)]
     for point in fresh.points:
         settle(folder, point)
     return fresh

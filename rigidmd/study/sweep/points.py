@@ -3,43 +3,32 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any
 
 from rigidmd.errors import Faults, RigidMDError, SceneError
-from rigidmd.output.sweep_folder import SEED, Point
+from rigidmd.output.sweep_folder import SEED, Manifest, Point
 from rigidmd.output.sweep_names import in_words, point_name, short_keys
 from rigidmd.run.provenance import APART, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.study.sweep.axes import Axis, settings
 
 
-@dataclass
-class Asked:
-    """What is asked for: scenes by points, as `points_of` finds them. See `Manifest` for the rest."""
+def points_of(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
+    """All points of a sweep over a scene file, checked, and whether they are of a single body.
 
-    name: str
-    source: str
-    keys: dict[str, list[str]]
-    fixed: dict[str, Any]
-    common: dict[str, Any]
-    inputs: dict[str, str]
-    points: list[Point] = field(default_factory=list)
-    is_body: bool = False
-
-
-def points_of(path: str | Path, axes: Sequence[Axis]) -> Asked:
-    """All points of a sweep over a scene file, checked. Raises SceneError with all faults of all points."""
+    Raises SceneError with all faults of all points.
+    """
     swept = [axis for axis in axes if axis.swept]
     keys = {axis.keys[0]: list(axis.keys) for axis in swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     short = short_keys(keys)
     every = settings(axes)
-    digest, faults = Digests(), _Told(str(path))
+    digest = Digests()
+    faults: dict[str, list[str]] = {}  # each with the points that have it
     checked: dict[str, RigidMDError | None] = {}  # values but for the seed -> what is wrong; replicas are built alike
-    asked: Asked | None = None
+    asked, scene = None, None
     for values in every:
         overrides = fixed | {key: value for first, value in values.items() for key in keys[first]}
         told = in_words(values, short)
@@ -50,22 +39,19 @@ def points_of(path: str | Path, axes: Sequence[Axis]) -> Asked:
                 checked[kind] = _fault_of(scene)
             if (wrong := checked[kind]) is not None:
                 raise wrong
-        except Faults as error:
-            faults.add(
-                told, [f"{error.where}: {fault}" if error.where != str(path) else fault for fault in error.faults]
-            )
-            continue
         except RigidMDError as error:
-            faults.add(told, [str(error)])
+            where = f"{error.where}: " if isinstance(error, Faults) and error.where != str(path) else ""
+            for fault in error.faults if isinstance(error, Faults) else [str(error)]:
+                faults.setdefault(f"{where}{fault}", []).append(told)
             continue
         if asked is None:
             apart = [key for together in keys.values() for key in together]
             common, inputs = common_part(scene, apart, digest)
-            asked = Asked(scene.name, str(path), keys, fixed, common, inputs, is_body=isinstance(scene, BodyScene))
+            asked = Manifest(scene.name, str(Path(path).absolute()), keys, fixed, common, inputs)
         asked.points.append(Point(point_name(values, short), values, digest.of(scene)))
-    if faults.any or asked is None:
-        raise SceneError(str(path), faults.in_words(len(every)))
-    return asked
+    if faults or asked is None:
+        raise SceneError(str(path), [_in_words(fault, points, len(every)) for fault, points in faults.items()])
+    return asked, isinstance(scene, BodyScene)
 
 
 def common_part(scene: Scene, apart: Sequence[str], digest: "Digests") -> tuple[dict[str, Any], dict[str, str]]:
@@ -100,47 +86,22 @@ class Digests:
 
 def _fault_of(scene: MolecularScene | BodyScene) -> RigidMDError | None:
     """What only the system of a scene shows to be wrong."""
+    from rigidmd.assemble.body import build_body
+    from rigidmd.assemble.system import build
+
     try:
-        _build(scene)
+        if not isinstance(scene, BodyScene):
+            build(scene)
+        elif not scene.run.is_open:
+            build_body(scene)
     except RigidMDError as error:
         return error
     return None
 
 
-def _build(scene: MolecularScene | BodyScene) -> None:
-    if isinstance(scene, BodyScene):
-        from rigidmd.assemble.body import build_body
-
-        if not scene.run.is_open:
-            build_body(scene)
-        return
-    from rigidmd.assemble.system import build
-
-    build(scene)
-
-
-class _Told:
-    """Faults with the points that have them."""
-
-    def __init__(self, source: str):
-        self._source = source
-        self._points: dict[str, list[str]] = {}
-
-    @property
-    def any(self) -> bool:
-        return bool(self._points)
-
-    def add(self, point: str, faults: Sequence[str]) -> None:
-        for fault in faults:
-            self._points.setdefault(fault, []).append(point)
-
-    def in_words(self, count: int) -> list[str]:
-        """A sentence for each: a fault of all points is that of the scene."""
-        found = []
-        for fault, points in self._points.items():
-            if len(points) == count and count > 1:
-                found.append(fault)
-            else:
-                more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
-                found.append(f"at {points[0]}{more}: {fault}")
-        return found
+def _in_words(fault: str, points: list[str], count: int) -> str:
+    """A fault with the points that have it; one of all `count` points is that of the scene."""
+    if len(points) == count and count > 1:
+        return fault
+    more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
+    return f"at {points[0]}{more}: {fault}"

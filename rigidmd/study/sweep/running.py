@@ -7,14 +7,15 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rigidmd.output.sweep_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, Point, write_manifest
 from rigidmd.run.keeper import checked_walltime
 from rigidmd.run.signals import handled
 from rigidmd.scene import Scene
+from rigidmd.study.sweep.cluster import Cluster
 from rigidmd.study.sweep.plan import settle
-from rigidmd.study.sweep.processes import Message
+from rigidmd.study.sweep.processes import Message, Pool
 from rigidmd.study.sweep.worker import Task
 
 #: Seconds between two looks at the clock, and between two writings of the manifest.
@@ -24,33 +25,8 @@ SPARE, LEAST = 10.0, 20.0
 SPARE_SHARE, LEAST_SHARE = 0.1, 0.2
 
 
-class Runner(Protocol):
-    """Who runs points: processes here, or a cluster."""
-
-    @property
-    def free(self) -> int:
-        """Tasks that it would take now."""
-        ...
-
-    def give(self, task: Task) -> None:
-        """Run a task."""
-        ...
-
-    def messages(self, seconds: float) -> list[tuple[str, Message]]:
-        """(name of the point, message) of those that come within so many seconds."""
-        ...
-
-    def stop(self) -> None:
-        """Let all runs end at their next looks, with checkpoints. May be called again."""
-        ...
-
-    def kill(self) -> None:
-        """End all at once."""
-        ...
-
-    def close(self) -> None:
-        """End it."""
-        ...
+#: Who runs points: processes here, or a cluster.
+Runner = Pool | Cluster
 
 
 @dataclass
@@ -86,7 +62,7 @@ def run_points(
     by_name = {point.folder: point for point in manifest.points}
     found.skipped = [point.folder for point in manifest.points if point.state == FINISHED]
     waiting = Waiting(manifest, [point for point in manifest.points if point.state != FINISHED])
-    book = _Book(folder, manifest)
+    changed, written = True, 0.0
     busy: set[str] = set()
     ends_at, least = None, 0.0
     if walltime is not None:
@@ -124,11 +100,13 @@ def run_points(
                     _note(folder, point, message, found)
                 else:
                     continue
-                book.changed()
-            book.write_if_due()
+                changed = True
+            if changed and clock.monotonic() - written > WRITING:
+                write_manifest(folder, manifest)
+                changed, written = False, clock.monotonic()
     found.out_of_time |= found.signal is None and bool(waiting)
     found.left = [point.folder for point in manifest.points if point.state not in (FINISHED, FAILED)]
-    book.write()
+    write_manifest(folder, manifest)
     found.seconds = clock.monotonic() - began
     return found
 
@@ -214,25 +192,3 @@ def code_kind(scene: Scene) -> str:
     from rigidmd.run.provenance import APART, keys_of, plain
 
     return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.held, *APART))))
-
-
-class _Book:
-    """Writes the manifest, not more often than is worth it."""
-
-    def __init__(self, folder: Path, manifest: Manifest):
-        self._folder, self._manifest = folder, manifest
-        self._dirty, self._last = True, 0.0
-
-    def changed(self) -> None:
-        """Note that it has to be written."""
-        self._dirty = True
-
-    def write_if_due(self) -> None:
-        """Write it if it has changed, and was not written just now."""
-        if self._dirty and clock.monotonic() - self._last > WRITING:
-            self.write()
-
-    def write(self) -> None:
-        """Write it."""
-        write_manifest(self._folder, self._manifest)
-        self._dirty, self._last = False, clock.monotonic()

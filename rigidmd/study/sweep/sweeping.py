@@ -23,7 +23,8 @@ from rigidmd.output.sweep_folder import (
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import name_of_file, read_tables
 from rigidmd.study.sweep.axes import Axis, axes_of, checked
-from rigidmd.study.sweep.figure import write_figure
+from rigidmd.study.sweep.cluster import Cluster
+from rigidmd.study.sweep.figure import draw_sweep
 from rigidmd.study.sweep.plan import known_axes, planned, settle
 from rigidmd.study.sweep.points import points_of
 from rigidmd.study.sweep.processes import Pool
@@ -88,7 +89,7 @@ def opened(wanted: Wanted, stack: ExitStack) -> Opened:
     folder = wanted.folder or Path("runs") / f"{named or name_of_file(wanted.path)}-sweep"
     check_sweep_folder(folder)
     axes = checked(axes if wanted.force else known_axes(folder, axes))
-    asked = points_of(wanted.path, axes)
+    asked, is_body = points_of(wanted.path, axes)
     lock = FolderLock(folder)
     stack.callback(lock.release)
     lock.take()
@@ -96,7 +97,7 @@ def opened(wanted: Wanted, stack: ExitStack) -> Opened:
     make_sweep_folder(folder)
     lock.take()
     write_manifest(folder, manifest)
-    return Opened(folder, manifest, asked.is_body)
+    return Opened(folder, manifest, is_body)
 
 
 def opened_again(folder: Path, stack: ExitStack) -> Opened:
@@ -184,7 +185,7 @@ def collected(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
     table = table_of(folder, manifest)
     if not any(row.runs for row in table.rows):
         return table, []
-    files = [write_table(table), write_figure(table, manifest.name)]
+    files = [write_table(table), draw_sweep(table, manifest.name)]
     return table, [path for path in files if path is not None and path.is_file()]
 
 
@@ -209,6 +210,4 @@ def runner_of(folder: Path, scheduler: str | None, jobs: int, threads: int) -> R
     """Processes here, or a cluster of dask with `threads` for each point. Raises SettingError."""
     if scheduler is None:
         return Pool(jobs, threads)
-    from rigidmd.study.sweep.cluster import Cluster
-
     return Cluster(scheduler, jobs, threads, folder, Path.cwd())

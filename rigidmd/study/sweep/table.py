@@ -17,7 +17,7 @@ from rigidmd.measure.samples import COLUMNS
 from rigidmd.output.record import Record, read_record
 from rigidmd.output.sweep_folder import FINISHED, TABLE, Manifest
 from rigidmd.output.sweep_names import short_keys, value_name
-from rigidmd.output.write import columns_text, write_csv
+from rigidmd.output.write import columns_text, nine_digits, write_csv
 
 if TYPE_CHECKING:
     import pandas
@@ -112,7 +112,7 @@ class Table:
             line = [_cell(row.values[key]) for key in self.keys] + [len(row.runs)]
             for column in self.columns:
                 value, error = row[column]
-                line += [_number(value)] if column in bare else [_number(value), _number(error)]
+                line += [nine_digits(value)] if column in bare else [nine_digits(value), nine_digits(error)]
             found.append(line)
         return found
 
@@ -123,10 +123,6 @@ class Table:
 
 def _cell(value: Any) -> Any:
     return value if isinstance(value, int | float | str) and not isinstance(value, bool) else value_name(value)
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(f"{value:.9g}")
 
 
 def table_of(folder: Path, manifest: Manifest) -> Table:
