@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from math import isfinite
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from rigidmd.core.toml_text import cut, line_of, shortened
@@ -34,6 +34,16 @@ class Section(BaseModel):
     """A frozen table of a TOML file; unknown keys are faults."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @model_validator(mode="after")
+    def _is_sound(self):
+        if faults := "; ".join(self._faults()):
+            raise ValueError(faults)
+        return self
+
+    def _faults(self) -> Iterable[str]:
+        """What is wrong between the keys of this table."""
+        return ()
 
 
 #: A name or a path: without line ends and other characters that no terminal shows.

@@ -5,7 +5,7 @@ from math import inf
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from rigidmd.mechanics.inertia import impossible
 from rigidmd.validation import NonNegative, Number, Positive, Section, Vector
@@ -80,16 +80,12 @@ class Applied(Timed):
     at_m: Vector | None = None
     """Point of action, body axes, from the centre of mass or the pivot; default: that point itself"""
 
-    @model_validator(mode="after")
-    def _does_something(self):
-        faults = self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
+    def _faults(self):
+        yield from self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
         if self.force_N is None and self.torque_N_m is None:
-            faults.append("needs force_N or torque_N_m")
+            yield "needs force_N or torque_N_m"
         if self.at_m is not None and self.force_N is None:
-            faults.append("at_m would do nothing without force_N")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield "at_m would do nothing without force_N"
 
 
 class Friction(Section):
@@ -134,19 +130,15 @@ class Frame(Timed):
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
     """Of the frame's origin, along the frame's axes; the body feels the opposite acceleration"""
 
-    @model_validator(mode="after")
-    def _does_something(self):
+    def _faults(self):
         timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
-        faults = self.timing_faults(timed, tuple)
+        yield from self.timing_faults(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
-            faults.append("from_s and to_s are not supported here; use times_s")
+            yield "from_s and to_s are not supported here; use times_s"
         if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
-            faults.append("angular_acceleration_rad_s2 and times_s contradict each other")
+            yield "angular_acceleration_rad_s2 and times_s contradict each other"
         if all(value is None for value in timed.values()) and self.angular_acceleration_rad_s2 is None:
-            faults.append("needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield "needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2"
 
 
 class Wheel(Timed):
@@ -159,17 +151,13 @@ class Wheel(Timed):
     motor_torque_N_m: Number | tuple[Number, ...] | None = None
     """Torque of its motor on the wheel; the body feels the opposite"""
 
-    @model_validator(mode="after")
-    def _turns(self):
-        faults = self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
+    def _faults(self):
+        yield from self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
         if not any(self.axis):
-            faults.append("axis is zero, which is not a direction")
+            yield "axis is zero, which is not a direction"
         idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
         if self.motor_torque_N_m is None and idle:
-            faults.append(f"{', '.join(idle)} would do nothing without motor_torque_N_m")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield f"{', '.join(idle)} would do nothing without motor_torque_N_m"
 
 
 class ChangingInertia(Timed):
@@ -181,16 +169,11 @@ class ChangingInertia(Timed):
     inertia_kg_m2: tuple[PositiveVector, ...]
     """Principal moments at each time"""
 
-    @model_validator(mode="after")
-    def _is_a_table(self):
-        faults = self.timing_faults({"inertia_kg_m2": self.inertia_kg_m2}, tuple)
-        if self.times_s is None:
-            faults = ["times_s is missing"]
+    def _faults(self):
+        timed = {"inertia_kg_m2": self.inertia_kg_m2}
+        yield from ["times_s is missing"] if self.times_s is None else self.timing_faults(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
-            faults.append("from_s and to_s are not supported here; use times_s")
+            yield "from_s and to_s are not supported here; use times_s"
         for k, moments in enumerate(self.inertia_kg_m2):
             if why := impossible(np.diag(moments)):
-                faults.append(f"no body has the inertia of entry {k}: {why}")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+                yield f"no body has the inertia of entry {k}: {why}"

@@ -114,8 +114,7 @@ class BodyTable(Section):
     centre_of_mass_m: Vector | None = None
     """From the pivot, body axes; of a pinned body"""
 
-    @model_validator(mode="after")
-    def _is_a_body(self):
+    def _faults(self):
         faults = []
         ways = [key for key in ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2") if getattr(self, key)]
         if len(ways) > 1:
@@ -135,11 +134,7 @@ class BodyTable(Section):
                 faults.append("inertia_about = 'pivot', but the body is not pinned")
             if ways and ways[0] in ("solid", "points"):
                 faults.append(f"inertia_about would do nothing with {ways[0]}")
-        if not faults:
-            faults += self._impossible()
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+        return faults or self._impossible()
 
     def _impossible(self) -> list[str]:
         tensor = self.tensor
@@ -191,45 +186,40 @@ class BodyStart(Section):
     velocity_m_s: Vector | None = None
     """Of the centre of mass of a body that is not pinned"""
 
-    @model_validator(mode="after")
-    def _one_of_each(self):
-        faults = []
+    def _faults(self):
         attitudes = ("euler_angles_deg", "yaw_pitch_roll_deg", "quaternion_wxyz", "rotation", "attitude_matrix")
         spins = ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")
         for keys in (attitudes, spins):
             given = [key for key in keys if getattr(self, key) is not None]
             if len(given) > 1:
-                faults.append(f"give one of {', '.join(given)}")
+                yield f"give one of {', '.join(given)}"
         matrix = self.rotation or self.attitude_matrix
         if self.project and matrix is None:
-            faults.append("project would do nothing: no matrix is given")
+            yield "project would do nothing: no matrix is given"
         if matrix is not None:
             error = orthogonality_error(np.array([matrix]))
             sense = np.linalg.det(matrix)
             if self.project and (sense <= 0 or error > FURTHEST_FROM_ROTATION):
-                faults.append(
+                yield (
                     f"the matrix is not a rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is "
                     f"{error:.2g}, must be below {FURTHEST_FROM_ROTATION:g}"
                 )
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
                 what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"
-                faults.append(
+                yield (
                     f"the matrix is not a rotation: {what}, must be below {LARGEST_ORTHOGONALITY_ERROR:g}; "
                     "project = true uses the nearest one"
                 )
         if self.quaternion_wxyz is not None and not any(self.quaternion_wxyz):
-            faults.append("quaternion_wxyz is zero, which is not a rotation")
+            yield "quaternion_wxyz is zero, which is not a rotation"
         if self.euler_rates_rad_s is not None:
             if self.euler_angles_deg is None:
-                faults.append("euler_rates_rad_s needs euler_angles_deg")
+                yield "euler_rates_rad_s needs euler_angles_deg"
             elif self.euler_angles_deg[1] % 180 == 0:
-                faults.append(
+                yield (
                     f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' turn about "
                     "the same axis there; give angular_velocity_body_rad_s"
                 )
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
 
     @property
     def attitude(self) -> np.ndarray:
@@ -279,27 +269,22 @@ class Run(Section):
     absolute_tolerance: Positive | None = None
     """Of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
 
-    @model_validator(mode="after")
-    def _nothing_idle(self):
-        faults = []
+    def _faults(self):
         if self.rotor is not None and self.integrator in SOLVERS:
-            faults.append(f"rotor would do nothing with {self.integrator}")
+            yield f"rotor would do nothing with {self.integrator}"
         elif fault := self.rotor and rotor_fault(self.integrator, self.rotor):
-            faults.append(fault)
+            yield fault
         if self.formulation is not None and self.integrator not in SOLVERS:
-            faults.append(f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}")
+            yield f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}"
         tolerances = [key for key in ("relative_tolerance", "absolute_tolerance") if getattr(self, key) is not None]
         if tolerances and self.integrator not in ("dop853", "radau"):
-            faults.append(f"{', '.join(tolerances)} would do nothing with {self.integrator}")
+            yield f"{', '.join(tolerances)} would do nothing with {self.integrator}"
         asked = {"energy_error": self.energy_error, "trajectory_error": self.trajectory_error}
-        faults += auto_faults(self.integrator, asked, ["rotor"] if self.rotor is not None else [])
+        yield from auto_faults(self.integrator, asked, ["rotor"] if self.rotor is not None else [])
         if not self.duration_s / self.timestep_s < MOST_STEPS:
-            faults.append(f"duration_s / timestep_s is more than {MOST_STEPS:g} steps")
+            yield f"duration_s / timestep_s is more than {MOST_STEPS:g} steps"
         elif self.duration_s < 0.5 * self.timestep_s:
-            faults.append(f"duration_s = {self.duration_s:g} is less than one step of {self.timestep_s:g} s")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield f"duration_s = {self.duration_s:g} is less than one step of {self.timestep_s:g} s"
 
     @property
     def is_open(self) -> bool:
@@ -415,15 +400,13 @@ class BodyScene(Scene):
             found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
         return [f"{place(keys, text)}: {fault}" for keys, fault in found]
 
-    @model_validator(mode="after")
-    def _whole(self):
-        faults = []
+    def _faults(self):
         fluid, body = self.fluid, self.body
         if fluid is not None:
             if fluid.density_kg_m3 is not None:
                 if body.solid is None or body.solid.shape not in ("sphere", "ellipsoid") or body.pinned:
-                    faults.append("fluid.density_kg_m3 needs a body.solid that is a sphere or an ellipsoid, not pinned")
-                faults += [
+                    yield "fluid.density_kg_m3 needs a body.solid that is a sphere or an ellipsoid, not pinned"
+                yield from [
                     f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows"
                     for key in ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
                     if getattr(fluid, key) is not None
@@ -433,11 +416,8 @@ class BodyScene(Scene):
                 and fluid.displaced_mass_kg is None
                 and fluid.density_kg_m3 is None
             ):
-                faults.append("fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or density_kg_m3")
+                yield "fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or density_kg_m3"
             if (fluid.displaced_mass_kg or fluid.density_kg_m3) and self.gravity is None:
-                faults.append("fluid: buoyancy needs [gravity]")
+                yield "fluid: buoyancy needs [gravity]"
         if self.output.interval_s is not None and self.output.interval_s > self.run.duration_s:
-            faults.append(f"output.interval_s = {self.output.interval_s:g} is longer than run.duration_s")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield f"output.interval_s = {self.output.interval_s:g} is longer than run.duration_s"

@@ -3,7 +3,7 @@
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import Field, Strict, field_validator
 
 from rigidmd.scene.species import ResidueNumber, checked_numbers, spans
 from rigidmd.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
@@ -43,26 +43,21 @@ class Walls(Section):
     stiffness_kJ_mol_A2: Positive | None = None
     """Of harmonic: stiffness"""
 
-    @model_validator(mode="after")
-    def _makes_sense(self):
-        faults = []
+    def _faults(self):
         for kind, keys in KEYS_OF_WALLS.items():
             given = [key for key in keys if getattr(self, key) is not None]
             if kind != self.kind and given:
-                faults.append(f"{', '.join(given)} would do nothing with kind = {self.kind!r}")
+                yield f"{', '.join(given)} would do nothing with kind = {self.kind!r}"
             missing = [key for key, needed in keys.items() if needed and key not in given]
             if kind == self.kind and missing:
-                faults.append(f"kind = {kind!r} needs {' and '.join(missing)}")
+                yield f"kind = {kind!r} needs {' and '.join(missing)}"
         lower, upper = self.positions_A
         if not lower < upper:
-            faults.append(f"positions_A = [{lower:g}, {upper:g}]: the first must be below the second")
+            yield f"positions_A = [{lower:g}, {upper:g}]: the first must be below the second"
         elif (lower, upper) == (-inf, inf):
-            faults.append("positions_A = [-inf, inf] is no wall at all")
+            yield "positions_A = [-inf, inf] is no wall at all"
         elif lower == inf or upper == -inf:
-            faults.append(f"positions_A = [{lower:g}, {upper:g}] leaves no place between them")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield f"positions_A = [{lower:g}, {upper:g}] leaves no place between them"
 
     @property
     def direction(self) -> int:
@@ -123,16 +118,11 @@ class Fields(Section):
     restraints: tuple[Restraint, ...] = Field(default=(), max_length=MOST_TABLES)
     """Springs on centres of mass"""
 
-    @model_validator(mode="after")
-    def _nothing_idle(self):
-        faults = []
+    def _faults(self):
         if self.electric_frequency_per_ps is not None and self.electric_V_per_nm is None:
-            faults.append("electric_frequency_per_ps would do nothing without electric_V_per_nm")
+            yield "electric_frequency_per_ps would do nothing without electric_V_per_nm"
         if self.electric_phase_deg and self.electric_frequency_per_ps is None:
-            faults.append("electric_phase_deg would do nothing without electric_frequency_per_ps")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield "electric_phase_deg would do nothing without electric_frequency_per_ps"
 
     @property
     def holds_in_place(self) -> bool:

@@ -229,47 +229,42 @@ class MolecularScene(Scene):
         beside = [str(Path(start.file).with_name(name)) for name in BESIDE]
         return next((name for name in beside if self.path(name).is_file()), None)
 
-    @model_validator(mode="after")
-    def _whole(self):
-        faults = []
+    def _faults(self):
         if self.structure is None:
-            faults += [
+            yield from [
                 f"molecules.{k}.count is missing (there is no structure file to count in)"
                 for k, species in enumerate(self.molecules)
                 if species.count is None
             ]
             if self.box.lengths_A is None and self.box.density_g_cm3 is None:
-                faults.append("box needs lengths_A or density_g_cm3, or there must be a structure file")
+                yield "box needs lengths_A or density_g_cm3, or there must be a structure file"
         elif self.box.density_g_cm3 is not None:
-            faults.append("box.density_g_cm3 and a structure file contradict each other: omit one")
+            yield "box.density_g_cm3 and a structure file contradict each other: omit one"
         elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
-            faults.append("structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false")
+            yield "structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false"
         first = self.first_moving
         if self.start.temperature_K is None and first is not None and first.temperature_K is None:
             from_file = self.structure is not None and self.structure.velocities
             if not from_file:
                 which = "the first stage" if first is self.stages[0] else "the first stage in which time passes"
-                faults.append(f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read")
+                yield f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read"
         if self.start.temperature_K is not None and self.structure is not None and self.structure.velocities:
-            faults.append("start.temperature_K would do nothing: the velocities are read from the structure file")
+            yield "start.temperature_K would do nothing: the velocities are read from the structure file"
         rescaled = first is not None and first.thermostat_kind in ("velocity_rescaling", "nose_hoover")
         if self.start.temperature_K == 0 and rescaled:
-            faults.append("start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest")
-        faults += self._barostat_faults()
+            yield "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest"
+        yield from self._barostat_faults()
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
-            faults.append("forces.tail_correction assumes a uniform liquid: omit it with frozen molecules")
+            yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
-            faults.append(
+            yield (
                 "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen molecules; omit it"
             )
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
-            faults.append(f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}")
-        faults += field_faults(self)
-        faults += self._uneven_frames()
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
+        yield from field_faults(self)
+        yield from self._uneven_frames()
 
     def _barostat_faults(self) -> list[str]:
         """Faults of stages with a barostat."""

@@ -160,35 +160,30 @@ class Stage(Section):
             raise ValueError("is missing")
         return duration
 
-    @model_validator(mode="after")
-    def _makes_sense(self):
-        faults = []
+    def _faults(self):
         if self.has_thermostat and self.temperature_K is None:
-            faults.append(f"an {self.ensemble} stage needs temperature_K")
+            yield f"an {self.ensemble} stage needs temperature_K"
         if self.has_barostat and self.pressure_bar is None:
-            faults.append(f"an {self.ensemble} stage needs pressure_bar")
+            yield f"an {self.ensemble} stage needs pressure_bar"
         if idle := [key for key, where in USED.items() if self._is_given(key) and not where & self._parts]:
-            faults.append(f"{', '.join(idle)} would do nothing {self._where(idle)}")
+            yield f"{', '.join(idle)} would do nothing {self._where(idle)}"
         if self.integrator in WITH_BATH and not self.has_thermostat and not self.is_minimisation:
-            faults.append(f"{self.integrator} contains a thermostat, but {self.ensemble} has none")
+            yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.changes_box:
-            faults += self._pressure_faults()
+            yield from self._pressure_faults()
         if fault := rotor_fault(self.integrator, self.rotor):
-            faults.append(fault)
+            yield fault
         decided = [
             key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default
         ]
         asked = {key: getattr(self, key) for key in ASKED}
-        faults += auto_faults(self.integrator, asked, decided)
+        yield from auto_faults(self.integrator, asked, decided)
         if self.bias_kT is not None and not self.has_thermostat:
-            faults.append(f"bias_kT is of averages at a temperature, and {self.ensemble} has no thermostat")
+            yield f"bias_kT is of averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
-            faults.append(f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps")
+            yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
         if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
-            faults.append(f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs")
-        if faults:
-            raise ValueError("; ".join(faults))
-        return self
+            yield f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs"
 
     def _is_given(self, key: str) -> bool:
         return getattr(self, key) != type(self).model_fields[key].default
