@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rigidmd.measure.bias import SHARE, AverageRun, Averages, Quantity
 from rigidmd.output.figure import FAINT, INK, bare_axis, curve_style, drawing, write_figure
+from rigidmd.output.page import chips, code, items, page, plain, section, table, wide
 from rigidmd.output.report import signed
 from rigidmd.output.write import columns_text, write_csv, write_json
 
@@ -123,8 +124,6 @@ def faults(found: Averages) -> list[str]:
 
 def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
     """All files; the paths written."""
-    from rigidmd.output.averages_page import averages_page
-
     write_csv(folder / FILES[0], [headers(found), *(row(found, run) for run in found.runs)])
     write_json(folder / FILES[1], as_data(found, command), indent=2, allow_nan=False)
     title = f"{found.name}: bias of averages over {found.sampled:g} ps"
@@ -216,3 +215,36 @@ def figure_of(found: Averages):
     figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside lower left", ncols=2,
                   labelcolor=INK)  # fmt: skip
     return figure
+
+
+def averages_page(found: Averages, command: str) -> str:
+    """A self-contained page."""
+    methods = methods_of(found)
+    named = chips(methods)
+
+    def step(method: str, quantity: Quantity) -> str:
+        at = found.off_at(method, quantity)
+        return "" if at is None else f"{'' if at[1] else '> '}{at[0]:.2g}"
+
+    judged = [q for q in found.quantities if any(found.off_at(method, q) for method in methods)]
+    rows = [[named[method], *(step(method, q) for q in judged)] for method in methods]
+    scales = dict.fromkeys(scale(q) for q in judged)
+    of = [f"{its} ({', '.join(q.name for q in judged if scale(q) == its)})" for its in scales]
+    runs = [[named[run.method], *line[1:]] for run, line in zip(found.runs, brief_rows(found), strict=True)]
+    about = f"{found.molecules} molecules, {found.freedom} degrees of freedom, {found.stage} at {found.temperature:g} K"
+    told = f"{SHARE:.0%} is of {', '.join(of)}. Where none was seen, > tells the step up to which it is smaller"
+    parts = [
+        f'<p class="faint">{plain(about)}; {found.sampled:g} ps at every step</p>',
+        section(
+            f"Steps (fs) at which an average is off by {SHARE:.0%}",
+            table(["method", *(q.name for q in judged)], rows),
+            items([told, *references(found)]),
+        ),
+        section("Bias against the time step", wide(figure_of(found), "averages", "biases over time steps")),
+        section(
+            "All runs: biases, U in kT per degree of freedom",
+            table(brief_headers(found), runs),
+            items(faults(found)),
+        ),
+    ]
+    return page(f"{found.name}: bias of averages", [*parts, section("How to repeat it", code(command))])

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from rigidmd.output.figure import COOL, FAINT, INK, WARM, save_figure, settings
+from rigidmd.output.figure import COOL, FAINT, INK, WARM, curve_style, save_figure, settings
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
@@ -58,6 +58,14 @@ def plain(value: object) -> str:
     if isinstance(value, Raw):
         return value
     return "" if value is None else html.escape(str(value))
+
+
+def chips(names: Iterable[str]) -> dict[str, Raw]:
+    """Names with the colours of their curves, as cells."""
+    return {
+        name: Raw(f'<span style="color:{curve_style(k)["color"]}">■</span> {plain(name)}')
+        for k, name in enumerate(names)
+    }
 
 
 def items(lines: Iterable[object]) -> str:

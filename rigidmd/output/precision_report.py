@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.measure.trials import Precision, Reached, Trial
 from rigidmd.output.figure import FAINT, INK, bare_axis, curve_style, drawing, few_decades, write_figure
+from rigidmd.output.page import chips, code, items, page, section, table, wide
 from rigidmd.output.report import signed
 from rigidmd.output.write import columns_text, write_csv
 
@@ -254,8 +255,6 @@ def cheapest_words(found: Precision) -> list[str]:
 
 def write_precision(folder: Path, found: Precision, command: str) -> list[Path]:
     """Write all files. Returns their paths."""
-    from rigidmd.output.precision_page import precision_page
-
     write_csv(folder / FILES[0], [headers(found), *(row(found, trial) for trial in found.trials)])
     written: list[str] = list(FILES[:3])
     if sampled := [average_row(found, trial) for trial in found.trials if trial.averages]:
@@ -321,3 +320,36 @@ def figure_of(found: Precision):
     right.legend(frameon=False, fontsize=8, handlelength=2.8, loc="center left", bbox_to_anchor=(1.0, 0.5),
                  labelcolor=INK)  # fmt: skip
     return figure
+
+
+def precision_page(found: Precision, command: str) -> str:
+    """A self-contained page."""
+    names = list(dict.fromkeys(t.integrator for t in found.trials))
+    named = chips(names)
+    unit = found.subject.time_unit
+    rows = [
+        [c.error, named[c.integrator], f"{c.at.step:.2g}" + (f" ({c.at.limit})" if c.at.limit else ""),
+         f"{c.at.seconds / found.subject.span:.2g}",
+         f"{c.times_faster:.1f} (at {c.common_step:.2g})" if c.common else "",
+         ", ".join(f"{name} at {at.step:.2g}" for name, at in c.rivals)]
+        for c in cheapest(found)
+    ]  # fmt: skip
+    per = "ps" if unit == "fs" else "s"
+    titles = [
+        f"for, over {found.subject.span:g} {per}",
+        "the cheapest is",
+        f"at a step of ({unit})",
+        f"seconds per {per}",
+        "times faster than velocity_verlet",
+        "as fast within the spread of the timings",
+    ]
+    trials = [[named[t.integrator], *map(short, row(found, t)[1:])] for t in found.trials]
+    parts = [
+        section("Advice", table(titles, rows), items(remarks(found))),
+        section("Error against run time", wide(figure_of(found), "precision", "log error over log run time")),
+        section("All trials", table(headers(found), trials)),
+    ]
+    if sampled := [trial for trial in found.trials if trial.averages]:
+        lines = [[named[t.integrator], *map(short, brief_row(found, t)[1:])] for t in sampled]
+        parts.append(section(f"Averages over {found.sampled:g} ps", table(brief_headers(), lines)))
+    return page(f"{found.subject.name}: error against run time", [*parts, section("How to repeat it", code(command))])

@@ -1,5 +1,6 @@
 """Report of `rigidmd stability`: a table, failures in words, stability.csv, .md and a self-contained page."""
 
+import html
 from collections import Counter
 from math import inf, isfinite, isnan
 from pathlib import Path
@@ -7,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import write_text
-from rigidmd.measure.stability import BOUND, RIGHT, VERDICTS, Finding, Limit, Trial
+from rigidmd.measure.stability import BOUND, CRASH, REFUSED, RIGHT, SILENT, TOLD, VERDICTS, Finding, Limit, Trial
 from rigidmd.output.figure import INK, bare_axis, curve_style, drawing, few_decades
+from rigidmd.output.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide
 from rigidmd.output.write import columns_text, write_csv
 
 FILES = ("stability.csv", "stability.html", "stability.md")
@@ -89,8 +91,6 @@ def failed(findings: list[Finding]) -> bool:
 
 def write_stability(folder: Path, findings: list[Finding], command: str, machine: str) -> list[Path]:
     """Write all files. Returns their paths."""
-    from rigidmd.output.stability_page import stability_page
-
     titles = ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
               "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
     write_csv(folder / FILES[0], [titles, *(line for finding in findings for line in _csv_lines(finding))])
@@ -198,3 +198,52 @@ def _draw_limits(axis, finding: Finding, family: str, style: dict) -> None:
             axis.axvline(limit.longest, color=style["color"], lw=0.6, ls=":")
     axis.set_xlabel(f"step ({finding.step_unit}); dotted: longest bounded")
     axis.set_ylabel("largest error of a conserved quantity")
+
+
+#: How a verdict is shown.
+KINDS = {RIGHT: GOOD, REFUSED: GOOD, TOLD: DOUBTFUL, SILENT: BAD, CRASH: BAD}
+#: Messages of a case at most.
+MESSAGES = 3
+
+
+def stability_page(findings: list[Finding], command: str, machine: str) -> str:
+    """A self-contained page."""
+    styles = styles_of(findings)
+    glance = [[_link(f), *_counts(f), f.sentence] for f in findings]
+    meanings = [[Raw(_badge(verdict)), meaning] for verdict, meaning in VERDICTS.items()]
+    bound = f"The longest step is that at which conserved quantities stay within {BOUND:g} of the kinetic energy."
+    lines = [[_link(f), *line[1:]] for f in findings for line in rows(f)]
+    parts = [
+        items(words(findings)),
+        section("At a glance", table(["case", *VERDICTS, ""], glance), table([], meanings, words=True)),
+        section("All integrators", table(HEADERS, lines), f"<p>{html.escape(bound)}</p>"),
+        *(_case(finding, styles) for finding in findings),
+        section("How to repeat it", code(f"{command}    # on {machine}")),
+    ]
+    return page("Stability", parts)
+
+
+def _link(finding: Finding) -> Raw:
+    return Raw(f'<a href="#case-{plain(finding.name)}">{plain(finding.name)}</a>')
+
+
+def _badge(verdict: str, count: str = "") -> str:
+    return f'<span class="badge {KINDS[verdict]}">{html.escape(f"{count} {verdict}".strip())}</span>'
+
+
+def _counts(finding: Finding) -> list[Raw]:
+    """How many runs got each verdict, longest steps with a silent end among them."""
+    counts = Counter(t.verdict for t in finding.trials)
+    counts.update(limit.beyond for limit in finding.limits if limit.beyond in (SILENT, CRASH))
+    return [Raw(f'<span class="{KINDS[v]}">{counts[v]}</span>' if counts[v] else "") for v in VERDICTS]
+
+
+def _case(finding: Finding, styles: dict[str, dict]) -> str:
+    counts = Counter(t.verdict for t in finding.trials)
+    badges = " ".join(_badge(v, str(counts[v])) for v in VERDICTS if counts[v])
+    drawn = picture(finding, styles)
+    shown = "" if drawn is None else wide(drawn, finding.name, finding.name)
+    messages = dict.fromkeys(t.outcome.message for t in finding.trials if t.outcome.message)
+    told = [*finding.notes, *(Raw(f"<code>{plain(message)}</code>") for message in list(messages)[:MESSAGES])]
+    sentence = f"<p>{plain(finding.sentence)}. {badges}</p>"
+    return section(finding.name, sentence, shown, items(told), anchor=f"case-{finding.name}")
