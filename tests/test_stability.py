@@ -130,7 +130,7 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
 
 
 def test_a_silent_case_is_exit_code_1(tmp_path, capsys, monkeypatch):
-    from rigidmd.study.stability.cases import CASES, Case
+    from rigidmd.study.stability.runs import CASES, Case
 
     def lie(find, quick):
         find.add("always", Outcome(1.0, 0.0), 1e-3)

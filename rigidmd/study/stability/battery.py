@@ -6,7 +6,7 @@ from collections.abc import Callable
 from rigidmd.errors import SceneError
 from rigidmd.measure.stability import Finding
 from rigidmd.study.stability import bodies, boxes, collisions, resistance, tops, unfit, water  # noqa: F401  (enter cases)
-from rigidmd.study.stability.cases import CASES, Case
+from rigidmd.study.stability.runs import CASES, Case
 from rigidmd.validation import meant
 
 

@@ -7,11 +7,11 @@ from scipy.special import ellipkm1
 
 from rigidmd.measure.stability import REFUSED, RIGHT, Finding, Outcome, longest_step
 from rigidmd.mechanics.rotation import from_vector
-from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.runs import (
     EXACT,
     SPLIT,
     away_from,
+    case,
     everything_kept,
     families,
     invariants,

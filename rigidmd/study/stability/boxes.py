@@ -9,12 +9,12 @@ from rigidmd.assemble.describe import describe
 from rigidmd.assemble.system import build
 from rigidmd.measure.stability import REFUSED, RIGHT, Finding, Outcome
 from rigidmd.scene import Scene
-from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.collisions import bent, from_file
 from rigidmd.study.stability.runs import (
     SPLIT,
     WATER_FORCES,
     attempt,
+    case,
     molecular,
     molecules_scene,
     only_built,

@@ -12,10 +12,10 @@ from rigidmd.core.state_file import write_state
 from rigidmd.measure.stability import REFUSED, RIGHT, TOLD, Finding, Outcome, longest_step
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.runs import (
     SPLIT,
     attempt,
+    case,
     energy_error,
     families,
     molecular,

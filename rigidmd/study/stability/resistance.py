@@ -5,19 +5,17 @@ from math import expm1, sqrt
 import numpy as np
 
 from rigidmd.measure.stability import Finding, Outcome
-from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.runs import (
+    POINT,
     QUICK,
     SPLIT,
-    WATER_BOX,
-    WATER_FORCES,
     WATERS,
     attempt,
+    case,
     liquid,
-    molecules_scene,
     run_body,
     simulate,
-    water,
+    water_scene,
 )
 
 STEPS = 20
@@ -75,7 +73,7 @@ def fluid(find: Finding, quick: bool) -> None:
             # of order 2 in c dt: right where the step resolves it, and never past zero anywhere
             ("quadratic", quadratic, 1 / (1 + c * at), max(1e-13, 0.1 * min(c * c, 5.0))),
         ):
-            outcome = run_point(data, decay("vx", known))
+            outcome = run_body(data, 1.0, STEPS, POINT, decay("vx", known), STEPS)
             find.add(f"{words}, {c:.0e}", outcome, allowed, family, c, 1.0)
         falling = {
             "body": {"mass_kg": 1.0},
@@ -88,21 +86,7 @@ def fluid(find: Finding, quick: bool) -> None:
             return abs(results["vz"][-1] / speed - 1)
 
         # kick, drift, kick are exact for a constant force
-        find.add(f"falling, {c:.0e}", run_point(falling, fall), 1e-13, family, c, 1.0)
-
-
-def run_point(data: dict, error) -> Outcome:
-    """`run_body` for a point, which has no rotor."""
-    from rigidmd.study.stability import runs
-
-    def run() -> Outcome:
-        scene = runs.body_scene(data, 1.0, STEPS, SPLIT, STEPS)
-        scene["run"].pop("rotor")
-        results = runs.Simulation(runs.Scene.from_dict(scene)).run()
-        told = max(results.summary["largest_relative_error"].values(), default=0.0)
-        return Outcome(float(error(results)), float(told))
-
-    return attempt(run)
+        find.add(f"falling, {c:.0e}", run_body(falling, 1.0, STEPS, POINT, fall, STEPS), 1e-13, family, c, 1.0)
 
 
 @case(6, x="dt / time constant", error="kinetic energy, standard errors from the canonical mean")
@@ -113,7 +97,7 @@ def thermostat(find: Finding, quick: bool) -> None:
     for ratio in (1e-12, 1e6) if quick else [10.0**k for k in range(-12, 7, 3)]:
         step, steps = 0.5, 200
         heat = {"temperature_K": 298.0, "thermostat_time_ps": step / 1000 / ratio}
-        data = molecules_scene(water("spce"), WATER_BOX, step, steps, SPLIT, 298.0, heat, WATER_FORCES, looks=steps)
+        data = water_scene("spce", step, steps, SPLIT, 298.0, heat, looks=steps)
         weak = steps * ratio < 1e-3
 
         def error(results, weak=weak, ratio=ratio, steps=steps) -> float:

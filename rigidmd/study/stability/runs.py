@@ -1,16 +1,17 @@
-"""Scenes made in code, their runs and outcomes."""
+"""Cases, which are named ways to try to break the engine; scenes made in code, their runs and outcomes."""
 
 import time as clock
 from collections.abc import Callable
 from functools import cache
 from math import inf, nan
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
-from rigidmd.measure.stability import Outcome
+from rigidmd.measure.stability import Finding, Outcome
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Simulation
 from rigidmd.run.results import Results
@@ -26,12 +27,42 @@ FAMILIES = {
     "kahan_li_6": {"integrator": "kahan_li_6"},
 }
 SPLIT, EXACT = "velocity_verlet", "velocity_verlet, exact rotor"
+#: A body without rotation, which has no rotor.
+POINT = "velocity_verlet of a point"
 QUICK = (SPLIT, EXACT, "srkn_4")
 TEXTBOOK = {
     f"{solver}, {form}": {"integrator": solver, "formulation": form}
     for solver in ("rk4", "dop853")
     for form in ("matrix", "quaternion", "euler_angles")
 }
+
+
+#: A case adds trials to its finding; quick : fewer settings and integrators.
+Attempt = Callable[[Finding, bool], None]
+
+
+class Case(NamedTuple):
+    """A named way to try to break the engine. group : its number in the list of what the battery must hold."""
+
+    name: str
+    group: int
+    sentence: str
+    attempt: Attempt
+    titles: tuple[str, str, str]  # of x and of the error; unit of steps
+
+
+CASES: dict[str, Case] = {}
+
+
+def case(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[Attempt], Attempt]:
+    """Register a function as a case under its own name, with the first line of its docstring."""
+
+    def enter(attempt: Attempt) -> Attempt:
+        sentence = (attempt.__doc__ or "").strip().splitlines()[0].rstrip(".")
+        CASES[attempt.__name__] = Case(attempt.__name__, group, sentence, attempt, (x, error, step))
+        return attempt
+
+    return enter
 
 
 def families(quick: bool) -> tuple[str, ...]:
@@ -54,7 +85,7 @@ def attempt(run: Callable[[], Outcome]) -> Outcome:
 
 def body_scene(data: dict, step: float, duration: float, family: str, samples: int = 50) -> dict:
     """The tables of a body's scene with a run of this family; no files."""
-    known = FAMILIES | TEXTBOOK
+    known = FAMILIES | TEXTBOOK | {POINT: {"integrator": "velocity_verlet"}}
     run = {"duration_s": float(duration), "timestep_s": float(step)} | known[family]
     output = {"trajectory": False, "figures": False, "interval_s": max(float(step), float(duration) / samples)}
     return data | {"run": run, "output": output | {"interval_s": min(output["interval_s"], float(duration))}}
@@ -193,24 +224,26 @@ def only_built(data: dict) -> Outcome:
     return attempt(run)
 
 
-WATER_BOX, WATER_FORCES = {"density_g_cm3": 0.997}, {"cutoff_A": 6.0}
-WATERS = 64
+WATERS, WATER_FORCES = 64, {"cutoff_A": 6.0}
 
 
 @cache
 def liquid(model: str, temperature: float, step: float, steps: int) -> State:
     """A state of water after these steps (fs) at a temperature (K), from a lattice."""
-    heat = {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
-    data = molecules_scene(water(model), WATER_BOX, step, steps, SPLIT, temperature, heat, WATER_FORCES)
     with np.errstate(all="ignore"):
-        return simulate(data).state
+        return simulate(water_scene(model, step, steps, SPLIT, temperature, weak_heat(temperature, step))).state
 
 
-def water(model: str) -> list[dict]:
-    """A box of TIP4P of 1983, whose sites are given because it is not a shipped model."""
-    return [
-        {"name": "tip4p", "sites": TIP4P, "count": WATERS} if model == "tip4p" else {"model": model, "count": WATERS}
-    ]
+def weak_heat(temperature: float, step: float) -> dict:
+    """A thermostat with a time of 20 steps (fs)."""
+    return {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
+
+
+def water_scene(model: str, *settings, **more) -> dict:
+    """`molecules_scene` of a box of water; of TIP4P of 1983 sites are given, because it is not a shipped model."""
+    kind = {"name": "tip4p", "sites": TIP4P} if model == "tip4p" else {"model": model}
+    box = {"density_g_cm3": 0.997}
+    return molecules_scene([kind | {"count": WATERS}], box, *settings, forces=WATER_FORCES, **more)
 
 
 TIP4P = [

@@ -4,8 +4,7 @@ import numpy as np
 
 from rigidmd.measure.stability import REFUSED, RIGHT, Finding, Outcome, longest_step
 from rigidmd.mechanics.rotation import from_vector
-from rigidmd.study.stability.cases import case
-from rigidmd.study.stability.runs import EXACT, FAMILIES, SPLIT, TEXTBOOK, away_from, families, run_body
+from rigidmd.study.stability.runs import EXACT, FAMILIES, SPLIT, TEXTBOOK, away_from, case, families, run_body
 
 #: The benchmark of Bruls & Cardona: 150 rad/s, within 2.6e-13 of the lowest point; centre of mass at 0.5 s computed
 #: with 40 digits.

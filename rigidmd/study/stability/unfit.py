@@ -5,9 +5,8 @@ from collections.abc import Iterator
 from math import inf, nan
 
 from rigidmd.measure.stability import REFUSED, Finding
-from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.collisions import BOX, FORCES, bent, from_file, pair_of
-from rigidmd.study.stability.runs import EXACT, SPLIT, body_scene, molecules_scene, only_built, run_molecules
+from rigidmd.study.stability.runs import EXACT, SPLIT, body_scene, case, molecules_scene, only_built, run_molecules
 
 
 @case(13, error="energy error over kinetic energy", step="fs")

@@ -7,20 +7,19 @@ import numpy as np
 from rigidmd.core.state import State
 from rigidmd.measure.means import mean
 from rigidmd.measure.stability import Finding, Outcome, longest_step
-from rigidmd.study.stability.cases import case
 from rigidmd.study.stability.collisions import bent
 from rigidmd.study.stability.runs import (
     QUICK,
     SPLIT,
-    WATER_BOX,
-    WATER_FORCES,
     WATERS,
     attempt,
+    case,
     liquid,
     molecules_scene,
     run_molecules,
     simulate,
-    water,
+    water_scene,
+    weak_heat,
 )
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -72,17 +71,14 @@ def tip4p_steps(find: Finding, quick: bool) -> None:
 
 def moved(model: str, step: float, steps: int, family: str, state: State, scale: float) -> Outcome:
     """An NVE run of water from a state."""
-    return run_molecules(
-        molecules_scene(water(model), WATER_BOX, step, steps, family, 0.0, None, WATER_FORCES), state, scale=scale
-    )
+    return run_molecules(water_scene(model, step, steps, family, 0.0), state, scale=scale)
 
 
 def warm(model: str, temperature: float, step: float) -> State:
     """Liquid water at a temperature, reached from 298 K."""
     if temperature == 298.0:
         return liquid(model, 298.0, 1.0, 500)
-    heat = {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
-    data = molecules_scene(water(model), WATER_BOX, step, 1000, SPLIT, None, heat, WATER_FORCES)
+    data = water_scene(model, step, 1000, SPLIT, None, weak_heat(temperature, step))
     return simulate(data, liquid(model, 298.0, 1.0, 500)).state
 
 
@@ -92,9 +88,7 @@ def frozen() -> State:
     for _ in range(200):
         state.velocity[:] = 0.0
         state.angular_momentum_body[:] = 0.0
-        state = simulate(
-            molecules_scene(water("spce"), WATER_BOX, 0.5, 20, SPLIT, 0.0, None, WATER_FORCES), state
-        ).state
+        state = simulate(water_scene("spce", 0.5, 20, SPLIT, 0.0), state).state
     state.velocity[:] = 0.0
     state.angular_momentum_body[:] = 0.0
     return state
