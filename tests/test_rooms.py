@@ -43,7 +43,7 @@ LIBRARIES = {
     "gsd": {"assemble/gsd_format.py", "output/gsd_file.py"},
     "tomli_w": {"output/scene_file.py"},
     "rocket_fft": {"forces/waves/mesh.py"},
-    "sympy": {"forces/laws/formulas.py", "peers/tables.py"},
+    "sympy": {"forces/laws/formulas.py", "peers/formulas.py"},
     "openmm": {"peers/openmm_system.py", "peers/openmm_files.py"},
     "matplotlib": {
         "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.resolve import charges_in
 from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.coulomb import reaction_field, self_energy
@@ -16,7 +17,6 @@ from rigidmd.forces.pairs.space import Space, cell_of
 from rigidmd.forces.waves import corrections, ewald, vectors
 from rigidmd.forces.waves.errors import (
     Charges,
-    charges_of,
     mesh_error,
     radius_of,
     real_error,
@@ -55,12 +55,7 @@ class Charged(NamedTuple):
     @property
     def summed(self) -> Charges:
         """All charges, in the form that error estimates need."""
-        return charges_of(
-            [
-                (int((self.species_index == k).sum()), m.charges[c], m.positions_body[c])
-                for k, (m, c) in enumerate(zip(self.species, self.chosen, strict=True))
-            ]
-        )
+        return charges_in(self.species, np.bincount(self.species_index, minlength=len(self.species)))
 
     def each(self, what: Callable[[np.ndarray, np.ndarray], float]) -> float:
         """Sum of what(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen."""

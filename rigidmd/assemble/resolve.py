@@ -61,13 +61,7 @@ class Facts(NamedTuple):
     @property
     def charges(self) -> Charges:
         """The charges of all molecules."""
-        sites = [m.charges != 0 for m in self.species]
-        return charges_of(
-            [
-                (int(count), m.charges[own], m.positions_body[own])
-                for count, m, own in zip(self.counts, self.species, sites, strict=True)
-            ]
-        )
+        return charges_in(self.species, self.counts)
 
     @property
     def reciprocal(self) -> np.ndarray:
@@ -78,6 +72,14 @@ class Facts(NamedTuple):
     def is_as_described(self) -> bool:
         """Whether the box has the edges of the cell that was described."""
         return np.array_equal(self.basis, AS_GIVEN)
+
+
+def charges_in(species: list[Molecule], counts: np.ndarray) -> Charges:
+    """The charges of so many molecules of each species, in the form that estimates of errors need."""
+    charged = [(m, m.charges != 0) for m in species]
+    return charges_of(
+        [(int(n), m.charges[own], m.positions_body[own]) for n, (m, own) in zip(counts, charged, strict=True)]
+    )
 
 
 class Resolved(NamedTuple):

@@ -163,21 +163,12 @@ def longest_step(
         seen[step] = run(step)
         return bounded(seen[step], bound)
 
-    good, bad = 0.0, inf
-    if look(start):
-        good = start
-        for _ in range(DOUBLINGS):
-            if not look(2 * good):
-                bad = 2 * good
-                break
-            good *= 2
-    else:
-        bad = start
-        for _ in range(DOUBLINGS):
-            if look(bad / 2):
-                good = bad / 2
-                break
-            bad /= 2
+    good, bad = (start, inf) if look(start) else (0.0, start)
+    for _ in range(DOUBLINGS):
+        if good > 0 and bad < inf:
+            break
+        step = 2 * good if good > 0 else bad / 2
+        good, bad = (step, bad) if look(step) else (good, step)
     while good > 0 and bad < inf and bad > RATIO * good:
         middle = (good * bad) ** 0.5
         good, bad = (middle, bad) if look(middle) else (good, middle)

@@ -15,11 +15,11 @@ from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
 from rigidmd.assemble.system import System
 from rigidmd.core.schemes import Scheme, Solver
 from rigidmd.core.state import Load, State
+from rigidmd.dynamics.advance import Model
 from rigidmd.dynamics.sums import Extent, extent_of
 from rigidmd.engines.cpu import BehindWallError, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.fields import SteadyForce
-from rigidmd.measure.kicks import kicks
 from rigidmd.measure.motion import energies, is_balanced
 from rigidmd.measure.samples import Sample
 from rigidmd.mechanics.rotation import orthogonality_error
@@ -415,3 +415,17 @@ class BodyCheck:
         else:
             cause = Cause("timestep_s is too long for this motion, or a force grows without bound", shorter)
         return f"{finding}. Likely cause: {cause.likely}. Try {cause.advice}"
+
+
+def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
+    """Largest kick of each molecule (n,) in a step, relative to the thermal size of that momentum.
+
+    A kick F dt beyond sqrt(m kT), or n dt beyond sqrt(I kT), comes from an overlap, not from a liquid. The measure is
+    relative to the scene's own masses, temperature and time step.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.abs(load.force).max(axis=1) * dt * np.sqrt(model.inverse_mass[model.species] / thermal)
+        turn = np.abs(load.torque_body) * dt / np.sqrt(model.inertia[model.species] * thermal)[: len(load.torque_body)]
+    turn = np.where((model.inertia[model.species] > 0)[: len(turn)], turn, 0.0)
+    found[: len(turn)] = np.maximum(found[: len(turn)], turn.max(axis=1, initial=0.0))
+    return found

@@ -1,7 +1,11 @@
-"""Pair laws as formulas of r with the numbers of the laws, where an engine has no form of its own with the same ending.
+"""Pair laws as formulas and tables of r, where an engine has no form of its own with the same ending.
 
 They are in the language of Lepton, which OpenMM reads: x^2, max, erfc, and definitions behind semicolons.
 """
+
+from typing import Any
+
+import numpy as np
 
 from rigidmd.forces.laws.coulomb import ReactionField
 from rigidmd.forces.laws.endings import Bent, Shape, SmoothlySwitched, Switched
@@ -42,3 +46,28 @@ def _ended(formula: str, shape: Shape, end: tuple[float, ...]) -> str:
         width = float(shape.cutoff - shape.start)
         return f"({whole})*({SWITCHES[type(shape)]}); t=max(0,(r-{float(shape.start)!r})/{width!r})"
     return whole
+
+
+def table(formula: str, first: float, last: float, entries: int) -> str:
+    """A table of LAMMPS' pair style table, even in r² from `first` to `last` Å: number, r, energy, force."""
+    r = np.sqrt(np.linspace(first**2, last**2, entries))
+    energy, force = _functions(formula)
+    with np.errstate(all="ignore"):
+        u, f = energy(r), force(r)
+    head = f"N {entries} RSQ {first:.17g} {last:.17g}\n\n"
+    rows = zip(r, np.broadcast_to(u, r.shape), np.broadcast_to(f, r.shape), strict=True)
+    return head + "".join(f"{k} {x:.15g} {a:.15g} {b:.15g}\n" for k, (x, a, b) in enumerate(rows, 1))
+
+
+def _functions(formula: str):
+    """Functions of arrays of r: energy, and force -dU/dr."""
+    import sympy  # slow to import
+
+    r = sympy.Symbol("r", positive=True)
+    text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
+    names: dict[str, Any] = {"r": r, "max": sympy.Max}
+    for definition in reversed(definitions):
+        name, _, value = definition.partition("=")
+        names[name] = sympy.parse_expr(value, names)
+    energy = sympy.parse_expr(text, names)
+    return (sympy.lambdify(r, part, ["numpy", "scipy"]) for part in (energy, -sympy.diff(energy, r)))

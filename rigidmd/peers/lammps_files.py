@@ -13,9 +13,8 @@ from rigidmd.core.state import State
 from rigidmd.forces.laws.endings import Plain
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.output.plain_text import in_comment
-from rigidmd.peers.formulas import coulomb_formula, lennard_jones_formula
+from rigidmd.peers.formulas import coulomb_formula, lennard_jones_formula, table
 from rigidmd.peers.portrait import Portrait, strange
-from rigidmd.peers.tables import table
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, COULOMB, ENERGY_UNITS
 

@@ -5,21 +5,24 @@ are virtual. Its units are nm, ps, u, e and kJ/mol.
 """
 
 import re
-from math import inf
+from math import inf, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.special import erfc
 
+from rigidmd.assemble.resolve import charges_in
 from rigidmd.errors import EngineError
 from rigidmd.forces.laws.endings import Plain, Switched
 from rigidmd.forces.laws.lennard_jones import LennardJones
 from rigidmd.forces.laws.screened import DampedShiftedForce, ScreenedCoulomb
+from rigidmd.forces.pairs.space import cell_of
+from rigidmd.forces.waves.errors import mesh_for, real_error
+from rigidmd.forces.waves.mesh import Pme
 from rigidmd.molecules import of_each
 from rigidmd.peers.bodies import Points
 from rigidmd.peers.formulas import coulomb_formula, lennard_jones_formula
 from rigidmd.peers.mass_points import MassPoints, mass_points
-from rigidmd.peers.mesh import grid_for
 from rigidmd.peers.portrait import Portrait, strange
 from rigidmd.scene.stage import Stage
 from rigidmd.units import COULOMB, KJ_PER_MOL
@@ -61,6 +64,26 @@ def faults(portrait: Portrait) -> list[str]:
     if portrait.frozen.any() and any(stage.has_barostat for stage in system.scene.stages):
         found.append("a barostat with frozen molecules: OpenMM would move them with the box")
     return found
+
+
+def grid_for(portrait: Portrait, order: int) -> tuple[int, int, int] | None:
+    """A grid for splines of an order with the accuracy of the scene's Ewald sum; None if there is none.
+
+    The scene's own grid if its splines are of that order or a lower one.
+    """
+    system, law = portrait.system, portrait.coulomb
+    own = system.terms.get("coulomb_reciprocal")
+    if isinstance(own, Pme) and own.order <= order:
+        a, b, c = own.grid
+        return a, b, c
+    if not isinstance(law, ScreenedCoulomb) or system.space.volume == inf:
+        return None
+    counts = np.bincount(system.model.species, minlength=len(system.species))
+    charges = charges_in(system.species, counts)
+    beyond = real_error(charges, law.alpha, law.cutoff, system.space.volume)
+    error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - beyond**2, 0.0))
+    found = mesh_for(charges, law.alpha, cell_of(system.space), error, order)
+    return None if found is None else found[0]
 
 
 def _stage_faults(stage: Stage) -> list[str]:

@@ -10,7 +10,7 @@ from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
 from rigidmd.engines import Engine
 from rigidmd.engines.cpu import BehindWallError
-from rigidmd.measure.kicks import kicks
+from rigidmd.measure.watch import kicks
 from rigidmd.mechanics.rotation import from_vector
 
 MOST_STEPS = 2000
