@@ -3,13 +3,30 @@
 import argparse
 import re
 import sys
-from math import inf
+from collections.abc import Callable
+from math import inf, nan
+from typing import Any
 
 #: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
 BY_SIGNAL = 128
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
 #: Exit code of a run that stopped because its wall time was up: run it again with --resume.
 OUT_OF_TIME = 75
+
+
+def number(kind: type, least: float, most: float, what: str) -> Callable[[str], Any]:
+    """A reader of numbers in a range, whole or real ones, for argparse; what : what they are, in words."""
+
+    def read(text: str) -> Any:
+        try:
+            value = kind(text) if kind is float or text.isdigit() else nan
+        except ValueError:
+            value = nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+        return value
+
+    return read
 
 
 def time_ps(text: str) -> float:

@@ -121,6 +121,26 @@ def _is_union_branch(key: Any) -> bool:
     return isinstance(key, str) and bool(re.search(r"[\[(]|^(constrained-)?(float|int|bool|str)$", key))
 
 
+#: Sentences on a value by the type of pydantic's error.
+SENTENCES = {
+    "missing": "is missing",
+    "too_long": "has {actual_length} entries, must not have more than {max_length}",
+    "too_short": "has {actual_length} entries, needs at least {min_length}",
+    "greater_than": "is {shown}, must be greater than {gt:g}",
+    "greater_than_equal": "is {shown}, must not be less than {ge:g}",
+    "less_than_equal": "is {shown}, must not be more than {le:g}",
+    "finite_number": "is {shown}, must be a finite number",
+    "float_type": "is {shown}, must be a number",
+    "int_type": "is {shown}, must be a whole number",
+    "int_from_float": "is {shown}, must be a whole number",
+    "bool_type": "is {shown}, must be true or false",
+    "string_type": "is {shown}, must be a text in quotes",
+    **dict.fromkeys(("tuple_type", "list_type"), "is {shown}, must be a list"),
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "is {shown}, must be a table"),
+    "value_error": "{error}",
+}
+
+
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
     shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shortened(value)
@@ -132,44 +152,17 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
             return "unknown key" + (meant(str(keys[-1]), known) or listed)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
-        case "missing":
-            return "is missing"
-        case "too_long":
-            return f"has {context['actual_length']} entries, must not have more than {context['max_length']}"
-        case "greater_than":
-            return f"is {shown}, must be greater than {context['gt']:g}"
-        case "greater_than_equal":
-            return f"is {shown}, must not be less than {context['ge']:g}"
-        case "finite_number":
-            return f"is {shown}, must be a finite number"
-        case "float_type":
-            return f"is {shown}, must be a number"
-        case "int_type" | "int_from_float":
-            return f"is {shown}, must be a whole number"
-        case "bool_type":
-            return f"is {shown}, must be true or false"
-        case "string_type":
-            return f"is {shown}, must be a text in quotes"
         case "literal_error":
             wanted = context["expected"]
             return f"is {shown}, must be {wanted}" + meant(str(value), re.findall(r"'([^']*)'", wanted))
-        case "too_short":
-            least = context["min_length"]
-            return f"has {context['actual_length']} entries, needs at least {least}"
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
-        case "tuple_type" | "list_type":
-            return f"is {shown}, must be a list"
-        case "model_type" | "model_attributes_type" | "dict_type":
-            return f"is {shown}, must be a table"
-        case "less_than_equal":
-            return f"is {shown}, must not be more than {context['le']:g}"
         case "string_pattern_mismatch" if "!-~" in context["pattern"]:
             return f"is {shown}, must be one to five visible ASCII characters without spaces"
         case "string_pattern_mismatch" if "x1f" in context["pattern"]:
             return f"is {shown}, must be one line without control characters"
-        case "value_error":
-            return str(context["error"])
+        case kind if kind in SENTENCES:
+            return SENTENCES[kind].format(shown=shown, **context)
     return f"is {shown}: {detail['msg']}"
 
 

@@ -15,7 +15,7 @@ from rigidmd.measure.means import error_of_mean
 from rigidmd.output.folder import add_to_folder
 from rigidmd.output.sweep_folder import FINISHED, Manifest, Point, read_manifest, state_on_disk
 from rigidmd.output.sweep_names import in_words, short_keys
-from rigidmd.output.write import nine_digits, write_csv
+from rigidmd.output.write import nine_digits, write_csv, writing
 
 ANALYSES = "analysis.csv"
 
@@ -97,10 +97,8 @@ def _combined(
     if len(own) < 2:
         return Combination(title, values, 1, findings, missed | why, own[0].files)
     where = folder / manifest.folder_of(values) if values else folder
-    try:
+    with writing(where, "made"):
         where.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{where} cannot be made: {error.strerror}") from None
     stretch = {
         "stage": own[0].stretch["stage"],
         "from_ps": min(one.stretch["from_ps"] for one in own),

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from rigidmd.arguments import number
+
 
 def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add them with `add(name, function, about, example)`."""
@@ -25,8 +27,10 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     _run_arguments(view, "page (default: view.html in the folder of the run)")
     film = add("film", _film, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots")
     _run_arguments(film, ".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)")
-    film.add_argument("--seconds", type=_seconds, default=10.0, metavar="S", help="length of the film (default: 10)")
-    film.add_argument("--height", type=_height, metavar="N", help="pixels (default: 640, of a .gif 448)")
+    length = number(float, 0.1, 3600, "a number of seconds from 0.1 to 3600")
+    height = number(int, 100, 2160, "a number of pixels from 100 to 2160")
+    film.add_argument("--seconds", type=length, default=10.0, metavar="S", help="length of the film (default: 10)")
+    film.add_argument("--height", type=height, metavar="N", help="pixels (default: 640, of a .gif 448)")
     film.add_argument("--plots", action="store_true", help="put plots with a moving cursor beside it")
 
     gallery = add(
@@ -46,24 +50,6 @@ def _run_arguments(parser: argparse.ArgumentParser, about: str) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help=about)
     parser.add_argument("--force", action="store_true", help="replace that file")
     parser.set_defaults(scene="this run", writes=True)
-
-
-def _seconds(text: str) -> float:
-    """A length of a film."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.1 <= value <= 3600:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds from 0.1 to 3600")
-    return value
-
-
-def _height(text: str) -> int:
-    """A height of a film."""
-    if not text.isdigit() or not 100 <= int(text) <= 2160:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of pixels from 100 to 2160")
-    return int(text)
 
 
 def _target(options: argparse.Namespace, default: str, endings: tuple[str, ...]) -> Path:

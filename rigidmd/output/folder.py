@@ -9,6 +9,7 @@ from filelock import FileLock, Timeout
 from rigidmd.core.files import file_fault, write_text
 from rigidmd.core.toml_text import cut
 from rigidmd.errors import OutputError
+from rigidmd.output.write import writing
 
 #: Files of a run; the scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
@@ -79,7 +80,7 @@ def make_folder(
     """
     names = list(names)
     check_folder(folder, force, inputs, names)
-    try:
+    with writing(folder, "made"):
         folder.mkdir(parents=True, exist_ok=True)
         if lock is not None and not lock.is_taken:
             lock.take()
@@ -87,8 +88,6 @@ def make_folder(
         for name in written_by_runs(folder):
             (folder / name).unlink(missing_ok=True)
         write_marker(folder, names)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be made: {error.strerror}") from None
 
 
 def continue_folder(folder: Path, names: Iterable[str]) -> None:
@@ -97,10 +96,8 @@ def continue_folder(folder: Path, names: Iterable[str]) -> None:
     Raises OutputError.
     """
     add_to_folder(folder, names)
-    try:
+    with writing(folder):
         (folder / SUMMARY).unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
 
 
 def check_is_run(folder: Path) -> None:

@@ -22,7 +22,7 @@ from rigidmd.output.folder import (
 )
 from rigidmd.output.run_files import Bounded, Summary, read_json
 from rigidmd.output.sweep_names import point_name, short_keys
-from rigidmd.output.write import write_json
+from rigidmd.output.write import write_json, writing
 from rigidmd.validation import settled
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
@@ -152,10 +152,8 @@ def check_sweep_folder(folder: Path) -> None:
 
 def make_sweep_folder(folder: Path) -> None:
     """Make it, and note the files that a sweep writes there. Raises OutputError."""
-    try:
+    with writing(folder, "made", "; name another folder with -o"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be made: {error.strerror}; name another folder with -o") from None
     add_to_folder(folder, FILES)
 
 
@@ -164,7 +162,7 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
     for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
         if not inner.is_dir() or (inner.is_symlink() and inner != folder):
             continue
-        try:
+        with writing(inner, "cleared"):
             for name in written_by_runs(inner):
                 for own in (inner / name, *offsets_of(inner / name)):
                     own.unlink(missing_ok=True)
@@ -173,8 +171,6 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
                 (inner / LOCK).unlink(missing_ok=True)
                 with contextlib.suppress(OSError):  # it holds files of others
                     inner.rmdir()
-        except OSError as error:
-            raise OutputError(f"{inner} cannot be cleared: {error.strerror}") from None
 
 
 def state_on_disk(folder: Path, point: Point) -> str:

@@ -16,6 +16,7 @@ from rigidmd.assemble.traj_format import ATOMS, MASSLESS, MASSLESS_VELOCITY, Sto
 from rigidmd.core.files import begin_file, file_fault, whole_file
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
+from rigidmd.output.write import writing
 
 
 class TrajFile:
@@ -43,11 +44,9 @@ class TrajFile:
                 pass
 
     def _begin(self) -> None:
-        try:
+        with writing(self._path):
             begin_file(self._path)
             self._file = TrajectoryWriter(self._path, "w")
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror or error}") from None
 
     def cut(self) -> None:
         """Leave out the frames that came after the time of `kept`."""
@@ -57,19 +56,15 @@ class TrajFile:
         with whole_file(self._path) as temporary, contextlib.closing(TrajectoryWriter(temporary, "w")) as new:
             for frame in self._kept_frames():
                 self._append(new, frame)
-        try:
+        with writing(self._path):
             self._file = TrajectoryWriter(self._path, "a")
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror or error}") from None
 
     @property
     def kept(self) -> tuple[int, int]:
         """Checksum of all frames, which are on the disk, and their number."""
         backend: Any = self._file.backend
-        try:
+        with writing(self._path):
             os.fsync(backend.fd.fileno())
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
         return self._sum, self._frames
 
     def write(self, state: State, time: float, step: int) -> None:
@@ -86,19 +81,15 @@ class TrajFile:
             found = found._replace(momenta=moving.get_momenta())
             if len(self._others):
                 found = found._replace(massless_velocity=velocity[self._others])
-        try:
+        with writing(self._path):
             self._append(self._file, found)
             self._sum, self._frames = self._summed(found), self._frames + 1
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
 
     def close(self) -> None:
         """Finish the file."""
-        try:
+        with writing(self._path):
             if self._file is not None:
                 self._file.close()
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror}") from None
 
     def _append(self, file: TrajectoryWriter, frame: Stored) -> None:
         atoms = self._like

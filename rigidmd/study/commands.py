@@ -4,10 +4,11 @@ import argparse
 import shlex
 import sys
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigidmd.arguments import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME, add_trust, say, seconds, warn
+from rigidmd.arguments import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME, add_trust, number, say, seconds, warn
 from rigidmd.errors import visible
 
 if TYPE_CHECKING:
@@ -27,6 +28,9 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  rigidmd sweep water.toml --replicas 8\n"
         "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     )
+    count = number(int, 1, 4096, "a number from 1 to 4096")
+    seeds = number(int, 2, 10000, "a number of replicas from 2 on")
+    index = number(int, 0, inf, "the number of a point, from 0 on")
     sweep.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
     sweep.add_argument(
         "--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
@@ -34,14 +38,14 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "KEY,KEY=A,B for keys that go together; may be repeated: all combinations run",
     )  # fmt: skip
     sweep.add_argument(
-        "--replicas", type=_replicas, metavar="N", help="N seeds, from that of the scene on: errors from their scatter"
+        "--replicas", type=seeds, metavar="N", help="N seeds, from that of the scene on: errors from their scatter"
     )
     sweep.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-sweep)")
     sweep.add_argument("--force", action="store_true", help="remove an earlier sweep in that folder and begin anew")
     sweep.add_argument(
-        "--jobs", type=_count, metavar="N", help="points at a time (default: so many that cores are full)"
+        "--jobs", type=count, metavar="N", help="points at a time (default: so many that cores are full)"
     )
-    sweep.add_argument("--threads", type=_count, metavar="N", help="threads of each point (default: cores over jobs)")
+    sweep.add_argument("--threads", type=count, metavar="N", help="threads of each point (default: cores over jobs)")
     sweep.add_argument(
         "--walltime", type=seconds, metavar="H:MM:SS",
         help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job",
@@ -56,27 +60,9 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     sweep.add_argument(
         "--collect", action="store_true", help="run nothing, and write table and figure of what is there"
     )
-    sweep.add_argument("--point", type=_index, metavar="K", help="run point K of a sweep that is there, from 0 on")
+    sweep.add_argument("--point", type=index, metavar="K", help="run point K of a sweep that is there, from 0 on")
     add_trust(sweep)
     sweep.set_defaults(overrides=[], writes=True)
-
-
-def _count(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 4096:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 1 to 4096")
-    return int(text)
-
-
-def _replicas(text: str) -> int:
-    if not text.isdigit() or not 2 <= int(text) <= 10000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of replicas from 2 on")
-    return int(text)
-
-
-def _index(text: str) -> int:
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not the number of a point, from 0 on")
-    return int(text)
 
 
 def _sweep(options: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from rigidmd.core.state import State
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.output.folder import SCENE, check_names, write_marker, written_by_runs
 from rigidmd.output.scene_file import input_names, write_scene
+from rigidmd.output.write import writing
 from rigidmd.peers.portrait import Portrait, portrait
 from rigidmd.run import MolecularSimulation
 from rigidmd.scene import MolecularScene, Scene
@@ -57,7 +58,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     if faults:
         raise SceneError(scene.source, [f"{writer.title}: {fault}" for fault in faults])
     state = start_of(system)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".export", dir=folder) as made:
             write_scene(Path(made), system.scene)
@@ -68,8 +69,6 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
             for name in names:
                 (Path(made) / name).replace(folder / name)
         write_marker(folder, names, MARKER)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
     return Exported(writer.title, names, system.notes, writer.command)
 
 
