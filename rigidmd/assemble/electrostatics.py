@@ -10,6 +10,7 @@ from rigidmd.assemble.resolve import charges_in
 from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces.laws.coulomb import reaction_field, self_energy
+from rigidmd.forces.laws.lennard_jones import Tail
 from rigidmd.forces.laws.screened import damped_self_energy, damped_shifted_force, screened_coulomb
 from rigidmd.forces.pairs.loop import pair_forces
 from rigidmd.forces.pairs.sites import BodySites, CentralSites
@@ -66,19 +67,20 @@ class Charged(NamedTuple):
         return total
 
 
-class Electrostatics(NamedTuple):
-    """The contributions of charges to a system."""
+class Interactions(NamedTuple):
+    """The interactions between molecules."""
 
     terms: dict[str, NamedTuple]
-    constants: dict[str, float]  # u Å²/ps²
+    constants: dict[str, float]  # constant energies, u Å²/ps²
     pressure: float = 0.0  # a constant part of the pressure, u/(Å ps²)
-    force_error: float | None = None  # estimated rms error of the force on a site, u Å/ps²; with Ewald sums
+    tail: Tail | None = None  # where the scene asks for it
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: tuple[str, ...] = ()
 
 
 def electrostatics(
     scene: MolecularScene, charged: Charged, space: Space, state: State, basis: np.ndarray, grid: Grid | None
-) -> Electrostatics:
+) -> Interactions:
     """The contributions of the charges of a resolved scene. Raises SceneError.
 
     basis (3, 3) : integers, the edges of the box in those of the described cell, to which ewald_k_max refers
@@ -94,11 +96,11 @@ def electrostatics(
         start = forces.switch_start_A or cutoff
         law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
         own = charged.each(lambda q, x: self_energy(law._replace(charge=q), x)) if cutoff < inf else None
-        return Electrostatics({"coulomb": between_pairs(law)}, {} if own is None else {"reaction_field_self": own})
+        return Interactions({"coulomb": between_pairs(law)}, {} if own is None else {"reaction_field_self": own})
     if forces.electrostatics == "damped_shifted_force":
         law = damped_shifted_force(charge, cutoff, forces.damping_per_A)
         own = charged.each(lambda q, x: damped_self_energy(law._replace(charge=q), x))
-        return Electrostatics({"coulomb": between_pairs(law)}, {"damped_self": own})
+        return Interactions({"coulomb": between_pairs(law)}, {"damped_self": own})
     return _ewald(scene, charged, space, between_pairs, state, basis, grid)
 
 
@@ -142,7 +144,7 @@ def _ewald(
     state: State,
     basis: np.ndarray,
     grid: Grid | None,
-) -> Electrostatics:
+) -> Interactions:
     forces, found = scene.forces, _waves(scene, charged, space, basis, grid)
     alpha, cutoff = settled(forces.ewald_alpha_per_A), settled(forces.cutoff_A)
     charge = charged.charge_e * COULOMB_CHARGE
@@ -195,7 +197,7 @@ def _ewald(
         constants["coulomb_frozen"], pressure = _of_frozen(
             charged, charge * still, space, alpha, settled(found.waves), permittivity, state
         )
-    return Electrostatics(terms, constants, pressure, error * COULOMB, tuple(notes))
+    return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
 
 
 def _of_frozen(

@@ -26,7 +26,7 @@ def overlaps(system: "System") -> list[str]:
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
     widest = max((sigma.max() for sigma in cores), default=0.0)
-    wanted = (inside, every_site), (OVERLAP * widest, _repelling)
+    wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     near = close_pairs(system, system.state, *wanted)
     sigma = of_each(cores, system.model.species) if near else np.zeros(0)
     faults = []
@@ -44,10 +44,6 @@ def overlaps(system: "System") -> list[str]:
 def every_site(molecule: Molecule) -> np.ndarray:
     """The sites of a molecule, as indices."""
     return np.arange(len(molecule.masses))
-
-
-def _repelling(molecule: Molecule) -> np.ndarray:
-    return np.flatnonzero(molecule.epsilon > 0)
 
 
 def close_pairs(

@@ -1,15 +1,14 @@
 """The interactions of a resolved scene: terms, constants, tail correction."""
 
 from math import inf
-from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.electrostatics import Charged, electrostatics
+from rigidmd.assemble.electrostatics import Charged, Interactions, electrostatics
 from rigidmd.core.state import State
 from rigidmd.dynamics.advance import Model
 from rigidmd.errors import SceneError
-from rigidmd.forces.laws.lennard_jones import LennardJones, Tail, lennard_jones, tail
+from rigidmd.forces.laws.lennard_jones import LennardJones, lennard_jones, tail
 from rigidmd.forces.pairs.loop import pair_forces
 from rigidmd.forces.pairs.sites import groups, sites_of
 from rigidmd.forces.pairs.space import Space
@@ -18,17 +17,6 @@ from rigidmd.molecules import Molecule, named_sites, of_each
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import ROUNDED, short_cutoff
 from rigidmd.units import KJ_PER_MOL
-
-
-class Interactions(NamedTuple):
-    """The interactions between molecules."""
-
-    terms: dict[str, NamedTuple]
-    constants: dict[str, float]  # constant energies, u Å²/ps²
-    pressure: float = 0.0  # a constant part of the pressure, u/(Å ps²)
-    tail: Tail | None = None  # where the scene asks for it
-    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
-    notes: tuple[str, ...] = ()
 
 
 def _taking_part(species: list[Molecule], model: Model, chosen: list[np.ndarray]):

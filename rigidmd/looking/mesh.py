@@ -1,5 +1,6 @@
 """The surface of a single body, to be drawn: its solid, its points joined, or a solid of the same inertia."""
 
+from functools import partial
 from itertools import pairwise, product
 from typing import NamedTuple
 
@@ -172,16 +173,8 @@ def _ball() -> Mesh:
     return _stack([(np.sin(a), np.cos(a)) for a in polar])
 
 
-def _cylinder() -> Mesh:
-    return _stack([(1.0, -0.5), (1.0, 0.5)])
-
-
-def _cone() -> Mesh:
-    return _stack([(0.0, -0.75), (1.0, 0.25)])
-
-
-def _rod() -> Mesh:
-    return _stack([(0.5, -0.5), (0.5, 0.5)])
+_cylinder, _rod = partial(_stack, [(1.0, -0.5), (1.0, 0.5)]), partial(_stack, [(0.5, -0.5), (0.5, 0.5)])
+_cone = partial(_stack, [(0.0, -0.75), (1.0, 0.25)])
 
 
 def _ring() -> Mesh:

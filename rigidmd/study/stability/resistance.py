@@ -4,17 +4,16 @@ from math import expm1, sqrt
 
 import numpy as np
 
-from rigidmd.measure.stability import Finding, Outcome
+from rigidmd.measure.stability import Finding
 from rigidmd.study.stability.runs import (
     POINT,
     QUICK,
     SPLIT,
     WATERS,
-    attempt,
     case,
     liquid,
     run_body,
-    simulate,
+    run_molecules,
     water_scene,
 )
 
@@ -112,16 +111,9 @@ def thermostat(find: Finding, quick: bool) -> None:
 
         find.add(
             f"dt/tau = {ratio:.0e}",
-            attempt(lambda data=data, error=error: outcome_of(data, state, error)),
+            run_molecules(data, state, error),
             1.0 if weak else 5.0,
             SPLIT,
             ratio,
             step,
         )
-
-
-def outcome_of(data: dict, state, error) -> Outcome:
-    """Error of the conserved energy of a run with a thermostat."""
-    results = simulate(data, state)
-    told = np.abs(results["drift"]).max() / results["kinetic"][0]
-    return Outcome(float(error(results)), float(told))

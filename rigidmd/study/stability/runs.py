@@ -106,14 +106,9 @@ def run_body(
     return attempt(run)
 
 
-def last_rotation(results: Results) -> np.ndarray:
-    """Q (3, 3) of the body's own axes at the end."""
-    return np.array([[results[f"q{i}{j}"][-1] for j in (1, 2, 3)] for i in (1, 2, 3)])
-
-
 def away_from(rotation: np.ndarray) -> Callable[[Results], float]:
-    """The largest entry of |Q - Q_known| at the end."""
-    return lambda results: np.abs(last_rotation(results) - rotation).max()
+    """The largest entry of |Q - Q_known| at the end, Q of the body's own axes."""
+    return lambda results: np.abs([[results[f"q{i}{j}"][-1] for j in (1, 2, 3)] for i in (1, 2, 3)] - rotation).max()
 
 
 def invariants(results: Results) -> float:
