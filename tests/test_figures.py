@@ -187,16 +187,17 @@ def test_as_many_integrators_as_there_are_are_told_apart():
         for n, name in enumerate(names)
         for k in (1, 2, 3)
     ]
-    for axis in precision_report.figure_of(Precision(subject, trials, 10, 1e-30)).axes:
+    figure = precision_report.figure_of(Precision(subject, trials, 10, 1e-30))
+    for axis in figure.axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names
         styles = {(line.get_color(), line.get_linestyle(), str(line._dash_pattern)) for line in curves}
         assert len(styles) == len(names)
-    left, right = figures[0].axes
+    left, right = figure.axes
     for axis, error in ((left, "trajectory_error"), (right, "energy_rms")):
         front = [f"{trial.timestep:.2g}" for trial in Precision(subject, trials, 10, 1e-30).front(error)]
         steps = [text.get_text() for text in axis.texts if text.get_text() != "error of the reference"]
         assert 0 < len(steps) <= len(front)  # of the best alone, and not one on another
         assert set(steps) <= set(front)
         assert axis.get_xlabel() == ""  # one label for both panels
-    assert figures[0].get_supxlabel() == "computing time (s) per s of motion"
+    assert figure.get_supxlabel() == "computing time (s) per s of motion"
