@@ -481,6 +481,7 @@ def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys
 def test_force_replaces_only_what_an_export_has_written(again, capsys):
     made = again / "made"
     command = ["export", str(again / "water.toml"), "--to", "gromacs", "-o", str(made)]
+    change(again / "water.toml", "smooth_switch", "shift")
     assert cli.main(command) == 0 and cli.main([*command, "--force"]) == 0
     change(made / ".rigidmd-export", "run.sh\n", "")
     (made / "run.sh").write_text("precious")
