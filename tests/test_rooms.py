@@ -50,7 +50,7 @@ LIBRARIES = {
         "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
         "looking/film.py", "analyse/files.py", "output/sweep_figure.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
     },
-    "pydantic": {"validation.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py", "scene/engine.py"},
+    "pydantic": {"validation.py", "output/run_files.py", "output/sweep_folder.py", "analyse/files.py", "molecules.py", "scene/__init__.py", "scene/base.py", "scene/molecules.py", "scene/fields.py", "scene/forces.py", "scene/place.py", "scene/species.py", "scene/stage.py", "scene/body.py", "scene/actions.py", "scene/engine.py"},
     "IPython": {"output/progress.py"},
     "chemiscope": {"looking/inline.py"},
     "numba": {
