@@ -497,12 +497,13 @@ class Simulation(Base):
                     to = agenda.next_look(done)
                     if pace > 0:
                         to = min(to, done + max(1, int(PIECE / pace)))  # the first step alone: it may take long
-                    shown = agenda.due(to)
+                    before, shown = shown, agenda.due(to)
                     looked = agenda.reads_energies(shown)
                     began = clock.perf_counter()
                     try:
                         self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
                     except Halted:
+                        shown = before
                         break
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
