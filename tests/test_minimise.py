@@ -24,6 +24,7 @@ from rigidmd.output.record import read_record
 from rigidmd.output.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run.enthalpy import Enthalpy
+from rigidmd.run.keeper import Keeper
 from rigidmd.run.minimise import minimise
 from rigidmd.scene import Scene
 from rigidmd.study.precision import precision
@@ -562,6 +563,25 @@ def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces
     several(tmp_path / "out", SEVERAL, "t.xtc", resume=True).run()
     for name in ("t.xtc", "log.csv", "pressure_tensor.csv", "final.npz"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_a_minimisation_and_its_overlap_removal_end_in_their_time(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(Keeper, "time_is_up", property(lambda self: asked.append(1) or len(asked) > 1))
+    (tmp_path / "two.xyz").write_text("3\n\nAr 0 0 0\nAr 0.9 0 0\nAr 0 1.1 0\n")
+    sections = {"structure": {"file": "two.xyz"}, "molecules": [{"model": "argon"}], "box": {"periodic": False}}
+    scene = small_scene({}, None, tmp_path, **sections, stages=[stage_of(), SHORT], start={})
+    results = Simulation(scene, tmp_path / "out", warn=lambda warning: None).run()
+    assert results.interrupted
+    assert results.out_of_time
+    (found,) = [stage["minimum"] for stage in results.summary["stages"]]
+    assert (found["converged"], found["ended_by"], found["iterations"]) == (False, "interrupted", 0)
+    assert found["relief_steps"] <= 2
+    monkeypatch.undo()
+    results = Simulation(scene, tmp_path / "out", resume=True, warn=lambda warning: None).run()
+    assert not results.interrupted
+    assert results.summary["stages"][0]["minimum"]["converged"]
+    assert results.summary["stages"][0]["minimum"]["relief_steps"] > 2
 
 
 def test_a_minimum_alone_has_one_frame(tmp_path):

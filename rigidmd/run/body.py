@@ -84,7 +84,7 @@ class BodySimulation(Simulation):
     def _reset(self) -> None:
         self.engine = self.system.engine()
         if isinstance(self.engine, OdeEngine):
-            self.engine.halts = lambda: self._interrupted or self._keeper.time_is_up
+            self.engine.halts = self._must_end
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:

@@ -497,14 +497,13 @@ class Simulation(Base):
                     to = agenda.next_look(done)
                     if pace > 0:
                         to = min(to, done + max(1, int(PIECE / pace)))  # the first step alone: it may take long
-                    shown = agenda.due(to)
+                    before, shown = shown, agenda.due(to)
                     looked = agenda.reads_energies(shown)
                     began = clock.perf_counter()
                     try:
                         self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
                     except Halted:
-                        self._out_of_time = not self._interrupted
-                        self._interrupted = True
+                        shown = before
                         break
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
@@ -514,9 +513,7 @@ class Simulation(Base):
                     advance, done = stretch.dt * (to - done), to
                     self._show(observers, self._moment(place, done), shown)
                     bar.update(advance)
-                    if self._keeper.time_is_up:
-                        self._interrupted = self._out_of_time = True
-                    elif done < stretch.steps and self._keeper.is_due:
+                    if not self._must_end() and done < stretch.steps and self._keeper.is_due:
                         self._checkpoint(named, place)
                 if not (stretch.act is not None and self._interrupted):
                     self._checkpoint(named, place)
@@ -555,6 +552,12 @@ class Simulation(Base):
                 return
             self.note(f"{type(observer).__name__} failed at {self.state.time[NOW]:g} {self.time_unit}: {reason}")
             self._interrupted, self._error = True, self._error or error
+
+    def _must_end(self) -> bool:
+        """Whether the run has been asked to end, or its time is up."""
+        if not self._interrupted and self._keeper.time_is_up:
+            self._interrupted = self._out_of_time = True
+        return self._interrupted
 
     def ask_for_checkpoint(self, number: int | None = None) -> None:
         """Write a checkpoint at the next look. number : of the signal that asks for it"""

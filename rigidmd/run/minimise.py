@@ -63,7 +63,7 @@ def minimise(
     point = start = enthalpy.at(state.copy())
     if not start.is_finite:
         raise SimulationError("energy or forces are not finite numbers: sites of different molecules coincide")
-    relief_steps = _relieve(system, enthalpy, point.state)
+    relief_steps = _relieve(system, enthalpy, point.state, stop)
     if relief_steps:
         point = enthalpy.at(point.state)
     descent = _Descent(enthalpy, system.smallest_diameter)
@@ -184,7 +184,7 @@ class _Descent:
         return None
 
 
-def _relieve(system: System, enthalpy: Enthalpy, state: State) -> int:
+def _relieve(system: System, enthalpy: Enthalpy, state: State, stop: Callable[[], bool]) -> int:
     """Move overlapping molecules apart, in place; the number of steps."""
     deepest = max((m.epsilon.max() for m in system.species), default=0.0)
     if not (deepest > 0 and enthalpy.free.any()):
@@ -193,7 +193,7 @@ def _relieve(system: System, enthalpy: Enthalpy, state: State) -> int:
     lightest = float(system.model.mass[system.model.species][enthalpy.free].min())
     # in this time step the limit of the force gives the lightest molecule a momentum of thermal size at kT = one well
     step = scale * np.sqrt(lightest / deepest) / OVERLAPPING
-    return relieve(system.model, enthalpy.engine, state, radius, scale, deepest, step).steps
+    return relieve(system.model, enthalpy.engine, state, radius, scale, deepest, step, stop).steps
 
 
 def _check_volume(system: System, start: Point, point: Point) -> None:

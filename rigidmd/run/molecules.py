@@ -314,7 +314,7 @@ class MolecularSimulation(Simulation):
         k = self._record.stage
         stage = self.scene.stages[k]
         with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
-            found = minimise(self.system, self.state, stage, lambda: self._interrupted, bar.update)
+            found = minimise(self.system, self.state, stage, self._must_end, bar.update)
         self.engine.forget()
         self._record.minima[k] = found
         if not found.converged:

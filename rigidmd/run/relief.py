@@ -1,5 +1,6 @@
 """Relief of overlaps: molecules that are too close on a lattice are moved apart before the first step."""
 
+from collections.abc import Callable
 from math import inf
 from typing import NamedTuple
 
@@ -25,13 +26,20 @@ class Relief(NamedTuple):
 
 
 def relieve(
-    model: Model, engine: Engine, state: State, radius: np.ndarray, scale: float, thermal: float, dt: float
+    model: Model,
+    engine: Engine,
+    state: State,
+    radius: np.ndarray,
+    scale: float,
+    thermal: float,
+    dt: float,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Relief:
     """Steepest descent with bounded moves, in place, until the kicks of the first step are no longer too large.
 
     radius (species,) : radius of each molecule (Å), which converts angles to moves; scale : the smallest Lennard-Jones
     diameter (Å). After a move that lowers the energy the next is longer by a fifth; any other move is undone and
-    halved.
+    halved. stop : asked before each step; the relief ends if it is true
     """
     load, tallies = engine.evaluate(state)
     left = float(kicks(model, load, thermal, dt).max())
@@ -43,6 +51,8 @@ def relieve(
     free = mobile(model)
     turning = (model.inertia > 0)[model.species][: len(state.rotation)]
     for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
+        if stop():
+            break
         # Each molecule moves along its own force by at most `length`, so overlaps do not slow down the others.
         push = load.force * free[:, None] / np.abs(load.force[free]).max()
         turn = load.torque_body * turning / arm / np.abs(load.force[free]).max()
