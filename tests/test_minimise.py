@@ -551,7 +551,7 @@ def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces
     run = several(tmp_path / "out", SEVERAL, "t.xtc")
 
     def stopped(system, state, stage, stop, advanced):
-        if run._stage == stopped_in:
+        if run._record.stage == stopped_in:
             run.stop()
         return minimise(system, state, stage, stop, advanced)
 

@@ -250,7 +250,7 @@ class OdeEngine(Engine):
             begun[:], there[:] = (state.time[NOW], 0.0), y
             sizes[:] = self._sizes(solver, state, y)
             self._anew = False
-        running = self._solver
+        kept, running = state.bath.copy(), self._solver
         if running is None:
             if singular(form, there, there, 0.0):
                 raise SingularError(there[1], begun[0])
@@ -270,7 +270,8 @@ class OdeEngine(Engine):
                     f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
                 )
             self._between = running.dense_output()
-            if self.halts():  # the slopes have moved the state
+            if self.halts():  # back to the last look: the slopes have moved the state
+                state.bath[:] = kept
                 read(form, self.model, state, state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt, y)
                 raise Halted
         if self._between is not None:
