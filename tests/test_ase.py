@@ -611,7 +611,7 @@ def test_a_damaged_one_is_told(traj, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("shorter", "2 frames are needed"),
+        ("shorter", "2 frames of"),
         ("changed", "its checksum is not that"),
         ("noise", "it is no trajectory of ASE"),
     ],

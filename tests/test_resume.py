@@ -548,7 +548,7 @@ def test_a_run_cannot_run_itself(again, tmp_path):
     simulation = Simulation(data, tmp_path / "run", force=True)
     assert simulation.run().summary["interrupted"] is False
     for strange in (3, "runs/water", data, None):
-        with pytest.raises(TypeError, match="is no Simulation"):
+        with pytest.raises(TypeError, match="is not a Simulation"):
             run_together([simulation, strange])
 
 
