@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidmd.core.files import file_fault, whole_file
 from rigidmd.core.memory import in_words, memory_fault
-from rigidmd.core.state import State, state_of
+from rigidmd.core.state import NO_CELL, State, state_of
 from rigidmd.errors import StructureError
 
 #: Of the files. Version 1 (rigidmd 0.1) did not say its version and held no step, books and bath.
@@ -108,5 +108,5 @@ def are_rotations(matrices: np.ndarray) -> bool:
 def is_cell(cell: np.ndarray) -> bool:
     """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or infinite edges, which are none."""
     if not np.isfinite(cell).all():
-        return not np.isfinite(cell.diagonal()).any()
+        return np.array_equal(cell, NO_CELL)
     return bool((cell.diagonal() > 0).all() and not np.triu(cell, 1).any() and np.abs(cell).max() <= LARGEST)
