@@ -8,9 +8,10 @@ from conftest import MOLECULES, ROOT, small_scene
 
 from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.errors import MoleculeError, SceneError, SimulationError, StructureError
+from rigidmd.errors import MoleculeError, OutputError, SceneError, SimulationError, StructureError
 from rigidmd.measure.stable_step import long_steps
 from rigidmd.molecules import Site, load_model, molecule, read_molecule
+from rigidmd.output.folder import check_folder
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene, parse_override
 
@@ -414,6 +415,15 @@ def test_output_folders(capsys, tmp_path):
     assert "is a file" in capsys.readouterr().err
     assert main(["run", str(scene), "-o", "/proc/here/there"]) == 2
     assert "cannot be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("names", "resumes"), [((".rigidmd-run",), False), ((".rigidmd-run", "checkpoint.npz"), True)])
+def test_a_folder_with_a_checkpoint_names_the_command_that_continues_it(names, resumes, tmp_path):
+    for name in names:
+        (tmp_path / name).touch()
+    with pytest.raises(OutputError, match=r"holds an earlier run; .*--force replaces it, -o names") as refused:
+        check_folder(tmp_path, force=False)
+    assert (f"`rigidmd resume {tmp_path}` continues it" in str(refused.value)) == resumes
 
 
 def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tmp_path):

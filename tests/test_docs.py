@@ -33,7 +33,7 @@ from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
 from rigidmd.molecules import read_parameters
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
-from rigidmd.shipped import CHAPTERS, DOCS
+from rigidmd.shipped import CHAPTERS, DOCS, find_example
 
 README = ROOT / "README.md"
 DOCUMENTS = [README, *(ROOT / "rigidmd" / "docs" / f"{name}.md" for name in CHAPTERS)]
@@ -313,7 +313,7 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
         wanted = {
             key: "needed" if field.is_required() else f"`{text}`" if (text := _toml(field.default)) else ""
             for key, field in model.model_fields.items()
-            if not _models_in(field.annotation)
+            if not _models_in(field.annotation) or "Literal" in str(field.annotation)  # a table, or a text in its place
         }
         for key in REFUSED.get(heading, ()):
             wanted.pop(key)
@@ -378,7 +378,10 @@ def test_help_lists_and_prints_the_chapters(capsys):
         assert "![" not in said
         with contextlib.suppress(StopIteration):
             code = next(block for block in blocks_of(DOCS / f"{name}.md") if block.language == "sh")
-            assert code.text in said
+            assert re.sub(r"systems/(?=\w+\.toml)", "", code.text) in said
+        for stem, ending in re.findall(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.py|\.ipynb)", source):
+            assert find_example(stem).path.suffix == ending  # `rigidmd new` copies it
+        assert not re.search(r"systems/(scripts/)?\w+\.(toml|py)", said)
     cli.main(["help", "top"])
     assert "[picture: seven heavy tops, tests/benchmarks/results/seven_tops.png]" in capsys.readouterr().out
 
