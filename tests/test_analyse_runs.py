@@ -161,7 +161,7 @@ def test_a_file_of_the_pressure_tensor_is_read_with_care(copy):
     (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows]) + "\n" + rows[0][:-30])
     history = of_folder(read_record(copy), 0.02)
     assert history.tensor.shape == (10, 7)  # the line that is cut is left out
-    (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows, "0,x,0,0,0,0,0"]))
+    (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows, "0,x,0,0,0,0,0"]) + "\n")
     with pytest.raises(OutputError, match=r"pressure_tensor.csv: column .* holds what is no number"):
         of_folder(read_record(copy))
     (copy / "pressure_tensor.csv").write_text("a,b\n1,2\n")

@@ -186,7 +186,7 @@ def test_wheels_are_shown(tmp_path):
 def test_a_run_says_what_is_wrong_with_it():
     scene = Scene.read(TOP, {"output.trajectory": False, "run.integrator": "velocity_verlet", "run.timestep_s": 0.06})
     simulation = Simulation(scene)
-    said = simulation.conclusion(simulation.run())
+    said = simulation.introduction() + simulation.conclusion(simulation.run())
     assert "timestep_s is too long for this motion" in said
     assert "is not a whole number of steps of" in said
     assert "turns by more than 180° between samples" in said

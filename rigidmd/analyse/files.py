@@ -118,9 +118,11 @@ class _Value(BaseModel):
 class _Stretch(BaseModel):
     model_config = ConfigDict(extra="allow")
 
-    frames: int
+    stage: str
     from_ps: Bounded
     to_ps: Bounded
+    frames: int
+    notes: list[str]
 
 
 class _Entry(BaseModel):
