@@ -649,10 +649,22 @@ def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
     return found
 
 
-#: What nothing else in a checkpoint decides: other values of these are of another run, which must end by itself.
+#: What nothing else in a checkpoint decides: other values of these are of another run, which must end by itself. The time
+#: at which a list was built decides how far ahead the next one is built, and so the order of sums.
 FREE = re.compile(
-    r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load.torque_body"
+    r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load.torque_body|engine/\w+.times"
 )
+
+
+@pytest.mark.parametrize("kept", [[], [0], [1, 2, 3, 4], [-1, 0], [True, 0], ["0", 0], {}, "ab", 3])
+@pytest.mark.parametrize("owner", ["LogFile", "Frames"])
+def test_sizes_that_are_none_cut_no_file(owner, kept, again):
+    found = read_checkpoint(again / "run" / CHECKPOINT)
+    found.told["of"][owner]["kept"] = kept
+    write_checkpoint(again / "run", found)
+    before = everything(again / "run")
+    assert cli.main(["resume", str(again / "run")]) == 2
+    assert everything(again / "run") == before
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ class AppendedFile:
 
     def __init__(self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")):
         self._path = path
-        self._size, self._sum = kept or (0, 0)
+        self._size, self._sum = (0, 0) if kept is None else kept
         with self._told("written" if kept is None else "read"):
             if kept is None:
                 begin_file(path)
