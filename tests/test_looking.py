@@ -87,7 +87,7 @@ def test_a_report_tells_of_molecules(water, tmp_path, capsys):
         assert f">{title}</h2>" in text
     record = read_record(water)
     own = record.columns["temperature"][record.columns["stage_name"] == "nve"]
-    row = re.search(r"<tr><td>nve</td><td>0.02</td><td>5</td><td>([\d.]+) ±", text)
+    row = re.search(r"<tr><td>nve</td><td>0.02</td><td>5</td><td>([\d.]+)</td>", text)  # of few lines no error
     assert float(row[1]) == pytest.approx(own.mean(), abs=0.5)
     assert "barostat: no stage has a pressure to keep" in text
     assert page.stat().st_size < 1e6

@@ -252,7 +252,7 @@ def test_the_cell_takes_the_pressure_asked_for(coupling):
     volume = state.volume
     found = minimise(system, state, scene.stages[0])
     assert found.converged
-    pressure = found.pressure / BAR
+    pressure = np.array(found.pressure) / BAR
     edges = state.cell.diagonal()
     if coupling == "isotropic":
         assert pressure[:3].mean() == pytest.approx(asked, abs=0.1)
@@ -301,12 +301,18 @@ def test_what_it_keeps_and_what_it_books():
     )
     seen = []
 
-    def look(moment):
-        state = moment.state.copy()
-        seen.append((moment.step, moment.time, state.velocity, state.angular_momentum_body, state.position))
+    class Look(Every):
+        once = False  # both moments of a time, before and after the minimisation
 
-    results = Simulation(scene, observers=Every(0.01, look)).run()
+        def see(self, moment):
+            state = moment.state
+            seen.append((moment.step, moment.time, state.velocity, state.angular_momentum_body, state.position))
+
+    once = []
+    observers = [Look(0.01, print), Every(0.01, lambda moment: once.append(moment.state.position))]
+    results = Simulation(scene, observers=observers).run()
     assert [moment[0] for moment in seen] == [0, 5, 5, 10]
+    assert np.array_equal(once, [seen[k][4] for k in (0, 2, 3)])
     before, after = [moment for moment in seen if moment[0] == 5]
     for k in (1, 2, 3):
         assert np.array_equal(before[k], after[k])  # time, velocity, angular momentum
