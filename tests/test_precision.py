@@ -48,8 +48,10 @@ def trials(found, name):
 
 def test_errors_fall_with_the_order_at_equal_cost(top):
     costs = [[trial.forces for trial in trials(top, name)] for name in ("velocity_verlet", "srkn_4", "srkn_6")]
-    assert np.allclose(costs[0], costs[1], rtol=0.15)
-    assert np.allclose(costs[0], costs[2], rtol=0.15)
+    shared = min(map(len, costs))  # besides the longer steps that are tried until one fails
+    assert shared >= 6
+    for other in costs[1:]:
+        assert np.allclose(costs[0][-shared:], other[-shared:], rtol=0.15)
     for name, order in (("velocity_verlet", 2), ("srkn_4", 4)):
         own = trials(top, name)[-2:]
         for error in ("rotation_error", "energy_rms"):
@@ -266,7 +268,7 @@ def test_molecules_start_where_the_last_stage_does():
     stages = [{"ensemble": "nvt", "temperature_K": 200.0, "duration_ps": 0.2}, {"duration_ps": 1.0}]
     scene = small_scene({"nitrogen": 8}, 18.5, stages=stages)
     found = precision(scene, ["velocity_verlet", "srkn_6"], [8.0, 4.0], repeats=1)
-    assert "kT per degree of freedom, at the" in advice(found)[0]
+    assert "kT per degree of freedom, at the" in "\n".join(advice(found))
     verlet = trials(found, "velocity_verlet")
     assert verlet[0].energy_rms / verlet[1].energy_rms == pytest.approx(4, rel=0.5)
     assert all(trial.position_error < 1 for trial in found.trials)
@@ -574,11 +576,11 @@ def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypat
     scene = small_scene({"argon": 40}, 18.5, start={"temperature_K": 90.0}, stages=[{"duration_ps": 0.1}, stage])
     monkeypatch.setattr(Scene, "read", lambda path, overrides: scene)
     folder = tmp_path / "p"
-    command = ["precision", "liquid.toml", "--averages", "--sample-ps", "0.4", "--timesteps", "5,10,400",
+    command = ["precision", "liquid.toml", "--averages", "--sample-ps", "20", "--timesteps", "5,10,400",
                "--integrators", "velocity_verlet", "-o", str(folder)]  # fmt: skip
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "bias of averages over 0.4 ps of npt" in said
+    assert "bias of averages over 20 ps of npt" in said
     assert "velocity_verlet + velocity_rescaling at 400 fs: stopped at step" in said
     with (folder / "precision.csv").open() as file:
         rows = list(csv.DictReader(file))

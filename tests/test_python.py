@@ -215,7 +215,7 @@ HOVER = {
     'results["energy"]': "ndarray[",
     "results.universe()": "Universe",
     "results.state": "State",
-    "results.plot()": "Figure",
+    "results.plot()": "Picture",
     "results.view()": "StructureWidget | Film",
     "results.atoms()": "Atoms",
     "results.atoms(slice(3))": "list[Atoms]",
