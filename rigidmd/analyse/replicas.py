@@ -11,7 +11,7 @@ from rigidmd.analyse.all import Task, analyse_folder
 from rigidmd.analyse.files import stretch_of, write_findings
 from rigidmd.analyse.findings import Curve, Finding, Value
 from rigidmd.errors import OutputError
-from rigidmd.measure.means import error_of_mean
+from rigidmd.measure.means import standard_error
 from rigidmd.output.folder import add_to_folder
 from rigidmd.output.sweep_folder import FINISHED, Manifest, Point, read_manifest, state_on_disk
 from rigidmd.output.sweep_names import in_words, short_keys
@@ -150,7 +150,7 @@ def _mean_value(values: list[Value], runs: int) -> Value:
 
 def mean_and_error(values: np.ndarray) -> tuple[Any, Any]:
     """Means over replicas (n, ...), and their standard errors."""
-    return values.mean(axis=0), error_of_mean(values)
+    return values.mean(axis=0), standard_error(values)
 
 
 def _mean_curve(curves: list[Curve]) -> Curve | None:

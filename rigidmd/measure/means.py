@@ -44,14 +44,17 @@ def mean(values: ArrayLike) -> tuple[float | None, float | None]:
     return average, sqrt(max(window, OF_BATCHES * _of_batches(centred)) / lost / n)
 
 
+def standard_error(values: ArrayLike) -> np.ndarray:
+    """Standard error (...) of the mean of independent runs (n, ...), n > 1: their standard deviation over sqrt(n)."""
+    return np.std(np.asarray(values, float), axis=0, ddof=1) / sqrt(len(np.asarray(values)))
+
+
 def error_of_mean(parts: ArrayLike) -> np.ndarray:
     """Standard error (...) of the mean of few independent values (n, ...), n > 1: half the range that holds 68 % of
     their Student distribution, which is 1.84 times the usual one for two values, 1.14 times for five."""
     from scipy import special  # slow to import
 
-    array = np.asarray(parts, float)
-    factor = float(special.stdtrit(len(array) - 1, special.ndtr(1.0)))
-    return np.std(array, axis=0, ddof=1) / sqrt(len(array)) * factor
+    return standard_error(parts) * float(special.stdtrit(len(np.asarray(parts)) - 1, special.ndtr(1.0)))
 
 
 def with_error(value: float, error: float | None) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.analyse.source import production_of
 from rigidmd.errors import RigidMDError
 from rigidmd.measure.columns import BODY_COLUMNS
-from rigidmd.measure.means import error_of_mean, mean, with_error
+from rigidmd.measure.means import mean, standard_error, with_error
 from rigidmd.measure.samples import COLUMNS
 from rigidmd.output.record import Record, read_record
 from rigidmd.output.sweep_folder import FINISHED, TABLE, Manifest
@@ -57,7 +57,7 @@ class Row:
         values = np.array([value for value, _ in found])
         if np.ptp(values) == 0:  # where rounding would give it an error
             return float(values[0]), 0.0
-        return float(values.mean()), float(error_of_mean(values))
+        return float(values.mean()), float(standard_error(values))
 
 
 @dataclass
