@@ -383,7 +383,9 @@ def test_help_lists_and_prints_the_chapters(capsys):
             assert find_example(stem).path.suffix == ending  # `rigidmd new` copies it
         assert not re.search(r"systems/(scripts/)?\w+\.(toml|py)", said)
     cli.main(["help", "top"])
-    assert "[picture: seven heavy tops, tests/benchmarks/results/seven_tops.png]" in capsys.readouterr().out
+    picture = "tests/benchmarks/results/seven_tops.png"  # a wheel does not have it
+    where = f", {picture}" if (DOCS.parent.parent / picture).is_file() else ""
+    assert f"[picture: seven heavy tops{where}]" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("name", "expected"), [("manuel", "did you mean manual?"), ("qqq", "there are top, water")])
