@@ -62,7 +62,7 @@ def drawing(path: Path) -> Iterator[Path]:
             yield temporary
     except RigidMDError:
         raise
-    except Exception as error:
+    except Exception as error:  # Matplotlib raises many types
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         warnings.warn(f"{path} cannot be drawn: {reason}", RigidMDWarning, stacklevel=2)
 

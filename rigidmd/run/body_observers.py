@@ -117,7 +117,7 @@ class Figures(Observer):
             for stem, figure in body_figures(run.system, results.samples).items():
                 try:
                     results.files += draw_motion(run.path(""), {stem: figure})
-                except Exception as error:
+                except Exception as error:  # of many types; the other figures are drawn first
                     failed = failed or error
             if failed is not None:
                 raise failed

@@ -542,7 +542,7 @@ class Simulation(Base):
             return
         try:
             act(*given)
-        except Exception as error:
+        except Exception as error:  # a user's observer may raise anything
             if isinstance(error, RigidMDError) and act == observer.see:
                 raise
             self._failed_before.append(observer)

@@ -208,7 +208,10 @@ class Scene(Section):
             raise SceneError(source, [f"{place(keys, text, overridden)}: {fault}" for keys, fault in wrong])
         faults += [f"{place(keys, text, overridden)}: {fault}" for keys, fault in numbers_beyond(data, *kind.SIZES)]
         faults += kind.contradictions(data, text)
-        refusal = lambda found: SceneError(source, [one + _removes(one, data, overridden) for one in found])  # noqa: E731
+
+        def refusal(found: list[str]) -> SceneError:
+            return SceneError(source, [fault + _removes(fault, data, overridden) for fault in found])
+
         try:
             scene = kind.model_validate(data)
         except ValidationError as error:
