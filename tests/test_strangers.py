@@ -419,3 +419,10 @@ def test_waves_in_columns_are_all_waves(most, square):
 )
 def test_an_end_or_a_folder_that_cannot_be(options, expected, capsys, tmp_path):
     assert expected in refusal(capsys, tmp_path, GOOD, *options, commands=("run",))
+
+
+def test_an_end_with_more_digits_than_a_number_has(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "nowhere.toml", "--until", "9" * 400 + "ps"])
+    assert ended.value.code == 2
+    assert "is not a time with a unit" in capsys.readouterr().err
