@@ -644,7 +644,7 @@ def test_one_that_changed_is_not_gone_on_with(fault, said, traj, tmp_path):
     assert path.read_bytes() == before
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_acetonitrile_is_that_of_ase():
     sites = [
         {"name": name, "element": element, "mass_u": float(mass), "position_A": [x, 0.0, 0.0], "charge_e": charge * SAME_COULOMB,
@@ -663,7 +663,7 @@ def test_acetonitrile_is_that_of_ase():
     assert atoms.get_potential_energy() == pytest.approx(other.get_potential_energy(), rel=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_pme_in_a_slanted_cell():
     counts = {"spce": 12, "nitrogen": 4, "argon": 3}
     box = {"lengths_A": [11.0, 12.0, 13.0], "angles_deg": [80.0, 100.0, 75.0]}

@@ -162,21 +162,21 @@ def run_of(text: str, overrides: tuple[str, ...], folder, capsys) -> None:
         assert not (folder / "run" / "summary.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("text", [ARGON, WATER, TOP], ids=["argon", "water", "top"])
 def test_the_scenes_run_without_an_attack(text, capsys, tmp_path):
     run_of(text, (), tmp_path, capsys)
     assert (tmp_path / "run" / "summary.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("attack", MOLECULES)
 def test_extreme_scenes_of_molecules(attack, capsys, tmp_path):
     text, *overrides = MOLECULES[attack]
     run_of(text, tuple(overrides), tmp_path, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("attack", BODIES)
 def test_extreme_scenes_of_bodies(attack, capsys, tmp_path):
     run_of(TOP, BODIES[attack], tmp_path, capsys)
@@ -242,7 +242,7 @@ ATOMS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("attack", ATOMS)
 def test_extreme_atoms_of_the_calculator(attack):
     """Energy, forces and stress are finite, or one sentence says what is wrong."""
@@ -262,7 +262,7 @@ AXES = ["seed", "seed=", "seed=1", "seed=1..", "seed=..3", "seed=3..1", "seed=1.
         "seed=-1,2", "start.temperature_K=nan,90", "start.temperature_K=inf,90", "molecules.0.model=argon,nothing"]  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("axis", AXES)
 def test_odd_axes_of_a_sweep(axis, capsys, tmp_path):
     """Refused before the first point with nothing written, or every point ends."""

@@ -38,7 +38,7 @@ def energy_error(results):
     return float(np.sqrt(np.mean((energy - energy[0]) ** 2)) / (2 * kinetic.mean()))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(tmp_path):
     results = Simulation(liquid(integrator="auto", energy_error_kT=1e-5), tmp_path / "a").run()
     stage = results.summary["stages"][1]
@@ -72,7 +72,7 @@ KEPT = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("target", [1e-3, 1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("kind", KEPT)
 def test_the_error_asked_for_is_kept_over_a_long_stage(kind, target):
@@ -173,7 +173,7 @@ def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
     assert "no step tried keeps the target over that time: truncation = 'smooth_switch', a longer" in found.reason
 
 
-@pytest.mark.parametrize("target", [1e-8, pytest.param(1e-3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("target", [1e-8, pytest.param(1e-3, marks=pytest.mark.soak)])
 def test_the_error_of_a_top_is_what_was_asked_for(target):
     changes = {"run.integrator": "auto", "run.trajectory_error": target, "run.timestep_s": 0.05}
     simulation = Simulation(Scene.read(TOP, changes))
@@ -185,7 +185,7 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
     assert simulation.scene.run.integrator == results.summary["integrator"] != "auto"
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_what_cannot_be_kept_is_said(capsys, tmp_path):
     command = ["run", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-30", "-o", str(tmp_path)]
     assert main(command) != 0
@@ -219,7 +219,7 @@ def test_check_says_that_it_is_open(capsys):
     assert "integrator and step chosen at its start for an error of 0.0001 kT" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
     stages = [{"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-30}]
     with pytest.raises(SimulationError, match=r"stopped at step 0 \(0 ps\): no integrator keeps its error below 1e-30"):
@@ -229,8 +229,8 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
 @pytest.mark.parametrize(
     ("thermostat", "integrator", "part"),
     [
-        pytest.param("andersen", "velocity_verlet", 2 / 8, marks=pytest.mark.slow),
-        pytest.param("langevin", "baoab", 1 / 24, marks=pytest.mark.slow),
+        pytest.param("andersen", "velocity_verlet", 2 / 8, marks=pytest.mark.soak),
+        pytest.param("langevin", "baoab", 1 / 24, marks=pytest.mark.soak),
         (None, "baoab", 1 / 24),
     ],
 )
@@ -265,7 +265,7 @@ def test_check_says_which_bias_is_asked_for(capsys):
     assert "for an error of 0.001 kT per degree of freedom of the average potential energy" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
     """64 SPC/E waters; BAOAB's estimate is an upper one."""
     stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 5.0}]

@@ -143,7 +143,7 @@ def test_chains_can_be_run_backwards(liquid):
 
 
 @pytest.mark.parametrize("thermostat", [
-    "langevin", *(pytest.param(name, marks=pytest.mark.slow) for name in ("velocity_rescaling", "nose_hoover", "andersen")),
+    "langevin", *(pytest.param(name, marks=pytest.mark.soak) for name in ("velocity_rescaling", "nose_hoover", "andersen")),
 ])  # fmt: skip
 def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermostat):
     stage = {"ensemble": "nvt", "temperature_K": [300.0, 310.0], "thermostat": thermostat, "duration_ps": 0.02}

@@ -268,10 +268,10 @@ def test_wheels_drives_and_friction_in_a_turning_accelerated_frame():
     [
         pytest.param("matrix", PINNED | ROTOR, id="matrix-rotor"),
         pytest.param("quaternion", FREE | {"fluid": FLUID}, id="quaternion-fluid"),
-        pytest.param("euler_angles", PINNED | ROTOR, id="euler_angles-rotor", marks=pytest.mark.slow),
-        pytest.param("quaternion", PINNED | ROTOR, id="quaternion-rotor", marks=pytest.mark.slow),
-        pytest.param("matrix", FREE | {"fluid": FLUID}, id="matrix-fluid", marks=pytest.mark.slow),
-        pytest.param("euler_angles", FREE | {"fluid": FLUID}, id="euler_angles-fluid", marks=pytest.mark.slow),
+        pytest.param("euler_angles", PINNED | ROTOR, id="euler_angles-rotor", marks=pytest.mark.soak),
+        pytest.param("quaternion", PINNED | ROTOR, id="quaternion-rotor", marks=pytest.mark.soak),
+        pytest.param("matrix", FREE | {"fluid": FLUID}, id="matrix-fluid", marks=pytest.mark.soak),
+        pytest.param("euler_angles", FREE | {"fluid": FLUID}, id="euler_angles-fluid", marks=pytest.mark.soak),
     ],
 )
 def test_the_textbook_systems_are_the_same_motion(scene, formulation):

@@ -49,7 +49,7 @@ def strain_state(box, state, room):
     boxes.apply_strain(box, state, room)
 
 
-@pytest.fixture(scope="module", params=["reaction_field", pytest.param("pme", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["reaction_field", pytest.param("pme", marks=pytest.mark.soak)])
 def liquid(request):
     """20 waters and 12 nitrogens in a slanted box under a stress, with a tail: system, engine, state."""
     forces = {"cutoff_A": 5.5, "truncation": "smooth_switch", "electrostatics": request.param, "tail_correction": True}
@@ -175,8 +175,8 @@ def gas(count, thermostat, box_for):
 
 
 @pytest.mark.parametrize(("barostat", "thermostat"), [
-    ("cell_rescaling", "velocity_rescaling"), pytest.param("cell_rescaling", "langevin", marks=pytest.mark.slow),
-    pytest.param("monte_carlo", "langevin", marks=pytest.mark.slow),
+    ("cell_rescaling", "velocity_rescaling"), pytest.param("cell_rescaling", "langevin", marks=pytest.mark.soak),
+    pytest.param("monte_carlo", "langevin", marks=pytest.mark.soak),
 ])  # fmt: skip
 def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
     """p(V) ~ V^N exp(-p V/kT): a Gamma distribution, whatever the thermostat does to the total momentum."""
@@ -260,8 +260,8 @@ def test_a_piston_can_be_run_backwards(compressed):
 
 
 @pytest.mark.parametrize("stage", [
-    {"pressure_coupling": "flexible"}, pytest.param({"barostat": "monte_carlo"}, marks=pytest.mark.slow),
-    pytest.param({"ensemble": "nph", "temperature_K": None}, marks=pytest.mark.slow),
+    {"pressure_coupling": "flexible"}, pytest.param({"barostat": "monte_carlo"}, marks=pytest.mark.soak),
+    pytest.param({"ensemble": "nph", "temperature_K": None}, marks=pytest.mark.soak),
 ], ids=str)  # fmt: skip
 def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
     own = {key: value for key, value in (NPT | {"duration_ps": 0.02} | stage).items() if value is not None}

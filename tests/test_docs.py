@@ -134,13 +134,13 @@ class Reader:
             case ["pip", "install", what]:
                 project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
                 assert what in (".", *(f".[{extra}]" for extra in project["optional-dependencies"]))
-            case ["pytest"] | ["pytest", "-m", "slow"]:
+            case ["pytest"] | ["pytest", "-m", "soak"]:
                 pass
             case ["sbatch", _]:
                 assert not runs
-            case ["pytest", "-m", "slow", "-rP", script]:
+            case ["pytest", "-m", "soak", "-rP", script]:
                 assert not runs
-                assert "@pytest.mark.slow" in (ROOT / script).read_text()
+                assert "@pytest.mark.soak" in (ROOT / script).read_text()
             case _:
                 pytest.fail(f"no command that this test knows: {words}")
 

@@ -55,7 +55,7 @@ PROCESSES = {
 
 
 @pytest.mark.parametrize("name", PROCESSES)
-@pytest.mark.parametrize("n", [16, 50, 160, 1000, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [16, 50, 160, 1000, pytest.param(5000, marks=pytest.mark.soak)])
 def test_the_error_of_a_mean_is_as_large_as_its_scatter(n, name):
     """For lengths of 10, 20 and 100 of the longest correlation time; a tenth that is slow is harder to see."""
     rng = np.random.default_rng(n)
@@ -112,7 +112,7 @@ def test_inefficiency_of_correlated_samples():
     assert correlation_time(x, 0.1) == pytest.approx(0.05 * inefficiency(x - x.mean()))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_means_of_windows_of_a_run_have_honest_errors():
     """Windows of 10 ps of 0.6 ns of 100 argon atoms: potential energy, temperature, pressure."""
     stages = [{"ensemble": "nvt", "temperature_K": 94.4, "timestep_fs": 10.0, "duration_ps": t} for t in (20.0, 600.0)]

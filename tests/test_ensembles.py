@@ -1,7 +1,7 @@
 """Sampling, judged by a package of others: kinetic energies, ensembles at two states, known averages of liquids,
 dipoles and crystals.
 
-`pytest -m slow -rP tests/test_ensembles.py` prints what was measured, each with its standard error. Limits are in
+`pytest -m soak -rP tests/test_ensembles.py` prints what was measured, each with its standard error. Limits are in
 standard errors: 4.5 where many figures are compared at once, else 3.5.
 """
 
@@ -200,7 +200,7 @@ def equipartition_judged(course: Course, temperature: float) -> float:
     return float(np.nanmax(found))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("thermostat", THERMOSTATS)
 @pytest.mark.parametrize("name", LIQUIDS)
 def test_kinetic_energies_are_those_of_the_temperature(name, thermostat):
@@ -276,7 +276,7 @@ def ensemble_judged(name: str, one, two, **options) -> float:
     return float(np.max(found))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("thermostat", THERMOSTATS)
 def test_energies_at_two_temperatures(thermostat):
     """ln [p2(U)/p1(U)] has the slope 1/kT1 - 1/kT2."""
@@ -292,7 +292,7 @@ def test_energies_at_two_temperatures(thermostat):
     assert ensemble_judged(f"{thermostat}, E", *found, total_energy=True) < FEW
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_energies_of_water_at_two_temperatures():
     """The same of SPC/E with a reaction field, langevin."""
     found = []
@@ -309,7 +309,7 @@ BAROSTATS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("barostat", BAROSTATS)
 def test_volumes_and_enthalpies_at_two_states(barostat):
     """Slopes (p1 - p2)/kT of V, 1/kT1 - 1/kT2 of the enthalpy, and both together of U and V."""
@@ -331,7 +331,7 @@ def test_volumes_and_enthalpies_at_two_states(barostat):
     assert ensemble_judged(f"{barostat}, U and V", base, both) < FEW
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_fluctuations_of_the_energy_fall_with_the_square_of_the_step():
     """NVE, velocity Verlet, of a mixture: rms fluctuations of the energy at steps that are halved."""
     found = []
@@ -381,7 +381,7 @@ def orientations(thermostat: dict, step: float, duration: float, interval: float
     return cosine.mean(axis=1), float(1 / np.tanh(x) - 1 / x)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_dipole_in_a_field():
     """<cos> = coth x - 1/x, x = mu E/kT, to 1e-3; and what a long step adds."""
     friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0}
@@ -396,7 +396,7 @@ def test_a_dipole_in_a_field():
     told("<cos> of a dipole, langevin, 20 fs", cosine.mean(), error_of(cosine), exact)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_few_dipoles_in_a_field():
     """The same to 1 %, in seconds."""
     cosine, exact = orientations({"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400)
@@ -422,7 +422,7 @@ def compressed(barostat: str, pressure: float, duration: float) -> tuple:
     return course["volume"] * 1e3 / DIAMETER**3 / 256, course["potential"] * KJ_PER_MOL / (256 * BOLTZMANN * DEPTH)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state():
     """Two-centre Lennard-Jones, L* = 0.67, T* = 2, p* = 2.013: density and energy by either barostat; <dV²>/(V kT)
     against -d ln V/dp between two pressures about it."""
@@ -452,7 +452,7 @@ def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state()
         assert told(f"compressibility by fluctuations, {barostat}", value, np.hypot(error, error_of_slope), slope) < FEW
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_piston_keeps_the_mean_pressure():
     """nph: over time the pressure is the one asked for."""
     warm = WARM | {"temperature_K": 200.0, "timestep_fs": 4.0, "duration_ps": 10.0}
@@ -498,7 +498,7 @@ def pressed(coupling: str, pressure: object, duration: float) -> tuple[dict, dic
     return stage | {"duration_ps": 15.0}, stage | {"duration_ps": duration}
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_crystal_has_the_same_edges_whichever_way_they_move(tmp_path):
     def edges(coupling, duration):
         course = follow(crystal(tmp_path, *pressed(coupling, PRESSED, duration)), 0.1, folder=tmp_path)
@@ -518,7 +518,7 @@ def test_a_crystal_has_the_same_edges_whichever_way_they_move(tmp_path):
                 assert values == pytest.approx(90)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
     """Under a pressure xy the cell leans the other way, by P_xy/C; C from the stress of a cell that is held sheared,
     and from how an unstressed cell fluctuates."""
@@ -560,7 +560,7 @@ def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
     assert by_fluctuations == pytest.approx(constant, rel=0.15 + FEW * spread / constant)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("coupling", ["anisotropic", "flexible"])
 def test_ice_keeps_its_cell(coupling, reference, tmp_path):
     """Proton-disordered ice Ih of TIP4P/2005 at 250 K and 1 bar: 0.921 g/cm³ (Abascal & Vega 2005, table IV), its three

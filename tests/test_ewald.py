@@ -258,7 +258,7 @@ def check_nist_moments(seen, rotation, moments):
     assert torque == pytest.approx(np.array(moments["mol1_torque_K"]), abs=2e-4 * np.abs(torque).max())
 
 
-@pytest.mark.parametrize("config", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("config", [1, pytest.param(3, marks=pytest.mark.soak)])
 def test_nist_spce_component_by_component(reference, config, tmp_path):
     table = json.loads((reference / "nist_spce_cuboid" / "REFERENCE.json").read_text())
     file = reference / "nist_spce_cuboid" / f"spce_sample_config_periodic{config}.txt"
@@ -324,7 +324,7 @@ def test_nist_spce_in_a_monoclinic_cell_that_leans_by_half_an_edge(reference, tm
     assert found["potential"] == published(-1.60912e5)
 
 
-@pytest.mark.parametrize("method", [pytest.param("ewald", marks=pytest.mark.slow), "pme"])
+@pytest.mark.parametrize("method", [pytest.param("ewald", marks=pytest.mark.soak), "pme"])
 def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
     """Energy and forces of OpenMM's test, which has them from GROMACS: Lennard-Jones cut at 10 Å."""
     given = json.loads((reference / "openmm" / "REFERENCE.json").read_text())["triclinic_8_ions"]
@@ -352,7 +352,7 @@ def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
 
 @pytest.mark.parametrize(
     ("method", "asked", "error"),
-    [pytest.param("ewald", 1e-10, 1e-9, marks=pytest.mark.slow), ("pme", 1e-8, 1e-7)],
+    [pytest.param("ewald", 1e-10, 1e-9, marks=pytest.mark.soak), ("pme", 1e-8, 1e-7)],
 )
 def test_madelung_constant_of_rock_salt(reference, method, asked, error, tmp_path):
     lines = (reference / "openmm" / "nacl_crystal.xyz").read_text().splitlines()[2:]
@@ -498,7 +498,7 @@ duration_ps = 0.004
     [
         ("shift", "plain"),
         *(
-            pytest.param(truncation, ewald, marks=pytest.mark.slow)
+            pytest.param(truncation, ewald, marks=pytest.mark.soak)
             for truncation, ewald in product(["plain", "shift"], ["plain", "shift", None])
             if (truncation, ewald) != ("shift", "plain")
         ),
@@ -555,7 +555,7 @@ def salty(edges, method, **more):
     return shaken(build(scene), 8)
 
 
-@pytest.mark.parametrize("method", [pytest.param(TIGHT_EWALD, marks=pytest.mark.slow), TIGHT_PME])
+@pytest.mark.parametrize("method", [pytest.param(TIGHT_EWALD, marks=pytest.mark.soak), TIGHT_PME])
 def test_total_does_not_depend_on_how_it_is_split(method):
     """A charged box with everything in it; the oracle at another alpha."""
     system, engine, state = salty([13.0, 14.0, 15.0], method)
@@ -714,7 +714,7 @@ def test_virial_is_the_slope_of_the_energy_with_the_volume(method, surface, angl
         (1e-5, "ewald"),
         (1e-4, "pme"),
         *(
-            pytest.param(asked, method, marks=pytest.mark.slow)
+            pytest.param(asked, method, marks=pytest.mark.soak)
             for asked, method in product([1e-3, 1e-4, 1e-5, 1e-6], ["ewald", "pme"])
             if (asked, method) not in ((1e-5, "ewald"), (1e-4, "pme"))
         ),
@@ -741,7 +741,7 @@ def test_a_box_that_has_outgrown_its_waves_is_noted(method):
         assert len(outgrown_sums(system, system.state._replace(cell=factor * system.state.cell))) == told
 
 
-@pytest.mark.parametrize("order", [7, *(pytest.param(order, marks=pytest.mark.slow) for order in (3, 4, 5, 6, 8))])
+@pytest.mark.parametrize("order", [7, *(pytest.param(order, marks=pytest.mark.soak) for order in (3, 4, 5, 6, 8))])
 def test_every_order_of_splines_keeps_to_its_estimate(order):
     forces = {
         "cutoff_A": 7.7,
@@ -755,7 +755,7 @@ def test_every_order_of_splines_keeps_to_its_estimate(order):
     assert found.estimated == pytest.approx(found.measured, rel=0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_single_precision_is_good_enough_for_1e_5():
     forces = {"cutoff_A": 7.7, "electrostatics": "pme", "ewald_accuracy": 1e-5}
     errors = []
@@ -770,8 +770,8 @@ def test_single_precision_is_good_enough_for_1e_5():
     [
         ("double", "pme"),
         ("double", "ewald"),
-        pytest.param("mixed", "pme", marks=pytest.mark.slow),
-        pytest.param("mixed", "ewald", marks=pytest.mark.slow),
+        pytest.param("mixed", "pme", marks=pytest.mark.soak),
+        pytest.param("mixed", "ewald", marks=pytest.mark.soak),
     ],
 )
 def test_same_bits_for_any_number_of_threads(method, precision):
@@ -868,7 +868,7 @@ def conserved(rows):
     return np.array([row.time for row in rows]), np.array([row.conserved for row in rows]) / 216
 
 
-@pytest.mark.parametrize("model", ["spce", pytest.param("tip4p2005", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("model", ["spce", pytest.param("tip4p2005", marks=pytest.mark.soak)])
 def test_energy_errors_of_pme_are_of_order_2(model):
     """The energy that the grid gives is kept: its fluctuation falls with the square of the step."""
     spread = [np.std(conserved(nve(model, dt, 0.4))[1]) for dt in (2.0, 1.0)]
@@ -906,7 +906,7 @@ def test_total_momentum_is_taken_out_at_steps_that_the_scene_decides():
     assert coarse().summary["momentum_removed"] == {"interval_ps": 1.0, "energy_kJ_mol": 0.0}  # the usual interval
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("model", ["spce", "tip4p2005"])
 @pytest.mark.parametrize("timestep", [1.0, 2.0])
 def test_no_drift_over_50_ps(model, timestep):
@@ -916,7 +916,7 @@ def test_no_drift_over_50_ps(model, timestep):
     assert found.error < 1e-4  # kJ/mol per molecule per ps: a tenth of GROMACS's drift with its defaults
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_liquid_spce_is_the_published_one():
     """-46.82 kJ/mol per molecule (512 molecules, Ewald, 298 K); first peak of g_OO at 2.75 Å, 3.0 to 3.1 high.
 

@@ -100,7 +100,7 @@ def disk(tmp_path) -> Iterator:
 
 # What is written when the disk is full: the scene, the log, the first checkpoint, frames or a later checkpoint.
 @pytest.mark.parametrize(
-    "size", [96, *(pytest.param(size, marks=pytest.mark.slow) for size in (4, 8, 16, 24, 32, 48, 64, 128, 192, 256))]
+    "size", [96, *(pytest.param(size, marks=pytest.mark.soak) for size in (4, 8, 16, 24, 32, 48, 64, 128, 192, 256))]
 )
 def test_a_disk_that_fills(size, scene, disk, tmp_path):
     """The run ends with a sentence; with room again it goes on to the same bits."""
@@ -138,7 +138,7 @@ def test_a_folder_that_cannot_be_written(scene, disk, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "stream", ["full", pytest.param("closed", marks=pytest.mark.slow), pytest.param("gone", marks=pytest.mark.slow)]
+    "stream", ["full", pytest.param("closed", marks=pytest.mark.soak), pytest.param("gone", marks=pytest.mark.soak)]
 )
 def test_a_standard_output_that_takes_nothing(stream, scene, tmp_path):
     """The run is not lost for it."""
@@ -150,7 +150,7 @@ def test_a_standard_output_that_takes_nothing(stream, scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changed", [{"LC_ALL": "C"}, pytest.param({"PYTHONIOENCODING": "latin-1"}, marks=pytest.mark.slow)]
+    "changed", [{"LC_ALL": "C"}, pytest.param({"PYTHONIOENCODING": "latin-1"}, marks=pytest.mark.soak)]
 )
 def test_a_poor_environment(changed, scene, tmp_path):
     """No home, no UTF-8, a path with spaces and letters of other scripts."""
@@ -169,7 +169,7 @@ def test_a_poor_environment(changed, scene, tmp_path):
 SIGNALS = [signal.SIGTERM, signal.SIGINT]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("sent", SIGNALS, ids=lambda sent: sent.name)
 def test_a_run_that_is_stopped_by_signals_goes_on(sent, scene, tmp_path):
     """At 25 random moments each, preparing included."""
@@ -206,7 +206,7 @@ def test_ctrl_c_in_a_callback_of_a_compiler_is_not_lost(capfd):
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_command_that_is_interrupted_while_it_compiles(scene, tmp_path):
     """Ctrl-C ends it with 130, wherever it comes, and the code that it leaves behind can be used."""
     rng = np.random.default_rng(4)
@@ -225,7 +225,7 @@ def test_a_command_that_is_interrupted_while_it_compiles(scene, tmp_path):
     assert same(scene, tmp_path / "last")
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_two_first_compilations_at_once(scene, tmp_path):
     environ = environment() | {"RIGIDMD_CACHE": str(tmp_path / "cache")}
     both = [
@@ -258,7 +258,7 @@ def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
     return (folder / name).read_bytes()
 
 
-@pytest.mark.parametrize("times", [25, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [25, pytest.param(1000, marks=pytest.mark.soak)])
 def test_damaged_files_of_a_run(times, scene, tmp_path):
     """Flipped and cut files are refused by name or give way to the checkpoint before; or the damage changes nothing."""
     names = [CHECKPOINT, PREVIOUS, FINAL, LOG, TRAJECTORY]

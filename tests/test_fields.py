@@ -217,7 +217,7 @@ def conserved_along(kind, scheme, dt):
 
 
 @pytest.mark.parametrize("kind", RUNS)
-@pytest.mark.parametrize("name", ["velocity_verlet", pytest.param("srkn_4", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["velocity_verlet", pytest.param("srkn_4", marks=pytest.mark.soak)])
 def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
     scheme, dt = SCHEMES[name], RUNS[kind][3] * (2 if name == "srkn_4" else 1)
     errors = []
@@ -514,7 +514,7 @@ def test_fields_that_are_tied_to_places_say_so():
     assert not build(scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})).external  # a sweep may pass through nothing
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_resolved_scene_with_fields_runs_again_to_the_same_bits(tmp_path):
     scene = slit(OSCILLATING | {"restraints": [{"molecules": "1-3", "stiffness_kJ_mol_A2": 4.0}]})
     first = Simulation(scene, tmp_path / "a").run()

@@ -49,7 +49,7 @@ def energies(engine, state):
     ("ending", "counts", "edge"),
     [
         pytest.param(
-            ending, *which, id=f"{ending}-{k}", marks=[] if k == 1 or ending == ENDINGS[k] else pytest.mark.slow
+            ending, *which, id=f"{ending}-{k}", marks=[] if k == 1 or ending == ENDINGS[k] else pytest.mark.soak
         )
         for ending in ENDINGS
         for k, which in enumerate(MIXTURES)

@@ -28,7 +28,7 @@ from rigidmd.errors import UNSEEN, CheckpointError
 from rigidmd.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 
 SECONDS, BYTES = 5.0, 2e9  # that an input may take
-FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the slow tier
+FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the soak tier
 
 WATER = """
 seed = 3
@@ -423,7 +423,7 @@ def folder(tmp_path_factory):
 
 
 def fuzz(*strategies):
-    """A test that takes a few inputs, and one in the slow tier that takes many."""
+    """A test that takes a few inputs, and one in the soak tier that takes many."""
 
     def tests(function):
         def limited(count):
@@ -433,7 +433,7 @@ def fuzz(*strategies):
             )  # fmt: skip
             return told(given(*strategies)(function))
 
-        return limited(FEW), pytest.mark.slow(limited(MANY))
+        return limited(FEW), pytest.mark.soak(limited(MANY))
 
     return tests
 

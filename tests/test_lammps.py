@@ -283,7 +283,7 @@ def test_a_process_ends_with_its_engine():
     assert process.poll() is not None and not folder.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("ensemble", ["nve", "nvt", "npt"])
 def test_means_are_those_of_rigidmd(ensemble):
     """216 SPC/E: potential energy, temperatures, pressure and density within errors, of runs that share their start."""

@@ -194,7 +194,7 @@ def test_numbers_are_picked_from_two_vectors():
         assert np.array_equal(out, table[x % 32])
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_pair_loops_of_water_are_vectorised(precision):
     _, engine, state = built({"spce": 30}, 20.0, forces=W1, precision=precision)
@@ -228,7 +228,7 @@ MIXED, DROPLET = ({"tip4p2005": 60, "nitrogen": 30, "argon": 20}, 18.0), ({"spce
     [
         ("switch", *MIXED),
         *(
-            pytest.param(ending, *which, marks=pytest.mark.slow)
+            pytest.param(ending, *which, marks=pytest.mark.soak)
             for ending in ("plain", "shift", "force_shift", "force_switch", "switch")
             for which in (MIXED, DROPLET)
             if (ending, which) != ("switch", MIXED)
@@ -267,7 +267,7 @@ print(hashlib.sha256(b"".join(a.tobytes() for a in state)).hexdigest())
 """
 
 
-@pytest.mark.parametrize("precision", ["mixed", pytest.param("double", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("precision", ["mixed", pytest.param("double", marks=pytest.mark.soak)])
 def test_the_same_bits_for_any_number_of_threads(precision):
     ends = set()
     for threads in ("1", "2", "16"):
@@ -323,7 +323,7 @@ def test_no_pair_is_missed_in_a_long_run():
     ("chosen", "least"),
     [
         ("compute_as_arrays", 2),
-        pytest.param("compute_as_arrays or no_pair_is_missed", 3, marks=pytest.mark.slow),
+        pytest.param("compute_as_arrays or no_pair_is_missed", 3, marks=pytest.mark.soak),
     ],
 )
 def test_the_narrowest_vectors(chosen, least):

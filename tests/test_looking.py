@@ -162,7 +162,7 @@ def test_a_browser_shows_a_top_that_moves(top, tmp_path):
 
 
 @in_browser
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_browser_shows_water_that_moves(water, tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
     page = tmp_path / "water.html"
@@ -174,7 +174,7 @@ def test_a_browser_shows_water_that_moves(water, tmp_path):
 
 
 @in_browser
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_film_of_a_thousand_frames_of_water(tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
     more = SHORT_WATER | {"stages.1.duration_ps": 2.0, "output.trajectory_interval_ps": 0.002}

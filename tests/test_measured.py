@@ -1,11 +1,11 @@
-"""What is measured of liquids beside published values. Minutes each: the slow tier."""
+"""What is measured of liquids beside published values. Minutes each: the soak tier."""
 
 import numpy as np
 import pytest
 
 from rigidmd import Scene, Simulation
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.soak
 
 OUTPUT = {"trajectory_interval_ps": 0.1, "pressure_tensor_interval_ps": 0.01, "figure": False}
 

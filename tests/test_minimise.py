@@ -60,7 +60,7 @@ def minimum_of(scene, state: State | None = None):
     ("coupling", "electrostatics"),
     [
         *((coupling, "reaction_field") for coupling in (None, *ASKED)),
-        pytest.param("flexible", "ewald", marks=pytest.mark.slow),
+        pytest.param("flexible", "ewald", marks=pytest.mark.soak),
     ],
 )
 def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
@@ -156,7 +156,7 @@ def pair_energy(model: str, x: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    ("model", "published"), [("tip4p", -26.09), pytest.param("spce", None, marks=pytest.mark.slow)]
+    ("model", "published"), [("tip4p", -26.09), pytest.param("spce", None, marks=pytest.mark.soak)]
 )
 def test_the_water_dimer(model, published):
     """TIP4P: 6.24 kcal/mol (Jorgensen et al. 1983, J. Chem. Phys. 79, 926, table III)."""

@@ -303,7 +303,7 @@ def test_the_tutorial_runs(tmp_path):
     assert float(hand) == pytest.approx(float(run), abs=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_tutorial_shows_what_it_says(tmp_path):
     shown = shown_by(executed(tmp_path))
     told = "".join(bundle["text/plain"] for bundle in shown)

@@ -309,7 +309,7 @@ def test_what_is_frozen_stays():
     assert np.abs(state.position[:-3] - start.position[:-3]).min(axis=1).max() > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("kind", ["nose_hoover", "langevin"])
 def test_thermostats_keep_the_temperature_of_both_motions(kind):
     system, _, start = staged(kind)
@@ -326,7 +326,7 @@ def test_thermostats_keep_the_temperature_of_both_motions(kind):
     assert (error < 4.0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_barostat_gives_the_volume_of_an_ideal_gas():
     """(N + 1) kT/P, of bodies that hardly touch: the sites of a pair exclude 0.02 Å³, of 140 for each molecule.
 

@@ -344,14 +344,14 @@ def from_text(given, **more):
     return rigidmd.pair_law(LJ, given, **more)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("truncation", NAMES)
 def test_a_law_is_the_built_in_one_in_a_box(truncation):
     same_as_built_in({"argon": 60}, 1e-12, law=from_text, truncation=truncation)
     same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_text, truncation=truncation)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
     def from_function(given):
         return rigidmd.pair_law(lennard_jones, {key: Pair(**own) for key, own in given.items()})
@@ -802,7 +802,7 @@ def test_scripts_are_listed_and_copied(tmp_path, monkeypatch, capsys):
     assert "must end in .py" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_langevin_function_of_dipoles_in_a_field_in_python():
     """Free dipoles in a field: the mean of cos is coth x - 1/x with x = mu E/kT."""
     scene = rigidmd.Scene.from_dict(

@@ -525,7 +525,7 @@ def oscillators():
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
     thermal, freedom = 0.0083144626 * 300, 3
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
@@ -547,7 +547,7 @@ def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
         assert oscillators.point(run, quantities["T_trans unbiased"]) is None or verlet
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_what_is_said_of_averages_follows_from_them(oscillators):
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
     assert set(quantities) == {"U", "T_trans", "T_trans unbiased", "pressure"}
@@ -631,7 +631,7 @@ def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
     assert steps == pytest.approx([share * longest for share in sampling.LADDER], rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_orders_cost_and_temperatures_of_512_waters():
     """Slopes over a decade, the best scheme at 1e-5 kJ/mol, and both temperatures at 2 and 4 fs."""
     changes = {

@@ -157,7 +157,7 @@ scenes = st.fixed_dictionaries(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @FEWER
 @given(scenes)
 def test_any_small_scene_runs_ten_steps_or_is_refused_in_words(data):

@@ -37,7 +37,7 @@ def five_digits(printed):
     return pytest.approx(printed, abs=0.501 * 10 ** (np.floor(np.log10(abs(printed))) - 4))
 
 
-@pytest.mark.parametrize("config", [pytest.param("config1", marks=pytest.mark.slow), "config4"])
+@pytest.mark.parametrize("config", [pytest.param("config1", marks=pytest.mark.soak), "config4"])
 def test_nist_lennard_jones(reference, config):
     table = json.loads((reference / "nist_lj_cuboid" / "REFERENCE.json").read_text())["table"][config]
     file = reference / "nist_lj_cuboid" / f"lj_sample_config_periodic{config[-1]}.txt"
@@ -153,7 +153,7 @@ def test_a_crystal_with_disordered_hydrogens_is_refused(reference):
         build(Scene.from_dict(data, reference / "structures"))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_two_centre_lennard_jones_liquid():
     """Mecke et al.: L* = 0.67, T* = 2, rho* = 0.458: p* = 2.013, u* = -10.9000. sigma 1 Å, epsilon 100 K, m 20 u."""
     sites = [

@@ -122,7 +122,7 @@ def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
     assert (tmp_path / "whole" / "pressure_tensor.csv").read_text().count("\n") == 32
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("precision", ["double", "mixed"])
 @pytest.mark.parametrize(
     "stages",
@@ -141,7 +141,7 @@ def test_every_ensemble_goes_on_to_the_same_bits(stages, precision, tmp_path):
     same_after_stops(scene(*stages, precision=precision), [17, 60, 111, 140], tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize(
     "name",
     [
@@ -158,7 +158,7 @@ def test_every_format_goes_on(name, tmp_path):
     same_after_stops(scene(NVT, output=WATER["output"] | {"trajectory": name}), [31, 80], tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_pme_goes_on(tmp_path):
     forces = {"cutoff_A": 5.0, "truncation": "shift", "electrostatics": "pme"}
     same_after_stops(scene(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path)
@@ -670,7 +670,7 @@ def test_sizes_that_are_none_cut_no_file(owner, kept, again):
 @pytest.mark.parametrize(
     ("kind", "count"),
     [("molecules", 25), ("verlet", 60), ("dop853", 60)]
-    + [pytest.param(kind, 10**6, marks=pytest.mark.slow) for kind in ("molecules", "verlet", "dop853", "rk4")],
+    + [pytest.param(kind, 10**6, marks=pytest.mark.soak) for kind in ("molecules", "verlet", "dop853", "rk4")],
 )
 def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
     """With right checksums: refused with a sentence, or they change no bit. No crash, no hang, no wrong course."""
@@ -809,7 +809,7 @@ def killed(command: list[str], after: float | None) -> int:
         return run.wait()
 
 
-@pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
 def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
     """kill -9 at random moments, with a checkpoint at every look."""
     scene = ["run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-9", "--threads", "1"]
@@ -835,7 +835,7 @@ def test_a_failed_write_stops_the_run(stopped, tmp_path):
     assert (tmp_path / "run" / "log.csv").read_bytes().endswith(b"\n")
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     """The recipe of the manual, with a scheduler that starts the next job at once."""
     manual = (ROOT / "rigidmd" / "docs" / "manual.md").read_text()

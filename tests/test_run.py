@@ -547,7 +547,7 @@ DECIDED = {
 }
 
 
-@pytest.mark.parametrize("electrostatics", ["reaction_field", pytest.param("ewald", marks=pytest.mark.slow), "pme"])
+@pytest.mark.parametrize("electrostatics", ["reaction_field", pytest.param("ewald", marks=pytest.mark.soak), "pme"])
 def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, tmp_path):
     """And runs again to the same bits, though nothing is left for it to decide."""
     forces = {"electrostatics": electrostatics} | (

@@ -40,14 +40,14 @@ APART = ("water_steps", "head_on", "overlaps")
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(case.name, marks=[pytest.mark.slow] if case.name in APART else []) for case in chosen(None)],
+    [pytest.param(case.name, marks=[pytest.mark.soak] if case.name in APART else []) for case in chosen(None)],
 )
 def test_quick(name):
     (finding,) = battery([name], quick=True)
     check(finding)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("name", [case.name for case in chosen(None)])
 def test_whole(name):
     (finding,) = battery([name])

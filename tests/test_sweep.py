@@ -452,7 +452,7 @@ def test_one_point_of_a_kind_compiles_before_the_others(argon, tmp_path):
     assert kinds[0] == kinds[1] != kinds[2]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
     """3 temperatures, 8 seeds, two workers; parent and workers are killed in the middle."""
     arguments = [str(argon), "--set", "start.temperature_K=90,100,110", "--set", "seed=1..8", "--set",
@@ -495,7 +495,7 @@ def test_points_run_on_a_cluster_of_dask(argon, finished, tmp_path, capsys):
     assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
     pytest.importorskip("distributed")
     from rigidmd.study.sweep.cluster import Cluster
@@ -567,7 +567,7 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
     assert "#SBATCH --array=1-2\n" in script.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_slurm_jobs_submit_themselves_again(argon, slurm):
     """Jobs whose time is up, until their points have finished."""
     arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=400", "-o", "sweep"]
