@@ -1,0 +1,219 @@
+"""Settings of thermostats and barostats as other engines read them, each in the units of that engine.
+
+No engine runs here: the files that are written are read back. What the numbers mean is in the manuals: GROMACS tau-t of
+sd is the inverse of the friction, of nose-hoover a period, of v-rescale a time constant, all in ps and bar; LAMMPS'
+Langevin has a damping time, the inverse of the friction, and its chains and pistons the inverse of an angular
+frequency, in fs and atm; OpenMM has frictions and frequencies in 1/ps, and pressures in bar.
+"""
+
+from math import pi
+
+import pytest
+from support import build, lammps_files, portrait, small_scene, write_gromacs, write_openmm
+
+COUNTS = {"spce": 6, "nitrogen": 4}
+NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
+WARMING = NVT | {"temperature_K": [280.0, 320.0]}
+LANGEVIN = {"thermostat": "langevin", "friction_translation_per_ps": 5.0, "integrator": "velocity_verlet"}
+CHAINS = {"thermostat": "nose_hoover", "thermostat_time_ps": 0.7, "nose_hoover_links": 4}
+RESCALING = {"thermostat_time_ps": 0.3}
+NPT = NVT | {"ensemble": "npt", "pressure_bar": 250.0}
+
+
+def drawn(*stages, counts=COUNTS, tail=False, **sections):
+    forces = {"cutoff_A": 5.0, "truncation": "shift", "tail_correction": tail}
+    return portrait(build(small_scene(counts, 13.0, stages=list(stages), **{"forces": forces} | sections)))
+
+
+# GROMACS
+
+
+def settings(folder, *stages, **sections):
+    """The .mdp file of the only stage, as key -> text."""
+    own = drawn(*stages, **sections)
+    write_gromacs(folder, own, own.system.state)
+    (path,) = folder.glob("*.mdp")
+    lines = (line.split("=") for line in path.read_text().splitlines())
+    return {key.strip(): value.strip() for key, value in lines}
+
+
+@pytest.mark.parametrize(("stage", "coupling", "integrator", "time"), [
+    (LANGEVIN, "no", "sd", 1 / 5.0), (CHAINS, "nose-hoover", "md-vv", 0.7), (RESCALING, "v-rescale", "md", 0.3),
+], ids=["langevin", "nose_hoover", "velocity_rescaling"])  # fmt: skip
+def test_gromacs_has_the_time_of_each_thermostat(stage, coupling, integrator, time, tmp_path):
+    found = settings(tmp_path, NVT | stage)
+    assert (found["tcoupl"], found["integrator"], found["tc-grps"]) == (coupling, integrator, "System")
+    assert float(found["tau-t"]) == pytest.approx(time, rel=1e-9)
+    assert float(found["ref-t"]) == 310.0
+    assert (float(found["dt"]), int(found["nsteps"])) == (0.002, 200)
+    assert found["pcoupl"] == "no"
+    assert found.get("nh-chain-length") == ("4" if stage is CHAINS else None)
+    assert found["comm-mode"] == ("None" if stage is LANGEVIN else "Linear")
+
+
+def test_gromacs_has_no_thermostat_at_constant_energy(tmp_path):
+    found = settings(tmp_path, {"duration_ps": 0.4})
+    assert (found["tcoupl"], found["pcoupl"], found["integrator"]) == ("no", "no", "md-vv")
+
+
+def test_gromacs_warms_from_one_temperature_to_the_other(tmp_path):
+    found = settings(tmp_path, WARMING | RESCALING)
+    assert [float(value) for value in found["annealing-temp"].split()] == [280.0, 320.0]
+    assert [float(value) for value in found["annealing-time"].split()] == [0.0, 0.4]  # ps
+    assert (found["annealing"], found["annealing-npoints"]) == ("single", "2")
+    assert float(found["ref-t"]) == 280.0
+
+
+@pytest.mark.parametrize(("pressure", "coupling", "expected"), [
+    (250.0, "isotropic", [250.0]), ([250.0, 250.0, 400.0], "semi_isotropic", [250.0, 400.0]),
+])  # fmt: skip
+def test_gromacs_has_the_pressure_of_each_direction(pressure, coupling, expected, tmp_path):
+    stage = NPT | {"pressure_bar": pressure, "pressure_coupling": coupling, "barostat_time_ps": 1.7,
+                   "compressibility_per_bar": 8e-5}  # fmt: skip
+    found = settings(tmp_path, stage | RESCALING)
+    assert [float(value) for value in found["ref-p"].split()] == expected
+    assert [float(value) for value in found["compressibility"].split()] == [8e-5] * len(expected)
+    assert (found["pcoupl"], found["pcoupltype"]) == ("C-rescale", coupling.replace("_", ""))
+    assert float(found["tau-p"]) == 1.7
+    assert float(found["tau-t"]) == 0.3
+
+
+def test_gromacs_takes_momentum_out_and_writes_at_the_intervals_of_the_scene(tmp_path):
+    output = {"log_interval_ps": 0.03, "trajectory_interval_ps": 0.05}
+    found = settings(tmp_path, NVT, run={"remove_momentum_interval_ps": 0.02}, output=output)
+    assert [int(found[key]) for key in ("nstcomm", "nstlog", "nstenergy", "nstxout-compressed")] == [10, 15, 15, 25]
+
+
+def test_gromacs_has_lengths_in_nm(tmp_path):
+    forces = {"cutoff_A": 5.0, "truncation": "switch", "switch_start_A": 4.2, "electrostatics": "none"}
+    found = settings(tmp_path, NVT, counts={"argon": 20}, forces=forces)
+    assert [float(found[key]) for key in ("rlist", "rvdw", "rcoulomb", "rvdw-switch")] == [0.5, 0.5, 0.5, 0.42]
+
+
+# LAMMPS
+
+#: kcal/mol/Å³ in atm is another way to the same number: 1 atm = 1.01325 bar.
+ATM = 1 / 1.01325
+
+
+def commands(stage, **sections):
+    """Fixes of a stage: name -> words behind its style."""
+    lines = lammps_files.movers(drawn(stage, **sections), 0)
+    return {line.split()[1]: line.split()[3:] for line in lines}
+
+
+def after(words, key, count):
+    """The numbers that follow a keyword."""
+    at = words.index(key) + 1
+    return [float(word) for word in words[at : at + count]]
+
+
+@pytest.mark.parametrize("counts", [{"spce": 6}, {"argon": 6}, {"spce": 6, "argon": 6}], ids="-".join)
+def test_lammps_has_the_damping_time_of_langevin(counts):
+    found = commands(WARMING | LANGEVIN, counts=counts)
+    if "spce" in counts:
+        assert found["bodies"][:2] == ["rigid/small", "molecule"]
+        assert after(found["bodies"], "langevin", 3) == [280.0, 320.0, pytest.approx(1000 / 5.0)]  # fs
+    if "argon" in counts:
+        assert found["points"] == ["nve"]
+        assert after(found["points_bath"], "langevin", 3) == [280.0, 320.0, pytest.approx(1000 / 5.0)]
+    if len(counts) == 2:
+        seeds = [int(after(words, "langevin", 4)[3]) for name, words in found.items() if name != "points"]
+        assert len(set(seeds)) == 2
+
+
+@pytest.mark.parametrize("counts", [{"spce": 6}, {"argon": 6}], ids="-".join)
+def test_lammps_has_the_period_of_chains(counts):
+    (words,) = commands(WARMING | CHAINS, counts=counts).values()
+    assert words[0] == ("rigid/nvt/small" if "spce" in counts else "nvt")
+    assert after(words, "temp", 3) == [280.0, 320.0, pytest.approx(1000 * 0.7 / (2 * pi))]
+    assert after(words, "tparam" if "spce" in counts else "tchain", 1) == [4.0]
+
+
+@pytest.mark.parametrize("counts", [{"spce": 6}, {"argon": 6}], ids="-".join)
+@pytest.mark.parametrize("ensemble", ["npt", "nph"])
+@pytest.mark.parametrize("tail", [False, True])
+def test_lammps_has_pressures_in_atm_less_that_of_the_tail(counts, ensemble, tail):
+    """Its forces have no tail: a pressure P is that of its forces at P less the tail's."""
+    stage = NPT | CHAINS if ensemble == "npt" else {"ensemble": "nph", "duration_ps": 0.4}
+    stage = stage | {"pressure_bar": [100.0, 300.0], "barostat_time_ps": 1.7}
+    own = drawn(stage, counts=counts, tail=tail)
+    (line,) = lammps_files.movers(own, 0)
+    words = line.split()[3:]
+    beyond = own.system.tail.pressure(13.0**3) / 6.02214076e-3 if tail else 0.0  # bar
+    assert (beyond < -1) == tail
+    first, last, damping = after(words, "iso", 3)
+    assert first == pytest.approx((100.0 - beyond) * ATM, rel=1e-7)
+    assert last == pytest.approx((300.0 - beyond) * ATM, rel=1e-7)
+    assert damping == pytest.approx(1700.0)
+    style = f"rigid/{ensemble}/small" if "spce" in counts else ensemble
+    assert words[0] == style and ("temp" in words) == (ensemble == "npt")
+
+
+def test_lammps_has_a_pressure_along_each_axis():
+    stage = NPT | CHAINS | {"pressure_bar": [100.0, 200.0, 300.0], "pressure_coupling": "anisotropic"}
+    words = commands(stage, counts={"spce": 6})["bodies"]
+    for axis, pressure in zip("xyz", (100.0, 200.0, 300.0), strict=True):
+        assert after(words, axis, 3) == pytest.approx([pressure * ATM, pressure * ATM, 1000.0])
+    assert words[words.index("couple") + 1] == "none"
+
+
+def test_lammps_has_steps_in_fs():
+    text = lammps_files.input_script(drawn(NVT | LANGEVIN, output={"log_interval_ps": 0.03, "trajectory": False}))
+    lines = [line.split() for line in text.splitlines()]
+    assert ["timestep", "2.0"] in lines and ["run", "200"] in lines and ["thermo", "15"] in lines
+
+
+# OpenMM
+
+
+def made(folder, *stages, **sections):
+    """Integrators and what else acts, read back from what is written for OpenMM."""
+    mm = pytest.importorskip("openmm")
+    own = drawn(*stages, engine={"name": "openmm"}, **sections)
+    write_openmm(folder, own, own.system.state)
+    read = [mm.XmlSerializer.deserialize(path.read_text()) for path in sorted(folder.glob("[bi]*.xml"))]
+    integrators = [one for one in read if isinstance(one, mm.Integrator)]
+    return integrators, [one for one in read if not isinstance(one, mm.Integrator)]
+
+
+def in_units(quantity, name):
+    import openmm.unit
+
+    unit = openmm.unit.picosecond**-1 if name == "1/ps" else getattr(openmm.unit, name)
+    return quantity.value_in_unit(unit)
+
+
+def test_openmm_has_the_friction_of_langevin(tmp_path):
+    (integrator,), others = made(tmp_path, NVT | LANGEVIN)
+    assert in_units(integrator.getFriction(), "1/ps") == pytest.approx(5.0)
+    assert in_units(integrator.getTemperature(), "kelvin") == 310.0
+    assert in_units(integrator.getStepSize(), "femtosecond") == pytest.approx(2.0)
+    assert others == []
+
+
+def test_openmm_has_the_period_of_chains(tmp_path):
+    """A chain of frequency w has the mass g kT/w²: w is 2 pi over the period."""
+    (integrator,), others = made(tmp_path, NVT | CHAINS)
+    assert in_units(integrator.getCollisionFrequency(), "1/ps") == pytest.approx(2 * pi / 0.7)
+    assert in_units(integrator.getTemperature(), "kelvin") == 310.0
+    assert integrator.getThermostat().getChainLength() == 4
+    assert [type(other).__name__ for other in others] == ["CMMotionRemover"]  # so that it counts three less
+
+
+@pytest.mark.parametrize("thermostat", [LANGEVIN, CHAINS], ids=["langevin", "nose_hoover"])
+def test_openmm_has_the_pressure_and_the_temperature_of_its_barostat(thermostat, tmp_path):
+    stage = NPT | thermostat | {"barostat": "monte_carlo", "barostat_interval_ps": 0.05}
+    _, others = made(tmp_path, stage)
+    (barostat,) = [other for other in others if "Barostat" in type(other).__name__]
+    assert in_units(barostat.getDefaultPressure(), "bar") == pytest.approx(250.0)
+    assert in_units(barostat.getDefaultTemperature(), "kelvin") == 310.0
+    assert barostat.getFrequency() == 25  # steps of 2 fs
+
+
+def test_openmm_has_an_integrator_for_each_stage(tmp_path):
+    integrators, _ = made(tmp_path, NVT | LANGEVIN, {"duration_ps": 0.1}, NVT | LANGEVIN | {"timestep_fs": 1.0})
+    kinds = [type(one).__name__ for one in integrators]
+    assert sorted(kinds) == ["CustomIntegrator", "LangevinMiddleIntegrator", "LangevinMiddleIntegrator"]
+    seeds = {one.getRandomNumberSeed() for one in integrators if hasattr(one, "getFriction")}
+    assert len(seeds) == 2
