@@ -5,22 +5,37 @@ from math import inf
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from support import (
+    MPA_S,
+    NM2_PER_S,
+    PER_CM,
+    build,
+    correlation,
+    count_pairs,
+    density_profile,
+    dielectric,
+    diffusion,
+    heights,
+    history,
+    hydrogen_bonds,
+    kinds_of,
+    msd,
+    noise_with_memory,
+    orientation,
+    random_rotations,
+    rdf,
+    rebuilt,
+    settled,
+    small_scene,
+    spectrum,
+    squared_displacement,
+    steady_from,
+    structure_factor,
+    system_of,
+    viscosity,
+)
 
-from rigidmd.analyse.correlation import correlation, squared_displacement
-from rigidmd.analyse.electric import dielectric
-from rigidmd.analyse.findings import settled
-from rigidmd.analyse.flow import viscosity
-from rigidmd.analyse.history import History, kinds_of, rebuilt
-from rigidmd.analyse.motion import MPA_S, NM2_PER_S, diffusion, msd
-from rigidmd.analyse.source import steady_from
-from rigidmd.analyse.structure import density_profile, hydrogen_bonds, rdf, structure_factor
-from rigidmd.analyse.turning import PER_CM, orientation, spectrum
-from rigidmd.assemble.system import build
-from rigidmd.core.state import NO_CELL
 from rigidmd.errors import OutputError
-from rigidmd.forces.pairs.counts import count_pairs, heights
-from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, BOLTZMANN, COULOMB
 
 MIXTURE = {
@@ -36,37 +51,10 @@ MIXTURE = {
 SLANTED = np.array([[21.0, 0.0, 0.0], [6.0, 19.0, 0.0], [-7.0, 5.0, 23.0]])
 
 
-def system_of(counts, edge=40.0, cutoff=5.0, **sections):
-    return build(small_scene(counts, edge, **{"forces": {"cutoff_A": cutoff}} | sections))
-
-
-def history(system, time, positions, cell=None, Q=None, velocities=None, L=None, tensor=None, temperature=300.0):
-    """Frames as they are given; a cell for all of them, or one for each."""
-    f, n = len(time), len(system.model.species)
-    cell = NO_CELL if cell is None else np.asarray(cell)
-    if positions is None:
-        positions = np.zeros((f, n, 3))
-    return History(
-        system, system.scene.stages[-1], np.asarray(time), np.broadcast_to(cell, (f, 3, 3)), positions,
-        np.empty((f, 0, 3, 3)) if Q is None else Q, velocities, L, {"temperature": np.full(f, temperature)}, tensor,
-    )  # fmt: skip
-
-
 def brownian(rng, frames, n, D, interval, drift=0.0):
     """Paths (f, n, 3) of walkers with a diffusion coefficient D, Å²/ps."""
     steps = np.sqrt(2 * D * interval) * rng.standard_normal((frames, n, 3)) + drift * interval
     return np.cumsum(steps, axis=0)
-
-
-def noise_with_memory(rng, frames, shape, variance, time, interval):
-    """Ornstein and Uhlenbeck's process: stationary, with a correlation exp(-t/time)."""
-    keep = np.exp(-interval / time)
-    x = np.sqrt(variance) * rng.standard_normal(shape)
-    found = np.empty((frames, *shape))
-    for k in range(frames):
-        found[k] = x
-        x = keep * x + np.sqrt(variance * (1 - keep**2)) * rng.standard_normal(shape)
-    return found
 
 
 def rotations_about(turns):

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,18 +12,24 @@ from pathlib import Path
 import MDAnalysis
 import numpy as np
 import pytest
-from conftest import ROOT, small_scene
 from MDAnalysis.analysis.msd import EinsteinMSD
 from MDAnalysis.analysis.rdf import InterRDF
+from support import (
+    ROOT,
+    _last_stage,
+    _stage_of,
+    build,
+    gmx,
+    of_folder,
+    read_record,
+    registry,
+    small_scene,
+    total_dipole,
+)
 
 import rigidmd
 from rigidmd import Scene, Simulation, cli
-from rigidmd.analyse import registry
-from rigidmd.analyse.electric import total_dipole
-from rigidmd.analyse.source import _last_stage, of_folder
-from rigidmd.assemble.system import build
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.output.record import _stage_of, read_record
 from rigidmd.units import DEBYE
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
@@ -220,19 +225,6 @@ def topology(water):
     gmx(folder, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr", "-maxwarn", "2")
     gmx(folder, "make_ndx", "-f", "run.tpr", "-o", "run.ndx", text="del 1-20\na OW\na HW1 HW2\nq\n")
     return folder
-
-
-def gmx(folder, *arguments, text=""):
-    done = subprocess.run(
-        [GROMACS, "-quiet", "-nobackup", *arguments],
-        cwd=folder,
-        input=text,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
-    return done.stdout
 
 
 def xvg(path):
@@ -447,7 +439,7 @@ def test_a_function_of_ones_own_is_found_by_name(copy, capsys, own):
 
 
 def test_the_mean_of_ones_own_has_an_honest_error(own):
-    from test_analyse import history, noise_with_memory, system_of
+    from support import history, noise_with_memory, system_of
 
     system, found = system_of({"argon": 2}), []
     for seed in range(50):

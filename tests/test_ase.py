@@ -16,24 +16,30 @@ from ase.calculators.fd import calculate_numerical_forces
 from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from conftest import ROOT, small_scene
-from test_resume import WATER, contents, same_after_stops, scene, stopped_at
+from scenes import FORTY_WATERS, forty_waters
+from support import (
+    EV,
+    ROOT,
+    TrajFile,
+    TrajReader,
+    _shares,
+    build,
+    contents,
+    load_model,
+    random_rotations,
+    read_frames,
+    same_after_stops,
+    small_scene,
+    stopped_at,
+)
 
 from rigidmd import BodyScene, MolecularScene, Scene, Simulation, cli
 from rigidmd.ase import RigidMD
-from rigidmd.assemble.system import build
-from rigidmd.assemble.to_atoms import EV
-from rigidmd.assemble.traj_format import TrajReader
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SceneError, StructureError
-from rigidmd.measure.atom_forces import _shares
-from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.molecules import load_model
-from rigidmd.output.traj_file import TrajFile
-from rigidmd.output.trajectory import read_frames
-from rigidmd.run.observers import Every
+from rigidmd.run import Every
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
-FORCES = WATER["forces"]
+FORCES = FORTY_WATERS["forces"]
 NVE = {"duration_ps": 0.06, "timestep_fs": 2.0}
 #: Factor of charges that gives them ASE's Coulomb constant, of CODATA 2014.
 SAME_COULOMB = float(np.sqrt(units.Hartree * units.Bohr * EV / COULOMB))
@@ -43,7 +49,7 @@ OUTPUT = {"log_interval_ps": 0.02, "trajectory_interval_ps": 0.02, "figure": Fal
 @pytest.fixture(scope="module")
 def results():
     """A run of 40 waters without files."""
-    return Simulation(Scene.from_dict(scene(NVE, output=OUTPUT))).run()
+    return Simulation(Scene.from_dict(forty_waters(NVE, output=OUTPUT))).run()
 
 
 @pytest.fixture(scope="module")
@@ -586,8 +592,8 @@ def test_ase_opens_it(traj, tmp_path):
 
 
 def test_a_run_with_it_goes_on_to_the_same_bytes(tmp_path):
-    output = WATER["output"] | {"trajectory": "trajectory.traj", "trajectory_interval_ps": 0.001}
-    same_after_stops(scene(NVE | {"duration_ps": 0.1}, output=output), [3, 41, 43], tmp_path)
+    output = FORTY_WATERS["output"] | {"trajectory": "trajectory.traj", "trajectory_interval_ps": 0.001}
+    same_after_stops(forty_waters(NVE | {"duration_ps": 0.1}, output=output), [3, 41, 43], tmp_path)
 
 
 def test_a_damaged_one_is_told(traj, tmp_path):

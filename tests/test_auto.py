@@ -5,21 +5,32 @@ from math import comb
 
 import numpy as np
 import pytest
-from conftest import ROOT, SPRING, small_scene, springs
+from support import (
+    DRIFT,
+    KICK,
+    ROOT,
+    SCHEMES,
+    SPRING,
+    Method,
+    Subject,
+    Walk,
+    _fitted,
+    averages,
+    bias_of_potential,
+    choice,
+    choose,
+    mean_square_rate,
+    small_scene,
+    springs,
+    start_of_last_stage,
+    walk,
+    weight,
+)
 
 from rigidmd.cli import main
-from rigidmd.core.schemes import DRIFT, KICK, SCHEMES
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure import choice, walk
-from rigidmd.measure.choice import choose
-from rigidmd.measure.shadow import bias_of_potential, mean_square_rate
-from rigidmd.measure.subjects import _fitted
-from rigidmd.measure.trials import Method, Subject
-from rigidmd.measure.walk import Walk, weight
-from rigidmd.run import Simulation
-from rigidmd.run.molecules import MolecularSimulation
+from rigidmd.run import MolecularSimulation, Simulation
 from rigidmd.scene import Scene
-from rigidmd.study.averages import averages, start_of_last_stage
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 

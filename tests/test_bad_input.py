@@ -4,32 +4,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import MOLECULES, ROOT, small_scene
+from scenes import GOOD
+from support import (
+    MOLECULES,
+    ROOT,
+    Site,
+    build,
+    check_folder,
+    load_model,
+    long_steps,
+    molecule,
+    read_molecule,
+    small_scene,
+)
 
-from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, OutputError, SceneError, SimulationError, StructureError
-from rigidmd.measure.stable_step import long_steps
-from rigidmd.molecules import Site, load_model, molecule, read_molecule
-from rigidmd.output.folder import check_folder
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene, parse_override
-
-GOOD = """\
-[box]
-lengths_A = 20.0
-
-[[molecules]]
-model = "spce"
-count = 20
-
-[[stages]]
-duration_ps = 0.01
-timestep_fs = 1
-
-[start]
-temperature_K = 300
-"""
 
 
 def refused(capsys, tmp_path, text, *arguments, code=2):
@@ -602,11 +594,11 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
 
 def test_molecules_by_order_and_by_geometry(tmp_path):
     """An .xyz has no residues: waters atom by atom, and one with all oxygens first, split across the boundary."""
-    from rigidmd.assemble.structure import read_structure
+    from support import read_structure
 
     water, nitrogen = load_model("spce"), load_model("nitrogen")
     rng = np.random.default_rng(0)
-    from rigidmd.mechanics.rotation import random_rotations
+    from support import random_rotations
 
     centres = np.array([[0.1, 0.2, 9.9], [5.0, 5.0, 0.1], [9.95, 5.0, 5.0]])
     q = random_rotations(rng, 3)

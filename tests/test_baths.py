@@ -2,23 +2,33 @@
 
 import numpy as np
 import pytest
-from conftest import built, move, small_scene
 from scipy import stats
+from support import (
+    BATCH,
+    BATH,
+    HEAT,
+    SCHEMES,
+    WITH_BATH,
+    Andersen,
+    Engine,
+    Langevin,
+    NoseHoover,
+    Ramp,
+    build,
+    built,
+    kernel,
+    key_of,
+    move,
+    observe,
+    relieve,
+    row_of_stage,
+    small_scene,
+    steady,
+    stir_group,
+)
 
-from rigidmd.assemble.rows import row as row_of_stage
-from rigidmd.assemble.system import build
-from rigidmd.compile import kernel
-from rigidmd.core.schemes import SCHEMES, WITH_BATH
-from rigidmd.core.state import HEAT
-from rigidmd.dynamics.baths import Andersen, Langevin, NoseHoover
-from rigidmd.dynamics.noise import BATCH, BATH, key_of
-from rigidmd.dynamics.ramps import Ramp, steady
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
-from rigidmd.measure.observables import observe
-from rigidmd.mechanics.groups import stir_group
 from rigidmd.run import Simulation
-from rigidmd.run.relief import relieve
 from rigidmd.units import BOLTZMANN
 
 VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_BATH["baoab"]

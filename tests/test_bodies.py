@@ -6,17 +6,25 @@ from itertools import permutations
 import known
 import numpy as np
 import pytest
-from conftest import BODIES, ROOT, move
+from support import (
+    BODIES,
+    ROOT,
+    SCHEMES,
+    Body,
+    Engine,
+    ExactRotor,
+    Pinned,
+    from_vector,
+    kernel,
+    move,
+    orthogonality_error,
+    random_rotations,
+    split_rotor,
+    state_of,
+    turn,
+)
 
-from rigidmd.compile import kernel
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import state_of
-from rigidmd.dynamics.body import Body
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SimulationError
-from rigidmd.mechanics.flight import Pinned
-from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
-from rigidmd.mechanics.rotor import ExactRotor, split_rotor, turn
 from rigidmd.run import Simulation
 from rigidmd.scene import BodyScene, Scene
 

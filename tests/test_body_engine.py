@@ -2,23 +2,40 @@
 
 import numpy as np
 import pytest
-from conftest import move
 from numba import njit
 from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
+from support import (
+    DRIFT,
+    KICK,
+    SCHEMES,
+    WITH_BATH,
+    Body,
+    Engine,
+    Flow,
+    Pinned,
+    Scheme,
+    SteadyForce,
+    build_body,
+    composed,
+    from_vector,
+    hat,
+    move,
+    random_rotations,
+    resistance,
+    split,
+    split_rotor,
+    state_of,
+)
+from support import course_integral as integral
+from support import course_is_steady as is_steady
+from support import course_steady as steady
+from support import course_table as table
+from support import course_total as total
+from support import course_value_at as value_at
+from support import course_window as window
 
-from rigidmd.assemble.body import build_body
-from rigidmd.core.schemes import DRIFT, KICK, SCHEMES, WITH_BATH, Flow, Scheme, composed, split
-from rigidmd.core.state import state_of
-from rigidmd.dynamics.body import Body
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.forces.body import resistance
-from rigidmd.forces.body.fields import SteadyForce
-from rigidmd.mechanics.course import integral, is_steady, steady, table, total, value_at, window
-from rigidmd.mechanics.flight import Pinned
-from rigidmd.mechanics.rotation import from_vector, hat, random_rotations
-from rigidmd.mechanics.rotor import split_rotor
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

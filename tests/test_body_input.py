@@ -1,9 +1,8 @@
 """Scenes of a body that cannot be what their author meant: each fault one clear message, all at once."""
 
 import pytest
-from conftest import ROOT
+from support import ROOT, build_body
 
-from rigidmd.assemble.body import build_body
 from rigidmd.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene

@@ -6,15 +6,12 @@ import json
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from conftest import BODIES, ROOT
+from support import BODIES, ROOT, Keeper, build_body, write_scene
 
 import rigidmd
-from rigidmd.assemble.body import build_body
 from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.output.scene_file import write_scene
 from rigidmd.run import Every, Simulation
-from rigidmd.run.keeper import Keeper
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

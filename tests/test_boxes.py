@@ -3,23 +3,37 @@
 import numba
 import numpy as np
 import pytest
-from conftest import built, move, small_scene
 from scipy import stats
+from support import (
+    BATH,
+    BOX,
+    COMPONENTS,
+    COUPLINGS,
+    NOW,
+    SCHEMES,
+    WITH_BATH,
+    WORK,
+    CellRescaling,
+    Langevin,
+    Pressure,
+    VelocityRescaling,
+    VolumeMoves,
+    box_of,
+    box_room,
+    boxes,
+    build,
+    built,
+    key_of,
+    move,
+    observe,
+    relieve,
+    row_of_stage,
+    small_scene,
+    steady,
+)
 
-from rigidmd.assemble.rows import box_of
-from rigidmd.assemble.rows import row as row_of_stage
-from rigidmd.assemble.system import build
-from rigidmd.core.schemes import SCHEMES, WITH_BATH
-from rigidmd.core.state import NOW, WORK
-from rigidmd.dynamics import boxes
-from rigidmd.dynamics.baths import Langevin, VelocityRescaling
-from rigidmd.dynamics.boxes import COMPONENTS, COUPLINGS, CellRescaling, Pressure, VolumeMoves, box_room
-from rigidmd.dynamics.noise import BATH, BOX, key_of
-from rigidmd.dynamics.ramps import steady
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure.observables import observe
 from rigidmd.run import Simulation
-from rigidmd.run.relief import relieve
 from rigidmd.scene import Scene
 from rigidmd.units import BAR, BOLTZMANN
 

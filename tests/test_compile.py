@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
-from conftest import ROOT
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher, cpu_target
+from support import ROOT
 
 from rigidmd.compile import Bound, Code, Laid, call, call_blocks, kernel, numba_private, opened, packed, task
 from rigidmd.compile.cache import cache_folder
@@ -219,7 +219,6 @@ def test_every_block_is_worked_on_once_whichever_thread_takes_it():
 
 #: Compiles `_add` for several types while a helper does so too, from the other end; prints what was read from the cache.
 BOTH = """
-import time
 import numba, numpy as np
 from rigidmd.compile import Parcel, ahead
 from test_compile import _add
@@ -227,8 +226,8 @@ contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
 wanted = [(*_add.name, Parcel(numba.typeof(content))) for content in contents]
 with ahead.helped(wanted):
     helper = ahead._helper.get()
-    while not helper._over and len(helper._done) < 2:
-        time.sleep(0.05)
+    with helper._news:
+        helper._news.wait_for(lambda: helper._over or len(helper._done) >= 2)
     for _, _, parcel in wanted:
         _add.address(parcel)
 print([_add.compiled[parcel]._cache_hits for _, _, parcel in wanted][-2:])

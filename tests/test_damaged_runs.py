@@ -7,16 +7,24 @@ import random
 import shutil
 
 import pytest
-from conftest import ROOT
+from support import (
+    ANALYSIS,
+    ROOT,
+    Manifest,
+    Point,
+    Summary,
+    compare,
+    read_findings,
+    read_json,
+    read_manifest,
+    read_record,
+    write_manifest,
+    write_report,
+)
+from support import differences_in_words as in_words
 
 from rigidmd import Scene, Simulation, cli
-from rigidmd.analyse.files import ANALYSIS, read_findings
 from rigidmd.errors import OutputError, RigidMDError
-from rigidmd.looking.report import write_report
-from rigidmd.output.record import read_record
-from rigidmd.output.run_files import Summary, read_json
-from rigidmd.output.sweep_folder import Manifest, Point, read_manifest, write_manifest
-from rigidmd.study.compare import compare, in_words
 
 DEEP = "[" * 5000 + "]" * 5000
 #: What a value of a file of JSON becomes, as text.

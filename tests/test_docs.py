@@ -24,16 +24,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from conftest import ROOT
 from pydantic import BaseModel
+from support import CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters
 
 import rigidmd
 from rigidmd import cli
-from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
-from rigidmd.molecules import read_parameters
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
-from rigidmd.shipped import CHAPTERS, DOCS, find_example
 
 README = ROOT / "README.md"
 DOCUMENTS = [README, *(ROOT / "rigidmd" / "docs" / f"{name}.md" for name in CHAPTERS)]

@@ -2,15 +2,23 @@
 
 import numpy as np
 import pytest
-from conftest import small_scene
 from scipy.signal import lfilter
+from support import (
+    AverageRun,
+    Averages,
+    Quantity,
+    brief_rows,
+    correlation_time,
+    error_of_mean,
+    inefficiency,
+    signed,
+    slope,
+    small_scene,
+)
+from support import averages_faults as faults
+from support import mean_and_error as mean
 
 from rigidmd import Simulation
-from rigidmd.measure.bias import AverageRun, Averages, Quantity
-from rigidmd.measure.drift import slope
-from rigidmd.measure.means import correlation_time, error_of_mean, inefficiency, mean
-from rigidmd.output.averages_report import brief_rows, faults
-from rigidmd.output.report import signed
 
 SERIES = 400
 

@@ -3,24 +3,34 @@
 import numba
 import numpy as np
 import pytest
-from conftest import built, move, small_scene
+from support import (
+    BATH,
+    HEAT,
+    MOST_THREADS,
+    SCHEMES,
+    Engine,
+    State,
+    VelocityRescaling,
+    blocks_of,
+    build,
+    built,
+    draw_momenta,
+    extent_of,
+    groups,
+    key_of,
+    move,
+    no_load,
+    observe,
+    orthogonality_error,
+    random_rotations,
+    slope,
+    small_scene,
+    state_of,
+    steady,
+    sums_over,
+)
 
-from rigidmd.assemble.momenta import draw_momenta
-from rigidmd.assemble.system import build
-from rigidmd.compile.machine import MOST_THREADS
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import HEAT, State, no_load, state_of
-from rigidmd.dynamics.baths import VelocityRescaling
-from rigidmd.dynamics.noise import BATH, key_of
-from rigidmd.dynamics.ramps import steady
-from rigidmd.dynamics.sums import extent_of, sums_over
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError
-from rigidmd.forces.pairs.sites import blocks_of
-from rigidmd.measure.drift import slope
-from rigidmd.measure.observables import observe
-from rigidmd.mechanics import groups
-from rigidmd.mechanics.rotation import orthogonality_error, random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN

@@ -7,38 +7,44 @@ from itertools import product
 
 import numpy as np
 import pytest
-from conftest import ROOT, built, shaken, small_scene
 from reference import KE, EwaldOracle, Oracle, nearest
 from scipy.special import erfc, hyp1f1
-
-from rigidmd.assemble.describe import describe
-from rigidmd.assemble.system import build
-from rigidmd.cli import main
-from rigidmd.compile import kernel, lanes
-from rigidmd.compile.machine import MOST_THREADS
-from rigidmd.engines.cpu import Engine
-from rigidmd.errors import SceneError
-from rigidmd.forces.laws.screened import (
+from support import (
     INTERVALS,
+    MOST_THREADS,
+    ROOT,
     TABLE_ERROR,
+    Box,
+    Engine,
     TabledScreening,
+    Triclinic,
+    accuracy,
+    build,
+    built,
+    cell_of,
+    describe,
+    estimated_error,
     force_table,
+    from_vector,
+    kernel,
+    lanes,
+    observe,
+    outgrown_sums,
     screened,
     screening,
     screening_of_lanes,
+    shaken,
+    slope,
+    small_scene,
+    sum_of,
+    summary_text,
+    waves,
 )
-from rigidmd.forces.pairs.space import Triclinic, cell_of
-from rigidmd.forces.waves.ewald import sum_of
-from rigidmd.forces.waves.vectors import waves
-from rigidmd.measure.accuracy import accuracy, estimated_error
-from rigidmd.measure.drift import slope
-from rigidmd.measure.observables import observe
-from rigidmd.measure.summary import outgrown_sums
-from rigidmd.mechanics.rotation import from_vector
-from rigidmd.output.report import summary_text
+
+from rigidmd.cli import main
+from rigidmd.errors import SceneError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
-from rigidmd.scene.place import Box
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
 BOXES = [{"lengths_A": [13.0, 12.5, 15.0]}, {"lengths_A": [13.0, 14.0, 15.0], "angles_deg": [75.0, 100.0, 65.0]}]

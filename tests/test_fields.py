@@ -4,18 +4,24 @@ from math import inf, pi, sqrt
 
 import numpy as np
 import pytest
-from conftest import move, small_scene
+from support import (
+    SCHEMES,
+    TAKEN,
+    BehindWallError,
+    Engine,
+    build,
+    describe,
+    draw_momenta,
+    from_vector,
+    molecular_subject,
+    move,
+    observe,
+    random_rotations,
+    remove_momentum,
+    small_scene,
+)
 
-from rigidmd.assemble.describe import describe
-from rigidmd.assemble.momenta import draw_momenta, remove_momentum
-from rigidmd.assemble.system import build
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import TAKEN
-from rigidmd.engines.cpu import BehindWallError, Engine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure.observables import observe
-from rigidmd.measure.subjects import molecular_subject
-from rigidmd.mechanics.rotation import from_vector, random_rotations
 from rigidmd.run import Simulation
 from rigidmd.units import AVOGADRO, BOLTZMANN, DEBYE, ELEMENTARY_CHARGE
 

@@ -7,27 +7,38 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from conftest import ROOT, small_scene
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
+from support import (
+    AT_ONCE,
+    COMPARATORS,
+    ROOT,
+    SCHEMES,
+    Curve,
+    Picture,
+    Precision,
+    Sample,
+    Samples,
+    Trial,
+    body_subject,
+    build,
+    columns_figure,
+    draw_molecule,
+    draw_panel,
+    energy_figure,
+    load_model,
+    panels,
+    precision_report,
+    record_of,
+    save_figure,
+    shown_range,
+    small_scene,
+)
+from support import SAMPLE_NUMBERS as NUMBERS
+from support import analysis_drawn as drawn
 
-from rigidmd.analyse.files import drawn
-from rigidmd.analyse.findings import Curve
-from rigidmd.assemble.system import build
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.looking.columns import columns_figure, record_of
-from rigidmd.looking.plots import draw_panel, panels
-from rigidmd.measure.samples import NUMBERS, Sample, Samples
-from rigidmd.measure.subjects import COMPARATORS, body_subject
-from rigidmd.measure.trials import Precision, Trial
-from rigidmd.molecules import load_model
-from rigidmd.output import precision_report
-from rigidmd.output.figure import AT_ONCE, save_figure, shown_range
-from rigidmd.output.molecule_figure import draw_molecule
-from rigidmd.output.picture import Picture
-from rigidmd.output.report import energy_figure
 from rigidmd.scene import Scene
 
 

@@ -2,28 +2,47 @@
 
 import numpy as np
 import pytest
-from conftest import built, move, small_scene
 from numba.core.errors import TypingError
 from reference import Oracle
+from support import (
+    AHEAD,
+    BUILDS,
+    BUILT,
+    ENTRIES,
+    MET,
+    MET_BY_ONE,
+    MOST_MET,
+    NAMES,
+    POLYNOMIALS,
+    SCHEMES,
+    USABLE,
+    WINDOW,
+    Addend,
+    Correction,
+    Engine,
+    Loading,
+    NotFiniteError,
+    Plain,
+    build,
+    built,
+    cell_of,
+    clusters_of,
+    from_vector,
+    kernel,
+    lane_count,
+    lennard_jones,
+    move,
+    no_load,
+    observe,
+    place_ahead,
+    radial,
+    reaction_field,
+    small_scene,
+)
+from support import lennard_jones_energy_and_force as energy_and_force
+from support import tree_ahead as ahead
 
-from rigidmd.assemble.system import build
-from rigidmd.compile import kernel
-from rigidmd.compile.lanes import lane_count
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import no_load
-from rigidmd.engines.cpu import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
-from rigidmd.forces.laws.coulomb import radial, reaction_field
-from rigidmd.forces.laws.endings import NAMES, POLYNOMIALS, Addend, Correction, Plain
-from rigidmd.forces.laws.lennard_jones import energy_and_force, lennard_jones
-from rigidmd.forces.pairs.clusters import clusters_of
-from rigidmd.forces.pairs.lists import AHEAD, BUILDS, BUILT, ENTRIES, MET, MET_BY_ONE, MOST_MET, USABLE, WINDOW
-from rigidmd.forces.pairs.sites import place_ahead
-from rigidmd.forces.pairs.space import cell_of
-from rigidmd.forces.pairs.tree import ahead
-from rigidmd.forces.terms import Loading
-from rigidmd.measure.observables import observe
-from rigidmd.mechanics.rotation import from_vector
 from rigidmd.units import BAR, BOLTZMANN
 
 ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]

@@ -2,16 +2,10 @@
 
 import numpy as np
 import pytest
-from conftest import built, move, shaken, small_scene
 from reference import Oracle
+from support import SCHEMES, build, built, describe, mobile, move, nearest_rotation, observe, shaken, small_scene
 
-from rigidmd.assemble.describe import describe
-from rigidmd.assemble.momenta import mobile
-from rigidmd.assemble.system import build
-from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SceneError
-from rigidmd.measure.observables import observe
-from rigidmd.mechanics.rotation import nearest_rotation
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -20,14 +20,13 @@ import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scenes import FROM_FILE, SATELLITE, STRUCTURES
+from support import Checkpoint, Saved, read_checkpoint, state_of, write_checkpoint, write_state
 
 from rigidmd.cli import main
-from rigidmd.core.state import state_of
-from rigidmd.core.state_file import Saved, write_state
 from rigidmd.errors import UNSEEN, CheckpointError
-from rigidmd.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 
-SECONDS, BYTES = 5.0, 2e9  # that an input may take
+SECONDS, BYTES = 5.0, 2e9  # of computing, that an input may take
 FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the soak tier
 
 WATER = """
@@ -101,20 +100,6 @@ integrator = "baoab"
 barostat = "cell_rescaling"
 """
 SUMMED = PRESSED.replace('"pme"', '"ewald"').replace("angles_deg = [80.0, 85.0, 90.0]\n", "")
-FROM_FILE = """
-[[molecules]]
-model = "spce"
-[structure]
-file = "FILE"
-[box]
-lengths_A = 18.0
-[forces]
-cutoff_A = 5.0
-[start]
-temperature_K = 300
-[[stages]]
-duration_ps = 0.01
-"""
 TOP = """
 [body]
 mass_kg = 2.0
@@ -135,27 +120,6 @@ times_s = [0.0, 0.5]
 [run]
 duration_s = 1.0
 timestep_s = 0.001
-"""
-SATELLITE = """
-[body]
-mass_kg = 10.0
-inertia_kg_m2 = [1.0, 2.0, 2.5]
-[start]
-quaternion_wxyz = [1.0, 0.0, 0.0, 0.1]
-angular_velocity_body_rad_s = [0.1, 1.0, 0.0]
-[[wheels]]
-axis = [0.0, 0.0, 1.0]
-motor_torque_N_m = [0.0, 0.01]
-times_s = [0.0, 1.0]
-[frame]
-angular_velocity_rad_s = [0.0, 0.001, 0.0]
-[run]
-duration_s = 1.0
-timestep_s = 0.01
-integrator = "dop853"
-relative_tolerance = 1e-9
-[output]
-interval_s = 0.1
 """
 SUNK = """
 [body]
@@ -220,42 +184,6 @@ charge_e = 0.4
 """
 ONE_WATER = "3\nwater\nO 0.0 0.0 0.0\nH 0.8164904 0.5773590 0.0\nH -0.8164904 0.5773590 0.0\n"
 
-
-def structures() -> dict[str, str]:
-    """Two waters in each format that is read."""
-    names, one = ("O", "H", "H"), np.array([[0, 0, 0], [0.8164904, 0.577359, 0], [-0.8164904, 0.577359, 0]])
-    atoms = [(m, name, *(at + 2 + 6 * m)) for m in range(2) for name, at in zip(names, one, strict=True)]
-    rows = list(enumerate(atoms, 1))
-    gro = "".join(f"{m + 1:5}SOL  {n:>5}{k:5}{x / 10:8.3f}{y / 10:8.3f}{z / 10:8.3f}\n" for k, (m, n, x, y, z) in rows)
-    xyz = "".join(f"{n} {x} {y} {z}\n" for _, (_, n, x, y, z) in rows)
-    lattice = 'Lattice="18.0 0.0 0.0 0.0 18.0 0.0 0.0 0.0 18.0" Properties=species:S:1:pos:R:3'
-    pdb = "".join(
-        f"ATOM  {k:5} {n:4} SOL A{m + 1:4}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {n}\n"
-        for k, (m, n, x, y, z) in rows
-    )
-    arc = "".join(f"{k} {n} {x} {y} {z} 1\n" for k, (_, n, x, y, z) in rows)
-    cif = "".join(f"{n}{k} {n} {x / 18} {y / 18} {z / 18} 1.0\n" for k, (_, n, x, y, z) in rows)
-    data = "".join(f"{k} {m + 1} {1 if n == 'O' else 2} 0.0 {x} {y} {z}\n" for k, (m, n, x, y, z) in rows)
-    dump = "".join(f"{k} {n} {x} {y} {z}\n" for k, (_, n, x, y, z) in rows)
-    columns = "".join(
-        f"_atom_site_{key}\n" for key in ("label", "type_symbol", "fract_x", "fract_y", "fract_z", "occupancy")
-    )
-    edges = "".join(f"_cell_length_{axis} 18\n" for axis in "abc")
-    angles = "".join(f"_cell_angle_{angle} 90\n" for angle in ("alpha", "beta", "gamma"))
-    return {
-        "x.gro": f"water\n{len(rows)}\n{gro}   1.8 1.8 1.8\n",
-        "x.xyz": f"{len(rows)}\nwater\n{xyz}",
-        "y.xyz": f"{len(rows)}\n{lattice}\n{xyz}",
-        "x.pdb": f"CRYST1   18.000   18.000   18.000  90.00  90.00  90.00 P 1           1\n{pdb}END\n",
-        "x.arc": f"{len(rows)} water\n18.0 18.0 18.0 90.0 90.0 90.0\n{arc}",
-        "x.cif": f"data_x\n{edges}{angles}loop_\n{columns}{cif}",
-        "x.cssr": f" 18.0 18.0 18.0\n 90.0 90.0 90.0 SPGR = 1 P 1\n {len(rows)} 1\n water\n{arc}",
-        "x.dump": f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(rows)}\nITEM: BOX BOUNDS pp pp pp\n0 18\n0 18\n0 18\nITEM: ATOMS id element x y z\n{dump}",
-        "x.data": f"units = real\n\n{len(rows)} atoms\n2 atom types\n0 18 xlo xhi\n0 18 ylo yhi\n0 18 zlo zhi\n\nMasses\n\n1 15.999\n2 1.008\n\nAtoms # full\n\n{data}",
-    }
-
-
-STRUCTURES = structures()
 
 NUMBERS = [
     0, 1, -1, 2, 3, 7, 2**31, 2**53, 10**12, 2**63 - 1, 2**63, 10**30, 10**400,
@@ -376,11 +304,11 @@ class Trial:
     def __call__(self, *arguments: str) -> int:
         """The exit code of a command, which must be 0 or 2 with a message that is safe to print."""
         out, err = io.StringIO(), io.StringIO()
-        begin = time.perf_counter()
+        begin = time.process_time()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)  # of NumPy: numbers that overflow or mean nothing
             code = main(list(arguments))
-        self.note(time.perf_counter() - begin, code == 2, arguments)
+        self.note(time.process_time() - begin, code == 2, arguments)
         said = out.getvalue() + err.getvalue()
         assert code in (0, 2), said
         assert not UNSEEN.search(said), said
@@ -524,15 +452,15 @@ def _checkpoints(trial, folder, changes):
     path = folder / "checkpoint.npz"
     kept = path.read_bytes()
     path.write_bytes(with_bytes_changed(kept, changes))
-    begin = time.perf_counter()
+    begin = time.process_time()
     try:
         found = read_checkpoint(path)
     except CheckpointError as error:
         assert str(path) in str(error)
-        trial.note(time.perf_counter() - begin, True, changes)
+        trial.note(time.process_time() - begin, True, changes)
     else:
         assert np.array_equal(found.of("x").arrays["y"], np.arange(50.0))  # nothing wrong is ever taken
-        trial.note(time.perf_counter() - begin, False, changes)
+        trial.note(time.process_time() - begin, False, changes)
 
 
 @st.composite

@@ -5,16 +5,22 @@ import subprocess
 
 import numpy as np
 import pytest
-from conftest import built, shaken, small_scene
 from reference import Oracle
+from support import (
+    build,
+    built,
+    export,
+    gmx,
+    kinetic_energies,
+    portrait,
+    random_rotations,
+    shaken,
+    small_scene,
+    write_gromacs,
+)
+from support import gromacs_faults as faults
 
-from rigidmd.assemble.system import build
 from rigidmd.errors import SceneError
-from rigidmd.measure.observables import kinetic_energies
-from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.peers.gromacs_files import faults, write_gromacs
-from rigidmd.peers.portrait import portrait
-from rigidmd.study.export import export
 from rigidmd.units import KJ_PER_MOL
 
 needs_gmx = pytest.mark.skipif(shutil.which("gmx") is None, reason="no gmx here")
@@ -34,11 +40,6 @@ WAVES = {
     "benzene": ({"benzene_opls": 4, "argon": 2}, {"mixing": "geometric", "ewald_truncation": "plain"}),
     "methanol": ({"methanol_trappe": 6, "argon": 2}, {}),
 }
-
-
-def gmx(folder, *arguments):
-    ran = subprocess.run(["gmx", "-quiet", *arguments], cwd=folder, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr[-3000:]
 
 
 def energies(folder):

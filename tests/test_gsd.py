@@ -5,17 +5,11 @@ import shutil
 import gsd.hoomd
 import numpy as np
 import pytest
-from conftest import small_scene
-from test_resume import NPT, NVT, WATER, same_after_stops, scene
+from scenes import FORTY_WATERS, NPT, NVT, forty_waters
+from support import GsdFile, GsdReader, build, from_quaternion, read_frames, same_after_stops, small_scene
 
-from rigidmd.assemble.gsd_format import GsdReader
-from rigidmd.assemble.system import build
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.mechanics.rotation import from_quaternion
-from rigidmd.output.trajectory import read_frames
-from rigidmd.output.trajectory_file import GsdFile
-from rigidmd.run import Simulation
-from rigidmd.run.observers import Every
+from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 
 COUNTS = {"tip4p2005": 6, "argon": 3, "nitrogen": 4}
@@ -97,7 +91,9 @@ def test_it_is_what_hoomd_has(run):
 
 
 def test_a_run_goes_on_to_the_same_bytes(tmp_path):
-    same_after_stops(scene(NVT, NPT, output=WATER["output"] | {"trajectory": "trajectory.gsd"}), [3, 61, 133], tmp_path)
+    same_after_stops(
+        forty_waters(NVT, NPT, output=FORTY_WATERS["output"] | {"trajectory": "trajectory.gsd"}), [3, 61, 133], tmp_path
+    )
 
 
 def test_wrapped_centres_and_no_box(tmp_path):

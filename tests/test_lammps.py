@@ -10,23 +10,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT, built, small_scene
-from engine_scenes import PME, SCENES
+from scenes import PME, SCENES
+from support import (
+    HEAT,
+    NOW,
+    ROOT,
+    Bodies,
+    LammpsEngine,
+    available_models,
+    build,
+    built,
+    compare_at,
+    energy_figure,
+    lammps,
+    lammps_files,
+    read_record,
+    small_scene,
+    verify,
+)
+from support import comparison_in_words as in_words
+from support import mean_and_error as mean
 
 from rigidmd import cli
-from rigidmd.assemble.system import build
-from rigidmd.core.state import HEAT, NOW
 from rigidmd.errors import EngineError, SimulationError
-from rigidmd.measure.summary import mean
-from rigidmd.molecules import available_models
-from rigidmd.output.record import read_record
-from rigidmd.output.report import energy_figure
-from rigidmd.peers import lammps, lammps_files
-from rigidmd.peers.bodies import Bodies
-from rigidmd.peers.checking import compare_at, in_words
-from rigidmd.peers.lammps import LammpsEngine
 from rigidmd.run import Simulation
-from rigidmd.study.verify import verify
 
 pytest.importorskip("lammps")
 

@@ -9,15 +9,12 @@ import sys
 import numba
 import numpy as np
 import pytest
-from conftest import ROOT, built, move, small_scene
 from numba import types
+from support import BUILDS, ROOT, SCHEMES, build, built, move, small_scene
+from support import pair_loop as pairs
 
-from rigidmd.assemble.system import build
 from rigidmd.compile import SIMD_BITS, Parcel, kernel, lanes
 from rigidmd.compile.records import load_matrices, load_vectors, store_matrices, store_vectors
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.forces.pairs import loop as pairs
-from rigidmd.forces.pairs.lists import BUILDS
 from rigidmd.units import KJ_PER_MOL
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
@@ -257,7 +254,7 @@ def test_mixed_precision_costs_less_than_a_hundred_thousandth(counts, edge, endi
 SAME_BITS = """
 import hashlib, sys
 sys.path.insert(0, "tests")
-from conftest import small_scene
+from support import small_scene
 from rigidmd.scene import Scene
 from rigidmd.run import Simulation
 stage = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.1}

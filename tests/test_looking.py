@@ -12,18 +12,11 @@ from itertools import pairwise
 import MDAnalysis
 import numpy as np
 import pytest
-from conftest import ROOT
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
+from support import ROOT, SOLIDS, UNITS, build_body, connections, mesh_of, molecule_film, read_record, solid, write_film
 
 from rigidmd import Scene, Simulation, cli
-from rigidmd.assemble.body import build_body
-from rigidmd.looking import molecule_film
-from rigidmd.looking.film import write_film
-from rigidmd.looking.mesh import UNITS, mesh_of
-from rigidmd.mechanics.solids import SOLIDS, solid
-from rigidmd.output.connections import connections
-from rigidmd.output.record import read_record
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
@@ -243,7 +236,7 @@ def test_a_film_moves(kind, request, tmp_path, capsys):
 
 
 def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
-    from rigidmd.looking import film
+    from support import film
 
     monkeypatch.setattr(film.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
@@ -271,8 +264,7 @@ def test_a_film_as_mp4(top, tmp_path):
 
 
 def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
-    from rigidmd.looking.body_film import body_film
-    from rigidmd.looking.film import _loop
+    from support import _loop, body_film
 
     record = read_record(top)
     film = body_film(record)

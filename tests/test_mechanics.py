@@ -5,19 +5,26 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-
-from rigidmd.compile import kernel
-from rigidmd.core.state import Load, state_of
-from rigidmd.mechanics.groups import TOGETHER, kick_group, turn_group
-from rigidmd.mechanics.inertia import kind_of_body, principal_frame
-from rigidmd.mechanics.rotation import align, from_quaternion, from_vector, orthogonality_error, random_rotations
-from rigidmd.mechanics.rotor import NONE, ExactRotor, split_rotor, turn
-
-
-@kernel(outer=True)
-def spin(rotor, rotation, angular_momentum, h, steps):
-    for _ in range(steps):
-        turn(rotor, 0, rotation, angular_momentum, 0, h)
+from support import (
+    NONE,
+    TOGETHER,
+    ExactRotor,
+    Load,
+    align,
+    from_quaternion,
+    from_vector,
+    kernel,
+    kick_group,
+    kind_of_body,
+    orthogonality_error,
+    principal_frame,
+    random_rotations,
+    spin,
+    split_rotor,
+    state_of,
+    turn,
+    turn_group,
+)
 
 
 @kernel(outer=True)

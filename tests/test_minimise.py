@@ -7,27 +7,32 @@ import warnings
 import ase.units
 import numpy as np
 import pytest
-from conftest import shaken, small_scene
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
+from support import (
+    NOW,
+    Enthalpy,
+    Keeper,
+    State,
+    build,
+    describe,
+    load_model,
+    minimise,
+    mobile,
+    panels,
+    precision,
+    read_frames,
+    read_record,
+    shaken,
+    small_scene,
+    state_of,
+    write_report,
+)
 
-from rigidmd.assemble.describe import describe
-from rigidmd.assemble.momenta import mobile
-from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.core.state import NOW, State, state_of
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
-from rigidmd.looking.plots import panels
-from rigidmd.looking.report import write_report
-from rigidmd.molecules import load_model
-from rigidmd.output.record import read_record
-from rigidmd.output.trajectory import read_frames
 from rigidmd.run import Every, Simulation
-from rigidmd.run.enthalpy import Enthalpy
-from rigidmd.run.keeper import Keeper
-from rigidmd.run.minimise import minimise
 from rigidmd.scene import Scene
-from rigidmd.study.precision import precision
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
 MIXTURE = {"argon": 4, "nitrogen": 4, "spce": 6}

@@ -7,15 +7,20 @@ from itertools import product
 
 import numpy as np
 import pytest
-from conftest import small_scene
 from scipy.spatial.transform import Rotation
-
-from rigidmd.analyse.electric import dielectric
-from rigidmd.analyse.history import History
-from rigidmd.analyse.motion import msd
-from rigidmd.analyse.structure import density_profile, hydrogen_bonds, rdf, structure_factor
-from rigidmd.analyse.turning import orientation, spectrum
-from rigidmd.assemble.system import build
+from support import (
+    History,
+    build,
+    density_profile,
+    dielectric,
+    hydrogen_bonds,
+    msd,
+    orientation,
+    rdf,
+    small_scene,
+    spectrum,
+    structure_factor,
+)
 
 GRAM_PER_CM3 = 1 / 1.66053906660  # u/Å³
 KELVIN = 1.380649e-23 / 1.66053906660e-27 * 1e20 / 1e24  # u Å²/ps²

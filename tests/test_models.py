@@ -5,14 +5,22 @@ import re
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from support import (
+    GROUPS,
+    MODELS,
+    available_models,
+    bonds,
+    build,
+    load_model,
+    models_table,
+    read_molecule,
+    small_scene,
+    with_masses,
+    write_scene,
+)
 
-from rigidmd.assemble.system import build
 from rigidmd.cli import main
 from rigidmd.errors import MoleculeError, SceneError
-from rigidmd.molecules import GROUPS, MODELS, available_models, load_model, read_molecule, with_masses
-from rigidmd.output.molecule_report import bonds, models_table
-from rigidmd.output.scene_file import write_scene
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL

@@ -8,14 +8,10 @@ import subprocess
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from support import Manifest, Point, build, gromacs_files, lammps_files, portrait, write_script
 
-from rigidmd.assemble.system import build
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.output.sweep_folder import Manifest, Point
-from rigidmd.peers import gromacs_files, lammps_files
-from rigidmd.peers.portrait import portrait
 from rigidmd.scene import Scene
-from rigidmd.study.sweep.slurm import write_script
 
 PLAIN = ("one", "two", "first", "AR", "RES")
 #: What some language obeys, at the ends of names and within them.
@@ -117,7 +113,7 @@ def test_names_change_no_setting_of_gromacs(usual, tmp_path, names):
 @example((EVIL[0], EVIL[1], "{stages}{title}{system}{kick}", '"""', "&"))
 def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, names):
     pytest.importorskip("openmm")
-    from rigidmd.peers.openmm_files import write_openmm
+    from support import write_openmm
 
     texts = []
     for drawn in (usual[1], portrait(build(named(names)))):

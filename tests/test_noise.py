@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 from scipy import stats
-
-from rigidmd.compile import kernel
-from rigidmd.dynamics.noise import (
+from support import (
     BATCH,
     BATH,
     LATTICE,
@@ -13,6 +11,7 @@ from rigidmd.dynamics.noise import (
     Key,
     chi_square,
     fill_normals,
+    kernel,
     key_of,
     normals,
     philox,

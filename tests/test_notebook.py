@@ -8,16 +8,13 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from conftest import ROOT, SYSTEMS, small_scene
+from support import ROOT, SYSTEMS, notebooks, progress, save_figure, small_scene
 
 import rigidmd
 from rigidmd.cli import main
 from rigidmd.errors import RigidMDWarning
-from rigidmd.output import progress
-from rigidmd.output.figure import save_figure
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.shipped import notebooks
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 SHORT = {"run.duration_s": 0.05, "output.figures": False}

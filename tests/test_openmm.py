@@ -7,27 +7,32 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import built, shaken, small_scene
 from reference import Oracle
 from scipy.special import erfc
+from support import (
+    HEAT,
+    Bodies,
+    NotFiniteError,
+    OpenmmEngine,
+    available_models,
+    build,
+    built,
+    inertia_tensor,
+    kinetic_energies,
+    load_model,
+    mass_points,
+    other_engine,
+    portrait,
+    random_rotations,
+    read_record,
+    shaken,
+    small_scene,
+    write_openmm,
+)
+from support import openmm_faults as faults
 
 from rigidmd import cli
-from rigidmd.assemble.system import build
-from rigidmd.core.state import HEAT
-from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.errors import EngineError, SceneError
-from rigidmd.measure.observables import kinetic_energies
-from rigidmd.mechanics.inertia import inertia_tensor
-from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.molecules import available_models, load_model
-from rigidmd.output.record import read_record
-from rigidmd.peers.bodies import Bodies
-from rigidmd.peers.engines import other_engine
-from rigidmd.peers.mass_points import mass_points
-from rigidmd.peers.openmm import OpenmmEngine
-from rigidmd.peers.openmm_files import write_openmm
-from rigidmd.peers.openmm_system import faults
-from rigidmd.peers.portrait import portrait
 from rigidmd.units import BAR, BOLTZMANN, COULOMB
 
 pytest.importorskip("openmm")

@@ -14,25 +14,37 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
-from conftest import ROOT, built, small_scene
 from scipy.integrate import quad
+from support import (
+    NAMES,
+    ROOT,
+    FormulaError,
+    Index,
+    OwnOfOneKind,
+    Plain,
+    build,
+    built,
+    check_forces,
+    describe,
+    ending,
+    formulas,
+    kernel,
+    lanes,
+    of_function,
+    of_table,
+    of_text,
+    own_code,
+    small_scene,
+    tail_of,
+)
+from support import lennard_jones as built_in
+from support import lennard_jones_energy_and_force as of_built_in
+from support import lennard_jones_tail as tail
+from support import own_energy_and_force as energy_and_force
 
 import rigidmd
-from rigidmd.assemble.describe import describe
-from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.compile import kernel, lanes
-from rigidmd.compile.numba_private import Index
-from rigidmd.core import own_code
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.forces.laws import formulas
-from rigidmd.forces.laws.endings import NAMES, Plain, ending
-from rigidmd.forces.laws.formulas import FormulaError, of_function, of_table, of_text
-from rigidmd.forces.laws.lennard_jones import energy_and_force as of_built_in
-from rigidmd.forces.laws.lennard_jones import lennard_jones as built_in
-from rigidmd.forces.laws.lennard_jones import tail
-from rigidmd.forces.laws.own import OwnOfOneKind, energy_and_force, tail_of
-from rigidmd.measure.own_forces import check_forces
 from rigidmd.units import KJ_PER_MOL
 
 SCRIPTS = sorted((ROOT / "systems" / "scripts").glob("*.py"))
@@ -782,7 +794,7 @@ def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
-    from rigidmd.analyse import registry
+    from support import registry
 
     monkeypatch.setattr(registry, "KNOWN", dict(registry.KNOWN))
     assert len(path.read_text().splitlines()) < 40

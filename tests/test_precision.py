@@ -9,22 +9,36 @@ import tomllib
 
 import numpy as np
 import pytest
-from conftest import ROOT, SPRING, small_scene, springs
+from support import (
+    FORMULATIONS,
+    ROOT,
+    SCHEMES,
+    SPRING,
+    Method,
+    Precision,
+    Trial,
+    averages,
+    averages_report,
+    body_subject,
+    choosing,
+    extrapolate,
+    measure,
+    measuring,
+    precision,
+    sampling,
+    small_scene,
+    springs,
+    timing,
+    write_precision,
+)
+from support import BiasPoint as Point
+from support import precision_advice as advice
+from support import precision_row as row
+from support import precision_table as table_text
 
 from rigidmd.cli import main
-from rigidmd.core.schemes import FORMULATIONS, SCHEMES
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure import trials as measuring
-from rigidmd.measure.bias import Point, extrapolate
-from rigidmd.measure.subjects import body_subject
-from rigidmd.measure.trials import Method, Precision, Trial, measure, timing
-from rigidmd.output import averages_report
-from rigidmd.output.precision_report import advice, row, table_text, write_precision
 from rigidmd.scene import Scene
-from rigidmd.study import averages as sampling
-from rigidmd.study import precision as choosing
-from rigidmd.study.averages import averages
-from rigidmd.study.precision import precision
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 

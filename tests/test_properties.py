@@ -4,21 +4,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from rigidmd.compile import kernel
-from rigidmd.core.state import State
-from rigidmd.errors import RigidMDError
-from rigidmd.mechanics.inertia import inertia_tensor, principal_frame
-from rigidmd.mechanics.rotation import (
+from support import (
+    ExactRotor,
+    State,
     from_euler_angles,
     from_quaternion,
     from_yaw_pitch_roll,
+    inertia_tensor,
     orthogonality_error,
+    principal_frame,
+    spin,
+    split_rotor,
     to_euler_angles,
     to_quaternion,
     to_yaw_pitch_roll,
 )
-from rigidmd.mechanics.rotor import ExactRotor, split_rotor, turn
+
+from rigidmd.errors import RigidMDError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
@@ -75,12 +77,6 @@ def test_any_masses_have_a_principal_frame(positions, data):
     assert np.abs(turned - np.diag(frame.inertia)).max() <= 2e-8 * scale
     assert (np.diff(frame.inertia) >= 0).all() or frame.kind == "spherical"
     assert frame.inertia[2] <= (frame.inertia[0] + frame.inertia[1]) * (1 + 3e-8)
-
-
-@kernel(outer=True)
-def spin(rotor, rotation, momentum, h, steps):
-    for _ in range(steps):
-        turn(rotor, 0, rotation, momentum, 0, h)
 
 
 #: Moments of a body: of three positive numbers, each pair added, so that no moment is more than the sum of the others.

@@ -9,15 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import BODIES, ROOT, small_scene
+from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Reading, load_model, small_scene
 
 import rigidmd
 from rigidmd.errors import SceneError
-from rigidmd.measure.columns import BODY, BODY_COLUMNS
-from rigidmd.measure.observables import Reading
-from rigidmd.measure.samples import COLUMNS
-from rigidmd.molecules import load_model
-from rigidmd.output.log import TENSOR
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import KJ_PER_MOL

@@ -5,17 +5,10 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from support import CentralSites, Engine, Model, NoRotor, build, lennard_jones, observe, pair_forces, state_of
+from support import lennard_jones_tail as tail
 
-from rigidmd.assemble.system import build
-from rigidmd.core.state import state_of
-from rigidmd.dynamics.advance import Model
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import StructureError
-from rigidmd.forces.laws.lennard_jones import lennard_jones, tail
-from rigidmd.forces.pairs.loop import pair_forces
-from rigidmd.forces.pairs.sites import CentralSites
-from rigidmd.measure.observables import observe
-from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN

@@ -19,36 +19,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from scenes import FORTY_WATERS, MINIMISE, NPH, NPT, NVE, NVT, forty_waters
+from support import (
+    CHECKPOINT,
+    PREVIOUS,
+    ROOT,
+    AppendedFile,
+    Checkpoint,
+    FolderLock,
+    checkpoint,
+    contents,
+    provenance,
+    read_checkpoint,
+    same_after_stops,
+    stopped_at,
+    write_checkpoint,
+)
 
 from rigidmd import cli
-from rigidmd.core.files import AppendedFile
 from rigidmd.errors import CheckpointError, OutputError, SimulationError
-from rigidmd.output import checkpoint
-from rigidmd.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from rigidmd.output.folder import CHECKPOINT, PREVIOUS, FolderLock
-from rigidmd.run import Simulation, provenance, run_together
-from rigidmd.run.observers import Every
+from rigidmd.run import Every, Simulation, run_together
 from rigidmd.scene import Scene
-
-WATER = {
-    "box": {"density_g_cm3": 0.9},
-    "molecules": [{"model": "spce", "count": 40}],
-    "forces": {"cutoff_A": 5.0, "truncation": "smooth_switch"},
-    "start": {"temperature_K": 298.0},
-    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figure": False},
-}
-NVT = {"ensemble": "nvt", "temperature_K": 298.0, "duration_ps": 0.1, "timestep_fs": 1.0}
-NPT = NVT | {"ensemble": "npt", "pressure_bar": 1.0, "barostat_interval_ps": 0.007, "temperature_K": [298.0, 320.0]}
-NVE = {"duration_ps": 0.1, "timestep_fs": 2.0}
-NPH = NVE | {"ensemble": "nph", "pressure_bar": 1.0}
-MINIMISE = {"ensemble": "minimise", "most_iterations": 5}
-
-
-def scene(*stages: dict, **changes) -> dict:
-    """Forty waters."""
-    return WATER | {"stages": list(stages)} | changes
-
 
 TOP = {
     "body": {
@@ -70,55 +61,10 @@ def top(integrator: str) -> dict:
     return TOP | {"run": TOP["run"] | {"integrator": integrator}}
 
 
-def stopped_at(steps: set[int]) -> Every:
-    """An observer that sends SIGTERM to this process after some of the steps of a run."""
-
-    def stop(moment):
-        if moment.step in steps:
-            steps.discard(moment.step)
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    return Every(0.001, stop)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a run that have to be the same to the bit."""
-    names = [
-        path.name
-        for path in folder.iterdir()
-        if path.name.startswith(("trajectory", "log", "topology", "motion", "pressure_tensor"))
-    ]
-    found = {name: (folder / name).read_bytes() for name in names}
-    if (folder / "final.npz").exists():
-        with np.load(folder / "final.npz") as data:
-            found |= {name: data[name].tobytes() for name in data.files}
-    return found
-
-
-def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
-    """Run once without a stop, once with stops after these steps, each time with another number of threads."""
-    looks = Every(0.001, lambda moment: None)  # the same looks in both runs
-    Simulation(Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=looks).run()
-    left, runs = set(steps), 0
-    while True:
-        simulation = Simulation(
-            Scene.from_dict(data | {"threads": 1 + runs % 2}), folder / "parts", observers=stopped_at(left), resume=True
-        )
-        results = simulation.run()
-        runs += 1
-        if not results.interrupted:
-            break
-        assert results.signal == signal.SIGTERM
-    assert runs == len(steps) + 1
-    whole, parts = contents(folder / "whole"), contents(folder / "parts")
-    assert whole.keys() == parts.keys() and len(whole) > 3
-    assert [name for name in whole if whole[name] != parts[name]] == []
-
-
 def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
     """Two stages, mixed precision, a box that moves, a ramp, a pressure tensor of its own."""
-    output = WATER["output"] | {"pressure_tensor_interval_ps": 0.01}
-    same_after_stops(scene(NVT, NPT, NVE, precision="mixed", output=output), [3, 61, 100, 133, 207], tmp_path)
+    output = FORTY_WATERS["output"] | {"pressure_tensor_interval_ps": 0.01}
+    same_after_stops(forty_waters(NVT, NPT, NVE, precision="mixed", output=output), [3, 61, 100, 133, 207], tmp_path)
     assert (tmp_path / "whole" / "pressure_tensor.csv").read_text().count("\n") == 32
 
 
@@ -138,7 +84,7 @@ def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
     ids=["langevin", "nose_hoover", "andersen", "monte_carlo", "flexible", "minimise", "auto"],
 )
 def test_every_ensemble_goes_on_to_the_same_bits(stages, precision, tmp_path):
-    same_after_stops(scene(*stages, precision=precision), [17, 60, 111, 140], tmp_path)
+    same_after_stops(forty_waters(*stages, precision=precision), [17, 60, 111, 140], tmp_path)
 
 
 @pytest.mark.soak
@@ -155,13 +101,13 @@ def test_every_ensemble_goes_on_to_the_same_bits(stages, precision, tmp_path):
     ],
 )
 def test_every_format_goes_on(name, tmp_path):
-    same_after_stops(scene(NVT, output=WATER["output"] | {"trajectory": name}), [31, 80], tmp_path)
+    same_after_stops(forty_waters(NVT, output=FORTY_WATERS["output"] | {"trajectory": name}), [31, 80], tmp_path)
 
 
 @pytest.mark.soak
 def test_pme_goes_on(tmp_path):
     forces = {"cutoff_A": 5.0, "truncation": "shift", "electrostatics": "pme"}
-    same_after_stops(scene(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path)
+    same_after_stops(forty_waters(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path)
 
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
@@ -221,7 +167,7 @@ def test_the_command_resume_goes_on_and_lengthens(again, capsys):
 def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
     """`rigidmd resume` reads the scene that the run has written: its inputs are copies, and what was open is decided."""
     auto = {"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-2}
-    data = scene(NVT, auto, structure={"file": "final.npz"}, start={"temperature_K": 298.0}, box={})
+    data = forty_waters(NVT, auto, structure={"file": "final.npz"}, start={"temperature_K": 298.0}, box={})
     data["molecules"] = [{"model": "spce"}]
     folder = stopped / "run"
     looks = stopped_at(set())
@@ -287,7 +233,7 @@ def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_p
     """Digests are those of the start, whatever happens to the files of a run that goes on."""
     shutil.copy(stopped / "run" / "final.npz", tmp_path / "start.npz")
     digest = hashlib.sha256((tmp_path / "start.npz").read_bytes()).hexdigest()
-    data = scene(NVT, structure={"file": "start.npz"}, box={})
+    data = forty_waters(NVT, structure={"file": "start.npz"}, box={})
     data["molecules"] = [{"model": "spce"}]
     away = Every(0.05, lambda moment: (tmp_path / "start.npz").unlink(missing_ok=True))
     results = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "run", observers=away).run()
@@ -377,7 +323,7 @@ def test_a_refused_resume_changes_nothing(case, again, capsys):
 @pytest.mark.parametrize("name", ["trajectory.gsd", "trajectory.traj", "trajectory.pdb"])
 def test_frames_beyond_a_checkpoint_outlive_a_refused_resume(name, again, capsys):
     """Formats with a table or an end of their own."""
-    data = scene(NVT, output=WATER["output"] | {"trajectory": name}, threads=1)
+    data = forty_waters(NVT, output=FORTY_WATERS["output"] | {"trajectory": name}, threads=1)
     run = again / "other"
     Simulation(Scene.from_dict(data), run, observers=stopped_at({31})).run()
     shutil.copy(run / CHECKPOINT, again)
@@ -496,7 +442,7 @@ def test_a_callback_that_changes_the_directory(again, monkeypatch):
     shutil.copytree(again / "run", elsewhere / "run")
     before = everything(elsewhere / "run")
     monkeypatch.chdir(again)
-    data = scene(NVT | {"duration_ps": 0.02}, threads=1)
+    data = forty_waters(NVT | {"duration_ps": 0.02}, threads=1)
     moved = Every(0.005, lambda moment: os.chdir(elsewhere))
     results = Simulation(Scene.from_dict(data), "new", observers=moved).run()
     assert everything(elsewhere / "run") == before and not (elsewhere / "new").exists()
@@ -541,7 +487,7 @@ except (OutputError, SimulationError):
 
 
 def test_a_run_cannot_run_itself(again, tmp_path):
-    data = Scene.from_dict(scene(NVT | {"duration_ps": 0.01}, threads=1))
+    data = Scene.from_dict(forty_waters(NVT | {"duration_ps": 0.01}, threads=1))
     simulation = Simulation(data, tmp_path / "run", observers=Every(0.005, lambda moment: simulation.run()))
     with pytest.raises(RuntimeError, match="running already"):
         simulation.run()
@@ -572,7 +518,7 @@ class Counting(Every):
 
 def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
     """What may change (figures, the user's own observers) takes no other observer's memory."""
-    data = scene(NVT, threads=1)
+    data = forty_waters(NVT, threads=1)
     first, second = Counting(0), Counting(100)
     Simulation(Scene.from_dict(data), again / "two", observers=[first, second, stopped_at({40})]).run()
     assert (first.counted, second.counted) == (5, 105)
@@ -675,7 +621,7 @@ def test_sizes_that_are_none_cut_no_file(owner, kept, again):
 def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
     """With right checksums: refused with a sentence, or they change no bit. No crash, no hang, no wrong course."""
     data = (
-        scene(NVT | {"duration_ps": 0.06}, threads=1)
+        forty_waters(NVT | {"duration_ps": 0.06}, threads=1)
         if kind == "molecules"
         else top(kind.replace("verlet", "velocity_verlet"))
     )
@@ -784,19 +730,31 @@ def test_one_run_at_a_time_writes_into_a_folder(again, capsys):
     lock.release()
 
 
-def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys):
+def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys, monkeypatch):
+    """On a clock that goes on by 10 ms whenever it is read."""
+    now, spare = [0.0], 3.0  # seconds that are left for the end
+
+    def read():
+        now[0] += 0.01
+        return now[0]
+
     command = ["run", str(stopped / "water.toml"), "-o", str(tmp_path / "run"), "--set", "stages.0.duration_ps=1000"]
-    assert cli.main([*command, "--walltime", "0:00:04"]) == 75
-    assert "goes on with it" in capsys.readouterr().out
-    assert cli.main([*command, "--resume", "--walltime", "0:00:04"]) == 75
-    log = (tmp_path / "run" / "log.csv").read_text().splitlines()
-    steps = [int(line.split(",")[0]) for line in log[1:-1]]
-    assert steps == list(range(0, 10 * len(steps), 10))
-    assert len(steps) > 20
+    steps = []
+    for more in ([], ["--resume"]):
+        began, seen = now[0], len(steps)
+        with monkeypatch.context() as patch:
+            patch.setattr(time, "monotonic", read)
+            assert cli.main([*command, *more, "--walltime", "0:00:04"]) == 75
+        assert "goes on with it" in capsys.readouterr().out
+        assert 4.0 - spare - 0.1 < now[0] - began < 4.0
+        log = (tmp_path / "run" / "log.csv").read_text().splitlines()
+        steps = [int(line.split(",")[0]) for line in log[1:-1]]
+        assert steps == list(range(0, 10 * len(steps), 10))
+        assert len(steps) > seen + 10
 
 
-def killed(command: list[str], after: float | None) -> int:
-    """Kill a command so many seconds after it has written to its log, or let it end; its exit code."""
+def killed(command: list[str], after: float) -> int:
+    """Kill a command so many seconds after it has written to its log; its exit code."""
     log = Path(command[command.index("-o") + 1]) / "log.csv"
     before = log.stat().st_mtime_ns if log.exists() else None
     run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -811,16 +769,22 @@ def killed(command: list[str], after: float | None) -> int:
 
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
 def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
-    """kill -9 at random moments, with a checkpoint at every look."""
+    """kill -9 at random moments, with a checkpoint at every look, of a run that is longer than anybody waits for."""
     scene = ["run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-9", "--threads", "1"]
-    scene += ["--set", f"stages.0.duration_ps={max(4.0, 0.3 * times)}", "--set", "output.log_interval_ps=0.02"]
-    without = ["--set", "output.checkpoint_minutes=false"]
-    assert cli.main([*scene, "-o", str(tmp_path / "whole"), *without]) == 0
+    scene += ["--set", "output.log_interval_ps=0.02"]
+    longest = 1000 * times
     command = [sys.executable, "-m", "rigidmd", *scene, "-o", str(tmp_path / "parts"), "--resume"]
     rng = np.random.default_rng(times)
     for _ in range(times):
-        assert killed(command, float(rng.uniform(0.0, 0.3))) == -signal.SIGKILL
-    assert killed(command, None) == 0
+        assert (
+            killed([*command, "--set", f"stages.0.duration_ps={longest}"], float(rng.uniform(0.0, 0.3)))
+            == -signal.SIGKILL
+        )
+    reached = (tmp_path / "parts" / "log.csv").read_text().splitlines()[-1]  # perhaps half a line
+    end = np.ceil(int(reached.partition(",")[0]) / 1000) + 1.0
+    assert cli.main(["resume", str(tmp_path / "parts"), "--until", f"{end}ps"]) == 0
+    without = ["--set", "output.checkpoint_minutes=false", "--set", f"stages.0.duration_ps={end}"]
+    assert cli.main([*scene, "-o", str(tmp_path / "whole"), *without]) == 0
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
 

@@ -3,7 +3,7 @@
 import ast
 
 import pytest
-from conftest import ROOT
+from support import ROOT
 
 PACKAGE = ROOT / "rigidmd"
 
@@ -122,7 +122,7 @@ def test_each_library_has_its_room(library):
 
 def test_what_is_compiled_counts_in_the_digest_that_names_the_cache():
     """A kernel outside of `cache.COMPILED`, or one that takes a number from outside, would run on when it changes."""
-    from rigidmd.compile.cache import COMPILED
+    from support import COMPILED
 
     for path in FILES:
         name = path.relative_to(PACKAGE).parts[0]

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-
-from rigidmd.mechanics.rotation import (
+from support import (
     angular_velocity_of_euler_rates,
     attitude_matrix,
     euler_rates,

@@ -13,29 +13,43 @@ from pathlib import Path
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from conftest import MOLECULES, ROOT, built, shaken, small_scene
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
+from support import (
+    BUILDS,
+    COLUMNS,
+    MOLECULES,
+    NOW,
+    ROOT,
+    SCHEMES,
+    TAKEN,
+    Engine,
+    Figures,
+    Sample,
+    Samples,
+    State,
+    System,
+    body_observers,
+    build,
+    built,
+    columns,
+    compare_at,
+    describe,
+    log,
+    minimise,
+    observe,
+    progress,
+    rigidmd_command,
+    row_of_stage,
+    shaken,
+    small_scene,
+    summarise,
+    summary_text,
+)
 
 import rigidmd
-from rigidmd.assemble.describe import describe
-from rigidmd.assemble.rows import row as row_of_stage
-from rigidmd.assemble.system import System, build
 from rigidmd.cli import main
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import NOW, TAKEN, State
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
-from rigidmd.forces.pairs.lists import BUILDS
-from rigidmd.measure.observables import observe
-from rigidmd.measure.samples import COLUMNS, Sample, Samples
-from rigidmd.measure.summary import summarise
-from rigidmd.output import log, progress
-from rigidmd.output.log import columns
-from rigidmd.output.report import summary_text
-from rigidmd.peers.checking import compare_at
-from rigidmd.run import Every, Observer, Simulation, body_observers
-from rigidmd.run.body_observers import Figures
-from rigidmd.run.minimise import minimise
+from rigidmd.run import Every, Observer, Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -752,12 +766,6 @@ def test_observers_cannot_write_to_the_state():
         Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)], warn=str).run()
 
 
-def command(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "rigidmd", *map(str, arguments)], capture_output=True, text=True, **options
-    )
-
-
 def running(tmp_path, lines):
     """A long argon run in another process, once its log has so many lines: (process, its folder)."""
     scene, out = str(ROOT / "systems" / "argon.toml"), tmp_path / "out"
@@ -1038,24 +1046,24 @@ def test_help_is_quick_and_imports_nothing_heavy():
 
 
 def test_version():
-    assert command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
+    assert rigidmd_command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
 
 
 def test_output_goes_to_runs_by_default(tmp_path):
     short = ["--set", "stages.0.duration_ps=0.01", "--set", "stages.1.duration_ps=0.01"]
-    done = command(
+    done = rigidmd_command(
         "run", ROOT / "systems" / "argon.toml", *short, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "runs" / "argon" / "summary.json").exists()
     assert "argon: 500 argon; 500 bodies, 500 sites, 1497 degrees of freedom" in done.stdout
     assert "summary.json" in done.stdout
-    again = command(
+    again = rigidmd_command(
         "run", ROOT / "systems" / "argon.toml", *short, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
     )
     assert again.returncode == 2
     assert "--force" in again.stderr
-    forced = command(
+    forced = rigidmd_command(
         "run",
         ROOT / "systems" / "argon.toml",
         *short,

@@ -4,11 +4,10 @@ import json
 import tomllib
 
 import pytest
-from conftest import SYSTEMS
 from jsonschema import Draft202012Validator
+from support import SYSTEMS, available_models
 
 from rigidmd.cli import main
-from rigidmd.molecules import available_models
 from rigidmd.scene import schema
 
 VALIDATOR = Draft202012Validator(schema())

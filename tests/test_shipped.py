@@ -5,11 +5,10 @@ import sys
 import tomllib
 
 import pytest
-from conftest import BODIES, ROOT, SYSTEMS
+from support import BODIES, ROOT, SHIPPED, SYSTEMS
 
 from rigidmd.cli import main
 from rigidmd.scene import Scene
-from rigidmd.shipped import SYSTEMS as SHIPPED
 
 
 def test_every_package_and_every_data_file_is_in_the_wheel():

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import elliprd
-
-from rigidmd.mechanics.inertia import inertia_tensor
-from rigidmd.mechanics.solids import NUMBERS, SOLIDS, added_mass_of_ellipsoid, solid
+from support import SOLID_NUMBERS as NUMBERS
+from support import SOLIDS, added_mass_of_ellipsoid, inertia_tensor, solid
 
 MASS = 2.5
 DIMENSIONS = {

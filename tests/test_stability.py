@@ -4,22 +4,16 @@ import csv
 from math import inf, nan
 
 import pytest
+from support import CRASH, REFUSED, RIGHT, SILENT, TOLD, Outcome, battery, failure, longest_step
+from support import StabilityFinding as Finding
+from support import chosen_cases as chosen
+from support import stability_failed as failed
+from support import stability_picture as picture
+from support import stability_table as table_text
+from support import stability_words as words
 
 from rigidmd.cli import main
 from rigidmd.errors import SceneError
-from rigidmd.measure.stability import (
-    CRASH,
-    REFUSED,
-    RIGHT,
-    SILENT,
-    TOLD,
-    Finding,
-    Outcome,
-    failure,
-    longest_step,
-)
-from rigidmd.output.stability_report import failed, picture, table_text, words
-from rigidmd.study.stability.battery import battery, chosen
 
 NAMES = [case.name for case in chosen(None)]
 
@@ -130,7 +124,7 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
 
 
 def test_a_silent_case_is_exit_code_1(tmp_path, capsys, monkeypatch):
-    from rigidmd.study.stability.runs import CASES, Case
+    from support import CASES, Case
 
     def lie(find, quick):
         find.add("always", Outcome(1.0, 0.0), 1e-3)

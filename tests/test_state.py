@@ -2,15 +2,26 @@
 
 import numpy as np
 import pytest
-from conftest import ROOT, built, move, small_scene
+from support import (
+    BATH,
+    HEAT,
+    NOW,
+    ORIGIN,
+    ROOT,
+    SCHEMES,
+    Solver,
+    VelocityRescaling,
+    build_body,
+    built,
+    key_of,
+    move,
+    read_state,
+    small_scene,
+    state_of,
+    steady,
+    write_state,
+)
 
-from rigidmd.assemble.body import build_body
-from rigidmd.core.schemes import SCHEMES, Solver
-from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
-from rigidmd.core.state_file import read_state, write_state
-from rigidmd.dynamics.baths import VelocityRescaling
-from rigidmd.dynamics.noise import BATH, key_of
-from rigidmd.dynamics.ramps import steady
 from rigidmd.errors import StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

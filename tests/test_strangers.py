@@ -10,22 +10,14 @@ import zipfile
 
 import numpy as np
 import pytest
-from test_bad_input import GOOD
-from test_fuzz import FROM_FILE, SATELLITE, STRUCTURES
+from scenes import FROM_FILE, GOOD, SATELLITE, STRUCTURES
+from support import COLUMNS, Sample, Samples, Saved, build, line_of, memory, read_molecule, state_of, write_state
+from support import memory_room as room
+from support import wave_vectors as vectors
 
-from rigidmd.assemble import room
-from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.core import memory
-from rigidmd.core.state import state_of
-from rigidmd.core.state_file import Saved, write_state
-from rigidmd.core.toml_text import line_of
 from rigidmd.errors import MoleculeError, SceneError, StructureError
-from rigidmd.forces.waves import vectors
-from rigidmd.measure.samples import COLUMNS, Sample, Samples
-from rigidmd.molecules import read_molecule
-from rigidmd.scene import Scene
-from rigidmd.scene.molecules import MolecularScene
+from rigidmd.scene import MolecularScene, Scene
 
 DEEP = "[" * 1000 + "]" * 1000
 AT_ONCE = 5.0  # s of computing

@@ -16,23 +16,37 @@ import ase.build
 import ase.io
 import numpy as np
 import pytest
-from conftest import built, small_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support import (
+    Box,
+    Molecule,
+    Site,
+    TrajectoryFile,
+    basis_in_words,
+    basis_of,
+    build,
+    built,
+    close_pairs,
+    element_of,
+    element_of_mass,
+    every_site,
+    load_model,
+    molecule,
+    pairs_within,
+    random_rotations,
+    read_geometry,
+    read_structure,
+    reduced,
+    small_scene,
+    standard_rotation,
+    with_masses,
+    write_state,
+    write_topology,
+)
 
-from rigidmd.assemble.atoms import element_of, element_of_mass
-from rigidmd.assemble.cells import basis_in_words, basis_of, pairs_within, reduced, standard_rotation
-from rigidmd.assemble.overlaps import close_pairs, every_site
-from rigidmd.assemble.structure import read_structure
-from rigidmd.assemble.structure_files import read_geometry
-from rigidmd.assemble.system import build
-from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.molecules import Molecule, Site, load_model, molecule, with_masses
-from rigidmd.output.trajectory_file import TrajectoryFile, write_topology
 from rigidmd.scene import Scene
-from rigidmd.scene.place import Box
 from rigidmd.units import GRAM_PER_CM3
 
 TOLERANCE = 0.15

@@ -14,23 +14,35 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from support import (
+    ROOT,
+    Axis,
+    Curve,
+    Finding,
+    FolderLock,
+    Pool,
+    Row,
+    Value,
+    Waiting,
+    code_kind,
+    in_hours,
+    in_ranges,
+    over_replicas,
+    parse_axis,
+    point_name,
+    read_manifest,
+    run_points,
+    short_keys,
+    sweeping,
+    value_name,
+    worker,
+)
+from support import axis_settings as settings
 
 import rigidmd
 from rigidmd import cli
-from rigidmd.analyse.findings import Curve, Finding, Value
-from rigidmd.analyse.replicas import over_replicas
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.output.folder import FolderLock
-from rigidmd.output.sweep_folder import read_manifest
-from rigidmd.output.sweep_names import point_name, short_keys, value_name
 from rigidmd.scene import Scene
-from rigidmd.study.sweep import sweeping, worker
-from rigidmd.study.sweep.axes import Axis, parse_axis, settings
-from rigidmd.study.sweep.processes import Pool
-from rigidmd.study.sweep.running import Waiting, code_kind, run_points
-from rigidmd.study.sweep.slurm import in_hours, in_ranges
-from rigidmd.study.sweep.table import Row
 
 ARGON = """
 [box]
@@ -391,17 +403,25 @@ def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, who
 
 
 def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
-    """A time step that is far too long ends a run; a wall time that is over leaves the rest."""
+    """A time step that is far too long ends a run."""
     folder = tmp_path / "sweep"
     arguments = ["sweep", str(argon), "--set", "stages.0.timestep_fs=5,100000", "--set", "stages.0.duration_ps=1000",
-                 "--set", "watch.stable_step=false", "-o", str(folder), "--walltime", "0:00:06"]  # fmt: skip
-    code = cli.main(arguments)
-    said = capsys.readouterr()
-    assert code in (1, 75), said.err
-    assert states(folder)["timestep_fs=100000"] == "failed"
-    assert "failed: timestep_fs=100000" in said.out
-    assert "the same command goes on" in said.out
-    assert code == (75 if states(folder)["timestep_fs=5"] == "interrupted" else 1)
+                 "--set", "watch.stable_step=false", "-o", str(folder)]  # fmt: skip
+    assert cli.main(arguments) == 1
+    assert states(folder) == {"timestep_fs=5": "finished", "timestep_fs=100000": "failed"}
+    said = capsys.readouterr().out
+    assert "failed: timestep_fs=100000" in said
+    assert "the same command" in said
+
+
+def test_a_wall_time_that_is_over_leaves_the_rest(argon, tmp_path, capsys):
+    """Two points that nobody has the time for."""
+    folder = tmp_path / "sweep"
+    arguments = ["sweep", str(argon), "--set", "seed=1,2", "--set", "stages.0.duration_ps=1e7", "--set",
+                 "output.trajectory=false", "--set", "output.log_interval_ps=100", "-o", str(folder)]  # fmt: skip
+    assert cli.main([*arguments, "--walltime", "0:00:03"]) == 75
+    assert set(states(folder).values()) <= {"interrupted", "waiting"}
+    assert "the same command goes on" in capsys.readouterr().out
 
 
 def test_two_sweeps_do_not_share_a_folder(copied, argon, capsys):
@@ -498,7 +518,7 @@ def test_points_run_on_a_cluster_of_dask(argon, finished, tmp_path, capsys):
 @pytest.mark.soak
 def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
     pytest.importorskip("distributed")
-    from rigidmd.study.sweep.cluster import Cluster
+    from support import Cluster
 
     folder = tmp_path / "sweep"
 
@@ -515,7 +535,7 @@ def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
 
 
 def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
-    from rigidmd.study.sweep import cluster
+    from support import cluster
 
     monkeypatch.setattr(cluster, "PATIENCE", 0.5)
     arguments = ["sweep", str(argon), *GRID, "-o", str(tmp_path / "sweep"), "--scheduler"]

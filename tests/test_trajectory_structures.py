@@ -7,22 +7,28 @@ import ase.io
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from conftest import small_scene
 from MDAnalysis.analysis.dielectric import DielectricConstant
-from test_resume import NVT, WATER, scene
+from scenes import FORTY_WATERS, NVT, forty_waters
+from support import (
+    FORMATS,
+    Frame,
+    _evened,
+    build,
+    from_files,
+    in_memory,
+    load_model,
+    open_trajectory,
+    read_atoms,
+    read_frames,
+    read_geometry,
+    read_structure,
+    small_scene,
+    trajectory_formats,
+    write_topology,
+)
 
 from rigidmd import cli
-from rigidmd.analyse.source import _evened
-from rigidmd.assemble import trajectory_formats
-from rigidmd.assemble.structure import read_structure
-from rigidmd.assemble.structure_files import read_atoms, read_geometry
-from rigidmd.assemble.system import build
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.molecules import load_model
-from rigidmd.output.frame import Frame
-from rigidmd.output.readers import FORMATS
-from rigidmd.output.trajectory import from_files, in_memory, read_frames
-from rigidmd.output.trajectory_file import open_trajectory, write_topology
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
@@ -254,9 +260,11 @@ def test_a_trajectory_is_no_molecule(tmp_path):
 
 def test_a_run_goes_on_from_a_trajectory(tmp_path):
     """With its velocities; both files are inputs, whose digests and copies are in the folder."""
-    first = scene(NVT, output=WATER["output"] | {"trajectory": "trajectory.trr", "topology": "topology.pdb"})
+    first = forty_waters(
+        NVT, output=FORTY_WATERS["output"] | {"trajectory": "trajectory.trr", "topology": "topology.pdb"}
+    )
     before = Simulation(Scene.from_dict(first), tmp_path / "old").run()
-    again = scene({k: v for k, v in NVT.items() if k not in ("ensemble", "temperature_K")}, box={}) | {
+    again = forty_waters({k: v for k, v in NVT.items() if k not in ("ensemble", "temperature_K")}, box={}) | {
         "molecules": [{"model": "spce"}], "structure": {"file": "old/trajectory.trr", "velocities": True},
     }  # fmt: skip
     del again["start"]

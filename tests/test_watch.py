@@ -7,16 +7,23 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import BODIES, ROOT, small_scene
+from support import (
+    BODIES,
+    DIRECTIONS,
+    KICK,
+    NOW,
+    ROOT,
+    SCHEMES,
+    Engine,
+    build,
+    small_scene,
+    stable_angle,
+    stiffest,
+    watch,
+)
 
-from rigidmd.assemble.system import build
 from rigidmd.cli import main
-from rigidmd.core.schemes import KICK, SCHEMES
-from rigidmd.core.state import NOW
-from rigidmd.engines.cpu import Engine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure import watch
-from rigidmd.measure.stable_step import DIRECTIONS, stable_angle, stiffest
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
@@ -319,7 +326,7 @@ def test_the_stiffest_motion_of_a_dimer():
 
 def test_the_stiffest_libration_of_water_is_found_in_few_directions():
     """Against all directions one by one: the largest eigenvalue of the whole matrix of force differences."""
-    import rigidmd.measure.stable_step as stable_step
+    from support import stable_step
 
     system = build(water(2.0))
     simulation = Simulation(water(2.0, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]))
@@ -421,12 +428,16 @@ def test_no_shipped_body_is_stopped_or_warned_of(path):
     assert not warnings
 
 
-def test_thick_oil_at_any_step_goes_on():
-    for c in (1e-3, 1.0, 1e3, 1e6):
-        Simulation(Scene.from_dict({
-            "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}}, "gravity": {}, "output": PLAIN,
-            "start": {"velocity_m_s": [3.0, 0.0, 0.0]}, "run": {"duration_s": 30.0, "timestep_s": 0.1},
-            "fluid": {"linear_resistance_kg_s": [c] * 3}})).run()  # fmt: skip
+@pytest.mark.parametrize("resistance", [1e-3, 1.0, 1e3, 1e6])
+def test_a_body_falls_in_oil_of_any_thickness_as_the_closed_form_says(resistance):
+    """m dv/dt = m g - c v, with steps from far below m/c to 1e5 of it."""
+    results = Simulation(Scene.from_dict({
+        "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}}, "gravity": {}, "output": PLAIN,
+        "start": {"velocity_m_s": [3.0, 0.0, 0.0]}, "run": {"duration_s": 30.0, "timestep_s": 0.1},
+        "fluid": {"linear_resistance_kg_s": [resistance] * 3}})).run()  # fmt: skip
+    kept, terminal = np.exp(-30.0 * resistance), 9.81 / resistance
+    expected = [3.0 * kept, 0.0, -terminal * (1 - kept)]
+    assert results.state.velocity[0] == pytest.approx(expected, rel=1e-11, abs=1e-11 * terminal)
 
 
 # the cache

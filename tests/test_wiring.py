@@ -5,15 +5,24 @@ from math import pi
 import numba
 import numpy as np
 import pytest
-from conftest import small_scene
-
-from rigidmd.assemble.momenta import draw_momenta
-from rigidmd.assemble.rows import bath_of, box_of, row
-from rigidmd.assemble.system import build
-from rigidmd.core.schemes import BATH, BOX, REST
-from rigidmd.core.state import NOW, ORIGIN, TAKEN
-from rigidmd.dynamics import advance, boxes, ramps
-from rigidmd.measure.observables import observe
+from support import BATH_STEP as BATH
+from support import (
+    BOX,
+    NOW,
+    ORIGIN,
+    REST,
+    TAKEN,
+    advance,
+    bath_of,
+    box_of,
+    boxes,
+    build,
+    draw_momenta,
+    observe,
+    ramps,
+    small_scene,
+)
+from support import row_of_stage as row
 
 #: In u, Å and ps, from SI: 1 u = 1.66053906660e-27 kg.
 KILOGRAM = 1 / 1.66053906660e-27
@@ -44,7 +53,9 @@ TEMPERATURES = ramp(280 * KELVIN, 310 * KELVIN)
 
 
 def test_langevin_has_the_friction_of_each_motion():
-    system = system_of(NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0, "friction_rotation_per_ps": 7.0})
+    system = system_of(
+        NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0, "friction_rotation_per_ps": 7.0}
+    )
     bath = bath_of(system, 0)
     assert (bath.friction_translation, bath.friction_rotation) == (2.0, 7.0)
     assert bath.thermal_energy == TEMPERATURES
@@ -71,7 +82,9 @@ def test_andersen_has_its_time():
     assert bath.time_constant == 0.3 and bath.thermal_energy == TEMPERATURES
 
 
-@pytest.mark.parametrize(("kind", "kept"), [("velocity_rescaling", 3), ("nose_hoover", 3), ("langevin", 0), ("andersen", 0)])
+@pytest.mark.parametrize(
+    ("kind", "kept"), [("velocity_rescaling", 3), ("nose_hoover", 3), ("langevin", 0), ("andersen", 0)]
+)
 def test_temperatures_count_the_total_momentum_where_the_thermostat_changes_it(kind, kept):
     system = system_of(NVT | {"thermostat": kind})
     assert system.freedom_in(0) == (TRANSLATION - kept, ROTATION)
@@ -275,7 +288,7 @@ def test_a_mixture_starts_at_rest_and_at_its_temperature():
 
 def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     """`remove_momentum` keeps all relative velocities, and returns the energy that it takes."""
-    from rigidmd.assemble.momenta import remove_momentum
+    from support import remove_momentum
 
     system = system_of(NVT)
     state, mass = pushed(system)

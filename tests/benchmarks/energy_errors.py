@@ -11,11 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from support import SCHEMES, choice, walk
 
 from rigidmd import Scene, Simulation
-from rigidmd.core.schemes import SCHEMES
 from rigidmd.errors import SimulationError
-from rigidmd.measure import choice, walk
 
 WATER = {"box": {"lengths_A": 12.42}, "molecules": [{"model": "spce", "count": 64}], "start": {"temperature_K": 300.0}}
 CO2 = {

@@ -1,4 +1,4 @@
-"""The ten scenes of tests/engine_scenes.py on rigidmd and another engine, a line each: for docs/validation.md.
+"""The ten scenes of tests/scenes.py on rigidmd and another engine, a line each: for docs/validation.md.
 
 python tests/benchmarks/engines.py [lammps|openmm]
 """
@@ -8,11 +8,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from conftest import small_scene
-from engine_scenes import SCENES
+from scenes import SCENES
+from support import small_scene, verify
 
 from rigidmd.errors import RigidMDError
-from rigidmd.study.verify import verify
 
 
 def main(engine: str) -> None:

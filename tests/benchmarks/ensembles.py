@@ -12,9 +12,9 @@ from pathlib import Path
 
 from peers import WORKLOADS, choice, start_of
 from scaling import STEP, speed
+from support import row_of_stage
 
 from rigidmd import Scene, Simulation
-from rigidmd.assemble.rows import row as row_of_stage
 
 WARM, PRESSED = {"temperature_K": 300.0}, {"pressure_bar": 1.0}
 STAGES = {

@@ -20,15 +20,25 @@ import numpy as np
 from numba import literally, njit
 from peers import WORKLOADS, choice, numbers, start_of
 from scipy.spatial import cKDTree
+from support import (
+    BUILDS,
+    DTYPES,
+    MASKED,
+    SCHEMES,
+    SIMD_BITS,
+    PairWorkspace,
+    State,
+    blocks_of,
+    call,
+    call_blocks,
+    end_of_row,
+    farthest,
+    no_load,
+    packed,
+    place_sites,
+)
 
 from rigidmd import Scene, Simulation
-from rigidmd.compile import SIMD_BITS, call, call_blocks, packed
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import State, no_load
-from rigidmd.engines.cpu import DTYPES
-from rigidmd.forces.pairs.lists import BUILDS, MASKED, end_of_row, farthest
-from rigidmd.forces.pairs.loop import PairWorkspace
-from rigidmd.forces.pairs.sites import blocks_of, place_sites
 
 STEP = 2e-3  # ps
 STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step

@@ -16,9 +16,9 @@ from pathlib import Path
 from peers import WORKLOADS, choice, start_of
 from scaling import STEP, relax, speed
 from scaling import scene as small
+from support import SCHEMES
 
 from rigidmd import Scene, Simulation
-from rigidmd.core.schemes import SCHEMES
 
 SMALL = "216"
 VERLET = SCHEMES["velocity_verlet"]

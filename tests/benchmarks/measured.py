@@ -9,8 +9,9 @@ PME, 10 Å (9 Å of 216), steps of 2 fs, mixed precision, the density given. The
 import argparse
 from pathlib import Path
 
+from support import Task, analyse_folder
+
 from rigidmd import Scene, Simulation
-from rigidmd.analyse.all import Task, analyse_folder
 
 TEMPERATURE = 298.15
 

@@ -8,10 +8,10 @@ import time
 from typing import NamedTuple
 
 import numpy as np
+from support import build
+from support import row_of_stage as row
 
 import rigidmd
-from rigidmd.assemble.rows import row
-from rigidmd.assemble.system import build
 
 STEPS = 40
 

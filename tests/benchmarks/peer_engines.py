@@ -72,16 +72,17 @@ class Rigidmd:
 
     @staticmethod
     def version() -> str:
+        from support import source_digest
+
         import rigidmd
-        from rigidmd.compile.cache import source_digest
 
         return f"rigidmd {rigidmd.__version__} (sources {source_digest()[:8]})"
 
     @staticmethod
     def run(job: dict, sites: dict, folder: Path) -> dict:
+        from support import SCHEMES, observe
+
         from rigidmd import Scene, Simulation
-        from rigidmd.core.schemes import SCHEMES
-        from rigidmd.measure.observables import observe
         from rigidmd.units import KJ_PER_MOL
 
         simulation = Simulation(Scene.from_dict(job["scene"], Path(job["sites"]).parent))

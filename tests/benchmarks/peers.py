@@ -47,15 +47,9 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy, environment
 from scipy.spatial import cKDTree
 from scipy.special import erfc
+from support import FAINT, INK, align, build, cache_folder, intramolecular_energy, observe, slope
 
 from rigidmd import Scene, Simulation
-from rigidmd.assemble.system import build
-from rigidmd.compile.cache import cache_folder
-from rigidmd.forces.waves.corrections import intramolecular_energy
-from rigidmd.measure.drift import slope
-from rigidmd.measure.observables import observe
-from rigidmd.mechanics.rotation import align
-from rigidmd.output.figure import FAINT, INK
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 HERE = Path(__file__).resolve().parent

@@ -21,9 +21,9 @@ from pathlib import Path
 import tomli_w
 from peers import choice
 from scaling import STEP, speed
+from support import row_of_stage as row
 
 from rigidmd import Scene, Simulation, run_together
-from rigidmd.assemble.rows import row
 
 CORES = len(os.sched_getaffinity(0))
 #: Molecules -> what their scene has of its own.

@@ -22,11 +22,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from peer_engines import environment
 from peers import WORKLOADS, numbers, write_start
+from support import NOW, SCHEMES, array_bytes
 
 from rigidmd import Scene, Simulation
-from rigidmd.assemble.room import array_bytes
-from rigidmd.core.schemes import SCHEMES
-from rigidmd.core.state import NOW
 
 WORK = WORKLOADS["W1"]
 UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cut-off
