@@ -405,7 +405,7 @@ def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, who
 def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
     """A time step that is far too long ends a run."""
     folder = tmp_path / "sweep"
-    arguments = ["sweep", str(argon), "--set", "stages.0.timestep_fs=5,100000", "--set", "stages.0.duration_ps=1000",
+    arguments = ["sweep", str(argon), "--set", "stages.0.timestep_fs=5,100000", "--set", "stages.0.duration_ps=300",
                  "--set", "watch.stable_step=false", "-o", str(folder)]  # fmt: skip
     assert cli.main(arguments) == 1
     assert states(folder) == {"timestep_fs=5": "finished", "timestep_fs=100000": "failed"}
