@@ -1,0 +1,305 @@
+"""Small errors in the physics that tests must find: what `mutations.py` applies, one at a time.
+
+A mutation replaces a text that occurs exactly once in a file, and names the tests that should fail then. Each has been
+seen to survive tests once, or is as subtle as one that has. `test_mutations.py` keeps the texts up to date.
+"""
+
+from typing import NamedTuple
+
+
+class Mutation(NamedTuple):
+    """A change of one place in the sources that no test may overlook."""
+
+    name: str
+    sentence: str  # what is wrong then
+    file: str  # below rigidmd/
+    old: str
+    new: str
+    tests: tuple[str, ...]  # FILE::TEST below tests/, most likely first
+
+
+CORE = [
+    Mutation(
+        "A1", "torque of a body: the sign of one product of its z component",
+        "forces/pairs/sites.py",
+        "            turn_z += x * by - y * bx",
+        "            turn_z += x * by + y * bx",
+        ("test_forces.py::test_forces_and_torques_are_the_slope_of_the_energy[shift]",),
+    ),
+    Mutation(
+        "A2", "force of a switched potential: k for k + 1 in the slope of the switch",
+        "forces/laws/endings.py",
+        "    slope = (k + 1) * series[0] * left**k / width",
+        "    slope = k * series[0] * left**k / width",
+        ("test_forces.py::test_a_switched_force_is_that_of_the_product",),
+    ),
+    Mutation(
+        "A3", "virial of the surface dipole: its part of the volume along one axis alone",
+        "forces/waves/corrections.py",
+        "            for k in (0, 1, 5, 9):\n                tally[k] += energy\n            for i in range(len(term.charge)):",
+        "            for k in (0, 1):\n                tally[k] += energy\n            for i in range(len(term.charge)):",
+        ("test_ewald.py::test_virial_is_the_slope_of_the_energy_with_the_volume",),
+    ),
+    Mutation(
+        "A4", "molecular virial: the transpose of its tensor",
+        "forces/pairs/sites.py",
+        "                    virial[3 * row + k] += force[row] * offset[k]",
+        "                    virial[3 * row + k] += force[k] * offset[row]",
+        ("test_forces.py::test_virials_are_sums_over_pairs",),
+    ),
+    Mutation(
+        "A5", "textbook solvers: the sign of the Coriolis term of the velocity",
+        "engines/textbook.py",
+        "- W[i] * V[j] + W[j] * V[i]",
+        "+ W[i] * V[j] - W[j] * V[i]",
+        ("test_body_engine.py::test_a_frame_that_changes_its_axis_is_left_to_compositions",),
+    ),
+    Mutation(
+        "A6", "textbook solvers: the growth of the moments of inertia is left out",
+        "engines/textbook.py",
+        "L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]",
+        "L[i] * y[n + j] - L[j] * y[n + i] - motor",
+        ("test_textbook.py::test_a_satellite_that_loses_mass_keeps_its_angular_momentum",),
+    ),
+    Mutation(
+        "A7", "a frame that spins up: its rate at the start of a step, not in the middle",
+        "forces/body/frame.py",
+        "        middle = time + 0.5 * h",
+        "        middle = time",
+        (
+            "test_body_engine.py::test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn",
+            "test_body_engine.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
+        ),
+    ),
+    Mutation(
+        "A8", "mean squared displacement: one origin too few",
+        "analyse/correlation.py",
+        "/ (frames - lag) / n",
+        "/ (frames - lag - 1) / n",
+        ("test_analyse.py::test_correlations_are_those_of_the_definition",),
+    ),
+    Mutation(
+        "A9", "viscosity: the differences of normal stresses are not halved",
+        "analyse/flow.py",
+        "(xx - yy) / 2, (yy - zz) / 2], axis=1)",
+        "(xx - yy), (yy - zz)], axis=1)",
+        ("test_analyse.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",),
+    ),
+    Mutation(
+        "A10", "LAMMPS data file: xz and yz of the box exchanged",
+        "peers/lammps_files.py",
+        "        tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])",
+        "        tilt = (state.cell[1, 0], state.cell[2, 1], state.cell[2, 0])",
+        ("test_lammps.py::test_both_engines_compute_the_same[triclinic]",),
+    ),
+    Mutation(
+        "A11", "errors over runs: the standard deviation without n - 1",
+        "measure/means.py",
+        "    return np.std(np.asarray(values, float), axis=0, ddof=1)",
+        "    return np.std(np.asarray(values, float), axis=0, ddof=0)",
+        ("test_sweep.py::test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run",),
+    ),
+    Mutation(
+        "A12", "dielectric constant: <M>² is not taken off",
+        "analyse/electric.py",
+        "    off = dipole - dipole.mean(axis=0)",
+        "    off = dipole",
+        (
+            "test_mixtures.py::test_the_dipole_of_a_mixture_is_that_of_its_rotated_charges",
+            "test_analyse.py::test_the_dielectric_constant_of_independent_dipoles",
+        ),
+    ),
+]  # fmt: skip
+
+RINGS = [
+    Mutation(
+        "B1", "Monte Carlo barostat: a scene passes N + 1 for N",
+        "assemble/rows.py",
+        "float(mobile(system.model).sum()), beyond, key",
+        "float(mobile(system.model).sum()) + 1.0, beyond, key",
+        ("test_wiring.py::test_a_monte_carlo_barostat_counts_the_molecules",),
+    ),
+    Mutation(
+        "B2", "Monte Carlo barostat: N + 1 in the rule of acceptance",
+        "dynamics/boxes.py",
+        "            return box.molecules * log(after / before)",
+        "            return (box.molecules + 1) * log(after / before)",
+        (
+            "test_wiring.py::test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecules",
+            "test_changing_cells.py::test_an_ideal_gas_has_its_volumes_through_a_whole_run",
+        ),
+    ),
+    Mutation(
+        "B3", "Nose-Hoover: degrees of freedom of translation for those of rotation",
+        "assemble/rows.py",
+        "links, freedom.translation, freedom.rotation)",
+        "links, freedom.translation, freedom.translation)",
+        ("test_wiring.py::test_chains_count_the_degrees_of_freedom_of_their_motion",),
+    ),
+    Mutation(
+        "B4", "Langevin: frictions of translation and rotation exchanged",
+        "assemble/rows.py",
+        "            return Langevin(thermal, *stage.frictions, key)",
+        "            return Langevin(thermal, *stage.frictions[::-1], key)",
+        ("test_wiring.py::test_langevin_has_the_friction_of_each_motion",),
+    ),
+    Mutation(
+        "B5", "pressure ramp: the first pressure is kept",
+        "dynamics/boxes.py",
+        "    return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * share",
+        "    return pressure.first[k] + 0.0 * share",
+        (
+            "test_wiring.py::test_a_ramp_is_even_over_the_steps_of_its_stage",
+            "test_wiring.py::test_what_drives_the_cell_follows_a_ramp_of_the_pressure",
+        ),
+    ),
+    Mutation(
+        "B6", "tail correction of a mixture: unlike pairs once, not twice",
+        "forces/laws/lennard_jones.py",
+        "        strength = sign * count @ c @ count",
+        "        strength = sign * count @ np.triu(c) @ count",
+        ("test_mixtures.py::test_the_tail_of_a_mixture_is_a_sum_over_all_pairs_of_its_sites",),
+    ),
+    Mutation(
+        "B7", "spectra: 33.36 for 29.98 in the wave number",
+        "analyse/turning.py",
+        "PER_CM = 0.0299792458",
+        "PER_CM = 0.0333564095",
+        ("test_mixtures.py::test_wave_numbers_and_freedoms_of_a_mixture",),
+    ),
+    Mutation(
+        "B8", "rotational diffusion: rotations about axes of the lab, not of the body",
+        "analyse/turning.py",
+        'between = np.einsum("fnji,fnjk->fnik", Q[:-1], Q[1:])',
+        'between = np.einsum("fnij,fnkj->fnik", Q[1:], Q[:-1])',
+        ("test_mixtures.py::test_an_anisotropic_body_diffuses_about_its_own_axes",),
+    ),
+    Mutation(
+        "B9", "n(r) of a mixture: divided by the number of the other species",
+        "analyse/structure.py",
+        "len(thinned.sites(a, slice(0, 1))[1])",
+        "len(thinned.sites(b, slice(0, 1))[1])",
+        ("test_mixtures.py::test_pairs_of_a_mixture_are_counted_against_the_pairs_that_there_are",),
+    ),
+    Mutation(
+        "B10", "spectrum of linear molecules: twice as high",
+        "analyse/turning.py",
+        'found[f"omega {name}"] = moments[2], lambda',
+        'found[f"omega {name}"] = 2 * moments[2], lambda',
+        ("test_mixtures.py::test_wave_numbers_and_freedoms_of_a_mixture",),
+    ),
+    Mutation(
+        "B11", "error of a drift: the random walk too small by a third",
+        "measure/drift.py",
+        "    walk = max(0.0, 3 * (slow * long - fast * short)",
+        "    walk = max(0.0, 2 * (slow * long - fast * short)",
+        ("test_drift.py::test_the_error_of_a_slope_is_as_large_as_its_scatter",),
+    ),
+    Mutation(
+        "B12", "standard errors of means forget the correlation of samples",
+        "measure/means.py",
+        "    return average, sqrt(max(window, OF_BATCHES * _of_batches(centred)) / lost / n)",
+        "    return average, sqrt(variance / n)",
+        ("test_drift.py::test_the_error_of_a_mean_is_as_large_as_its_scatter",),
+    ),
+    Mutation(
+        "B13", "unbiased temperatures: dt²/8 for dt²/12",
+        "measure/observables.py",
+        "    slant = verlet_step**2 / 12",
+        "    slant = verlet_step**2 / 8",
+        (
+            "test_wiring.py"
+            "::test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces",
+        ),
+    ),
+    Mutation(
+        "B14", "start: the total momentum of a mixture is removed with equal weights",
+        "assemble/momenta.py",
+        "    velocity -= momentum / mass.sum()",
+        "    velocity -= np.where(model.keeps_momentum, velocity.mean(axis=0), 0.0)",
+        (
+            "test_wiring.py::test_a_mixture_starts_at_rest_and_at_its_temperature",
+            "test_wiring.py::test_a_push_that_is_taken_out_is_the_same_for_all_molecules",
+        ),
+    ),
+    Mutation(
+        "B15", "run: the total momentum is removed with the mass of the first species for all",
+        "dynamics/advance.py",
+        "            own = model.mass[model.species[m]]\n            mass += own",
+        "            own = model.mass[0]\n            mass += own",
+        ("test_wiring.py::test_a_mixture_is_brought_to_rest_by_one_velocity_for_all",),
+    ),
+    Mutation(
+        "B16", "LAMMPS: pressures in bar where it reads atm",
+        "peers/lammps_files.py",
+        "ATMOSPHERE = 1.01325 * BAR",
+        "ATMOSPHERE = 1.0 * BAR",
+        ("test_engine_settings.py::test_lammps_has_pressures_in_atm_less_that_of_the_tail",),
+    ),
+    Mutation(
+        "B17", "LAMMPS: the damping time of Langevin is the friction",
+        "peers/lammps_files.py",
+        "{_n(1e3 / stage.frictions[0])}",
+        "{_n(1e3 * stage.frictions[0])}",
+        ("test_engine_settings.py::test_lammps_has_the_damping_time_of_langevin",),
+    ),
+    Mutation(
+        "B18", "GROMACS: tau-t ten times as long",
+        "peers/gromacs_files.py",
+        '"tau-t": f"{stage.thermostat_time:.12g}"',
+        '"tau-t": f"{10 * stage.thermostat_time:.12g}"',
+        ("test_engine_settings.py::test_gromacs_has_the_time_of_each_thermostat",),
+    ),
+    Mutation(
+        "B19", "OpenMM: the inverse of the friction of Langevin",
+        "peers/openmm_stages.py",
+        "mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)",
+        "mm.LangevinMiddleIntegrator(stage.temperatures[0], 1 / stage.frictions[0], dt)",
+        ("test_engine_settings.py::test_openmm_has_the_friction_of_langevin",),
+    ),
+    Mutation(
+        "B20", "resume: Nose-Hoover chains and pistons start anew",
+        "run/resuming.py",
+        "    if exact and not are_rotations(found.rotation):",
+        "    found.bath[:] = 0.0\n    if exact and not are_rotations(found.rotation):",
+        (
+            "test_thermostat_states.py::test_a_checkpoint_gives_back_all_of_a_state",
+            "test_thermostat_states.py::test_chains_go_on_to_the_same_bits_in_double_precision",
+        ),
+    ),
+    Mutation(  # harmless within a run, whose steps count on; but stages run alone would share their numbers
+        "B21", "random numbers of every stage are those of the first",
+        "assemble/rows.py",
+        "    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, k)",
+        "    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, 0)",
+        ("test_wiring.py::test_stages_have_random_numbers_of_their_own",),
+    ),
+    Mutation(
+        "B22", "profile of the density: sites are not rotated with their molecule",
+        "analyse/structure.py",
+        "                at = at + part.Q[:, kind.index] @ kind.molecule.positions_body[site]",
+        "                at = at + kind.molecule.positions_body[site]",
+        ("test_mixtures.py::test_the_profile_of_a_mixture_is_that_of_its_rotated_sites",),
+    ),
+    Mutation(
+        "B23", "hydrogen bonds: O-H is not rotated with its molecule",
+        "analyse/structure.py",
+        "arm.append(np.broadcast_to(turn @ (body[hydrogen] - body[site]), centre.shape))",
+        "arm.append(np.broadcast_to(body[hydrogen] - body[site], centre.shape))",
+        ("test_mixtures.py::test_hydrogen_bonds_of_a_mixture_are_those_of_its_geometry",),
+    ),
+    Mutation(  # no pair is missed for cells of less than 30 % strain: the list rests on a wider margin than it has
+        "B24", "neighbour list: images of a changed cell may move 2.4 times as far",
+        "forces/pairs/update.py",
+        "    return 0.25 * pairs.skin if is_short else 0.0",
+        "    return 0.6 * pairs.skin if is_short else 0.0",
+        ("test_changing_cells.py::test_one_list_has_all_pairs_of_a_cell_that_is_strained",),
+    ),
+    Mutation(
+        "B25", "cell rescaling with Langevin counts as if the total momentum were kept",
+        "assemble/rows.py",
+        "    x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))",
+        "    x, y, z = map(float, system.model.keeps_momentum | system.keeps_momentum_in(k))",
+        ("test_wiring.py::test_cell_rescaling_knows_whether_the_total_momentum_is_kept",),
+    ),
+]  # fmt: skip

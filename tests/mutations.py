@@ -1,0 +1,156 @@
+"""Whether tests find small errors in the physics: python tests/mutations.py [--list] [--all] [NAME ...]
+
+Each mutation of mutation_list.py and fresh_mutations.py is applied to a copy of the checkout, alone, and the tests that
+it names run there until one fails. Nothing in the checkout changes. The exit code is 1 if a mutation survives, does not
+apply or runs out of time, and 2 if the tests fail without any mutation.
+
+Kernels are compiled into a cache of the copy, which is kept between mutations: a mutation of Python code alone takes
+seconds, one of a kernel as long as what depends on it takes to compile. All 37 of the first list take about {MINUTES}
+minutes on one core.
+"""
+
+import argparse
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from fresh_mutations import FRESH
+from mutation_list import CORE, RINGS, Mutation
+
+ROOT = Path(__file__).parent.parent
+MUTATIONS: list[Mutation] = [*CORE, *RINGS, *FRESH]
+#: Exit codes of pytest: all passed; some failed; could not begin, as with an error of an import.
+PASSED, FAILED, INTERRUPTED = 0, 1, 2
+
+
+def copy_of_checkout(folder: Path, working_tree: bool) -> Path:
+    """The files of HEAD, or those of the working tree, in a folder that is empty or holds an earlier copy."""
+    copy = folder / "checkout"
+    copy.mkdir(parents=True, exist_ok=True)
+    archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, capture_output=True, check=True).stdout
+    subprocess.run(["tar", "-x", "-C", copy], input=archive, check=True)
+    if working_tree:
+        listing = ["git", "ls-files", "--modified", "--others", "--exclude-standard", "-z"]
+        names = subprocess.run(listing, cwd=ROOT, capture_output=True, check=True, text=True).stdout.split("\0")
+        for name in dict.fromkeys(filter(None, names)):
+            (copy / name).unlink(missing_ok=True)
+            if (ROOT / name).is_file():
+                (copy / name).parent.mkdir(parents=True, exist_ok=True)
+                (copy / name).write_bytes((ROOT / name).read_bytes())
+    return copy
+
+
+@contextlib.contextmanager
+def applied(mutation: Mutation, copy: Path) -> Iterator[None]:
+    """Change the file of a copy, and give it back as it was, with its time: kernels of other files stay compiled.
+
+    Raises ValueError unless the text occurs exactly once.
+    """
+    path = copy / "rigidmd" / mutation.file
+    text, times = path.read_text(encoding="utf-8"), path.stat()
+    if (count := text.count(mutation.old)) != 1:
+        raise ValueError(f"its text occurs {count} times in {mutation.file}")
+    path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+    try:
+        yield
+    finally:
+        path.write_text(text, encoding="utf-8")
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+
+def run_tests(copy: Path, arguments: Sequence[str], limit: float) -> tuple[int | None, str]:
+    """The exit code of pytest in a copy, None if it was stopped at the time limit (s); and what it printed."""
+    reference = os.environ.get("RIGIDMD_REFERENCE", ROOT.parent / "shared" / "reference")
+    settings = {
+        "PYTHONPATH": str(copy),  # before an installed rigidmd, in child processes too
+        "RIGIDMD_CACHE": str(copy.parent / "kernels"),
+        "RIGIDMD_REFERENCE": str(reference),
+        "PYTHONDONTWRITEBYTECODE": "1",  # of two mutations in one second the second would not be read
+    }
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-rfE", "--tb=no", "-p", "no:cacheprovider", *arguments]
+    with subprocess.Popen(
+        command, cwd=copy, env=os.environ | settings, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        try:
+            printed, _ = process.communicate(timeout=limit)
+            return process.returncode, printed
+        except subprocess.TimeoutExpired:
+            return None, ""
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # workers too, of which pytest-xdist has some
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def verdict(mutation: Mutation, copy: Path, limit: float, whole: bool) -> tuple[bool, str]:
+    """Whether a test finds a mutation, and that in words."""
+    selections = [["-n", "0", *(f"tests/{test}" for test in mutation.tests)]] + ([["tests"]] if whole else [])
+    try:
+        with applied(mutation, copy):
+            for arguments in selections:
+                code, printed = run_tests(copy, arguments, limit)
+                if code is None:
+                    return False, f"no verdict within {limit:g} s"
+                if code in (FAILED, INTERRUPTED):
+                    first = re.search(r"^(?:FAILED|ERROR) (?:tests/)?(.+?)(?: - .*)?$", printed, re.MULTILINE)
+                    return True, f"killed by {first[1] if first else 'an error before the tests'}"
+                if code != PASSED:
+                    return False, f"pytest ended with {code}: {printed.strip().splitlines()[-1]}"
+    except ValueError as error:
+        return False, f"does not apply: {error}"
+    return False, "survived"
+
+
+def chosen(names: Sequence[str]) -> list[Mutation]:
+    """The mutations of these names, all for none. Raises SystemExit for a name that there is not."""
+    known = {mutation.name: mutation for mutation in MUTATIONS}
+    if unknown := [name for name in names if name not in known]:
+        raise SystemExit(f"there is no mutation {', '.join(unknown)}; --list shows all")
+    return [known[name] for name in names] or MUTATIONS
+
+
+def main() -> int:
+    """The command; its exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="such as B7; default: all")
+    parser.add_argument("--list", action="store_true", help="print all mutations and end")
+    parser.add_argument("--all", action="store_true", help="where the named tests pass, run all but the soak tier")
+    parser.add_argument("--working-tree", action="store_true", help="copy what is not committed too")
+    parser.add_argument("--folder", type=Path, help="for copy and kernels, and kept; default: a temporary one")
+    parser.add_argument("--limit", type=float, default=900.0, metavar="S", help="for each run of pytest (default: 900)")
+    options = parser.parse_args()
+    mutations = chosen(options.names)
+    if options.list:
+        for mutation in mutations:
+            print(f"{mutation.name:4} {mutation.file:32} {mutation.sentence}")
+        return 0
+    with contextlib.ExitStack() as stack:
+        folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mutations-")))
+        copy = copy_of_checkout(folder.absolute(), options.working_tree)
+        tests = dict.fromkeys(f"tests/{test}" for mutation in mutations for test in mutation.tests)
+        begun = time.monotonic()
+        code, printed = run_tests(copy, ["-n", "0", *tests], options.limit * 2)
+        print(f"without a mutation: {printed.strip().splitlines()[-1] if printed else 'no verdict'}, "
+              f"{time.monotonic() - begun:.0f} s", flush=True)  # fmt: skip
+        if code != PASSED:
+            print(printed)
+            return 2
+        killed = 0
+        for mutation in mutations:
+            begun = time.monotonic()
+            found, words = verdict(mutation, copy, options.limit, options.all)
+            killed += found
+            print(f"{mutation.name:4} {words}, {time.monotonic() - begun:.0f} s", flush=True)
+    print(f"{killed} of {len(mutations)} killed")
+    return 0 if killed == len(mutations) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
