@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd import BodyScene, Every, Scene, Simulation
+import rigidmd
+from rigidmd import BodyScene, Scene
 from rigidmd.analyse.history import History
 from rigidmd.assemble.system import System, build
 from rigidmd.compile import kernel
@@ -117,7 +118,7 @@ def gmx(folder: Path, *arguments, text: str = "") -> str:
     return done.stdout
 
 
-def stopped_at(steps: set[int]) -> Every:
+def stopped_at(steps: set[int]) -> "rigidmd.Every":
     """An observer that sends SIGTERM to this process after some of the steps of a run."""
 
     def stop(moment):
@@ -125,7 +126,7 @@ def stopped_at(steps: set[int]) -> Every:
             steps.discard(moment.step)
             os.kill(os.getpid(), signal.SIGTERM)
 
-    return Every(0.001, stop)
+    return rigidmd.Every(0.001, stop)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -144,11 +145,11 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
     """Run once without a stop, once with stops after these steps, each time with another number of threads."""
-    observers = Every(0.001, lambda moment: None)  # observes at the same steps as those that stop
-    Simulation(Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=observers).run()
+    observers = rigidmd.Every(0.001, lambda moment: None)  # observes at the same steps as those that stop
+    rigidmd.Simulation(Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=observers).run()
     left, runs = set(steps), 0
     while True:
-        simulation = Simulation(
+        simulation = rigidmd.Simulation(
             Scene.from_dict(data | {"threads": 1 + runs % 2}),
             folder / "parts",
             observers=stopped_at(left),
@@ -231,7 +232,7 @@ HOMES = {
     "assemble.structure_files": "read_atoms read_geometry",
     "assemble.to_atoms": "EV",
     "assemble.traj_format": "TrajReader",
-    "compile": "SIMD_BITS call call_blocks kernel packed",
+    "compile": "SIMD_BITS call call_blocks packed",
     "compile.cache": "COMPILED cache_folder source_digest",
     "compile.lanes": "lane_count",
     "compile.machine": "MOST_THREADS",
@@ -259,7 +260,9 @@ HOMES = {
     "forces.laws.screened": "INTERVALS TABLE_ERROR TabledScreening force_table screened screening screening_of_lanes",
     "forces.pairs.clusters": "clusters_of",
     "forces.pairs.counts": "count_pairs heights",
-    "forces.pairs.lists": "AHEAD BUILDS BUILT ENTRIES IMAGES_FOUND MASKED MET MET_BY_ONE MOST_MET USABLE WINDOW end_of_row farthest",
+    "forces.pairs.lists": (
+        "AHEAD BUILDS BUILT ENTRIES IMAGES_FOUND MASKED MET MET_BY_ONE MOST_MET USABLE WINDOW end_of_row farthest"
+    ),
     "forces.pairs.loop": "PairWorkspace pair_forces",
     "forces.pairs.sites": "CentralSites blocks_of place_ahead place_sites",
     "forces.pairs.space": "Triclinic cell_of",
@@ -412,9 +415,9 @@ MODULES = {
     "lammps": "peers.lammps",
     "lammps_files": "peers.lammps_files",
     "lanes": "compile.lanes",
+    "live_plot": "looking.live",
     "log": "output.log",
     "measuring": "measure.trials",
-    "live": "looking.live",
     "memory": "core.memory",
     "memory_room": "assemble.room",
     "molecular_observers": "run.molecular_observers",

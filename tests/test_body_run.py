@@ -126,7 +126,7 @@ def test_an_observer_sees_the_body_and_an_interrupted_run_keeps_what_it_has(tmp_
     def look(moment):
         poses.append(moment.observation)
         if moment.time > 0.02:
-            simulation._interrupted = True
+            simulation.stop()
 
     scene = Scene.read(TOP, {"output.figures": False})
     simulation = Simulation(scene, tmp_path / "run", observers=[Every(0.005, look)])

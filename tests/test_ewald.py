@@ -1024,7 +1024,8 @@ def test_scenes_without_pme_need_no_fourier_transforms():
     script = """
 import sys
 sys.modules["rocket_fft"] = None  # an import of it fails
-from rigidmd.assemble.system import build
+sys.path.insert(0, "tests")
+from support import build
 from rigidmd.cli import main
 from rigidmd.scene import Scene
 for forces in ({}, {"electrostatics": "ewald", "cutoff_A": 6.0}):

@@ -19,6 +19,7 @@ from support import (
     load_model,
     minimise,
     mobile,
+    molecular_run,
     panels,
     precision,
     read_frames,
@@ -499,7 +500,7 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     assert nvt["temperature_K"] > 0
     assert (tmp_path / "out" / "energy.png").is_file()
     again = Simulation(Scene.read(tmp_path / "out" / "scene.toml")).run()
-    assert [frame.time for frame in again._frames] == pytest.approx([0, 0.01, 0.02])
+    assert [ts.time for ts in again.universe().trajectory] == pytest.approx([0, 0.01, 0.02])
     with np.load(tmp_path / "out" / "final.npz") as final:
         for name in ("position", "rotation", "velocity"):
             assert np.array_equal(final[name], getattr(again.state, name))
@@ -562,11 +563,11 @@ def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces
     run = several(tmp_path / "out", SEVERAL, "t.xtc")
 
     def stopped(system, state, stage, stop, advanced):
-        if run._record.stage == stopped_in:
+        if stage is system.scene.stages[stopped_in]:
             run.stop()
         return minimise(system, state, stage, stop, advanced)
 
-    monkeypatch.setattr("rigidmd.run.molecules.minimise", stopped)
+    monkeypatch.setattr(molecular_run, "minimise", stopped)
     results = run.run()
     done = [0.0] if stopped_in < 2 else [0.0, 0.01, 0.02]
     assert results.interrupted

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from support import ROOT, SYSTEMS, notebooks, progress, save_figure, small_scene
+from support import ROOT, SYSTEMS, live_plot, notebooks, progress, save_figure, small_scene
 
 import rigidmd
 from rigidmd.cli import main
@@ -49,7 +49,7 @@ def cell(monkeypatch):
 
     monkeypatch.setattr(display, "DisplayHandle", Handle)
     monkeypatch.setattr(progress, "in_notebook", lambda: True)
-    monkeypatch.setattr("rigidmd.looking.live.in_notebook", lambda: True)
+    monkeypatch.setattr(live_plot, "in_notebook", lambda: True)
     return outputs
 
 
@@ -106,7 +106,7 @@ def test_elsewhere_progress_is_asked_for(capsys):
 
 
 def test_a_live_plot_is_one_picture_that_changes(cell, monkeypatch):
-    monkeypatch.setattr("rigidmd.looking.live.SHARE", 1.0)  # of the time may go into drawing
+    monkeypatch.setattr(live_plot, "SHARE", 1.0)  # of the time may go into drawing
     plain = Simulation(top(**FEW)).run(progress=False)
     live = rigidmd.LivePlot("theta", "energy_error", pause=0.0)
     watched = Simulation(top(**FEW), observers=live).run(progress=False)

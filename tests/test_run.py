@@ -36,6 +36,8 @@ from support import (
     describe,
     log,
     minimise,
+    molecular_observers,
+    molecular_run,
     observe,
     progress,
     rigidmd_command,
@@ -261,7 +263,7 @@ def test_intervals_that_are_not_whole_steps_are_noted():
         assert note in describe(scene)
     results = run.run()
     assert set(scene.rounded_times()) <= set(results.summary["notes"])
-    times = [frame.time for frame in results._frames]
+    times = [ts.time for ts in results.universe().trajectory]
     assert times[1] == pytest.approx(0.066)  # the first stage is shorter than the interval
     assert results["time"][:3] == pytest.approx([0.0, 0.008, 0.016])
 
@@ -864,7 +866,7 @@ def test_the_time_left_is_of_the_steps_of_this_run(monkeypatch, capsys, tmp_path
         return [line for line in capsys.readouterr().err.splitlines() if "ps/s" in line]
 
     monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
-    monkeypatch.setattr(rigidmd.run.molecules, "minimise", slowly)
+    monkeypatch.setattr(molecular_run, "minimise", slowly)
     first, *_, last = lines(0.02)
     assert first == "  0.004 of 0.04 ps, 0.0001 ps/s, 06:00 left"
     assert last == "  0.04 of 0.04 ps, 0.0001 ps/s, 00:00 left"
@@ -909,7 +911,7 @@ class Failing(Observer):
         setattr(self, method, self.fail)
 
     def fail(self, *given):
-        if not (isinstance(given[0], rigidmd.run.moment.Moment) and given[0].step < 2):
+        if not (isinstance(given[0], rigidmd.Moment) and given[0].step < 2):
             raise ValueError("it does not work")
 
 
@@ -956,8 +958,8 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
     def fail(*given, **options):
         raise ValueError("ParseException: no mathematics")
 
-    monkeypatch.setattr("rigidmd.run.molecular_observers.save_figure", fail)
-    monkeypatch.setattr("rigidmd.run.body_observers.draw_motion", fail)
+    monkeypatch.setattr(molecular_observers, "save_figure", fail)
+    monkeypatch.setattr(body_observers, "draw_motion", fail)
     pictures = [Failing("see", draws=True), Failing("end", draws=True)]
     notes = []
     results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()

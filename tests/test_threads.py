@@ -355,10 +355,8 @@ def test_benchmarks_measure_what_a_user_gets(monkeypatch):
 
 @pytest.mark.parametrize(("asked", "words"), [(None, "2 threads"), (1, "1 thread"), (7, "2 threads")])
 def test_check_says_how_many_threads_compute(asked, words):
-    code = (
-        "from rigidmd.assemble.describe import describe; from rigidmd.scene import Scene; "
-        f"print(describe(Scene.read('systems/water.toml').model_copy(update={{'threads': {asked}}})))"
-    )
+    command = [sys.executable, "-m", "rigidmd", "check", "systems/water.toml"]
+    command += [] if asked is None else ["--set", f"threads={asked}"]
     environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert f"computing: {words}, double precision" in done.stdout, done.stderr

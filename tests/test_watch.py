@@ -18,6 +18,7 @@ from support import (
     build,
     small_scene,
     stable_angle,
+    stable_step,
     stiffest,
     watch,
 )
@@ -326,8 +327,6 @@ def test_the_stiffest_motion_of_a_dimer():
 
 def test_the_stiffest_libration_of_water_is_found_in_few_directions():
     """Against all directions one by one: the largest eigenvalue of the whole matrix of force differences."""
-    from support import stable_step
-
     system = build(water(2.0))
     simulation = Simulation(water(2.0, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]))
     state = simulation.run().state
@@ -349,7 +348,7 @@ def test_in_a_large_system_a_slab_tells_the_stiffest_motion(monkeypatch):
     state.position[7] += [41.6, 0.0, -20.8]  # in which box a molecule is does not matter
     whole = stiffest(simulation.system, state)
     for most in (60, 120):
-        monkeypatch.setattr("rigidmd.measure.stable_step.MOST_DISPLACED", most)
+        monkeypatch.setattr(stable_step, "MOST_DISPLACED", most)
         found = stiffest(simulation.system, state)
         x = simulation.system.centres(state, wrapped=True)[:, 0]
         assert np.sum(x < x[found.molecule]) < most
