@@ -9,6 +9,14 @@ import pytest
 os.environ.setdefault("RIGIDMD_COMPILERS", "1")
 
 pytest.register_assert_rewrite("support")
+from hooks import (  # noqa: E402, F401
+    missing,
+    pytest_collection_modifyitems,
+    pytest_collectreport,
+    pytest_runtest_logreport,
+    pytest_sessionfinish,
+    pytest_terminal_summary,
+)
 from support import ROOT  # noqa: E402
 
 
@@ -17,5 +25,5 @@ def reference() -> Path:
     """Outside data: RIGIDMD_REFERENCE, or ../shared/reference beside the project."""
     folder = Path(os.environ.get("RIGIDMD_REFERENCE", ROOT.parent / "shared" / "reference"))
     if not folder.is_dir():
-        pytest.skip(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")
+        missing(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")
     return folder

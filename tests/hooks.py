@@ -1,0 +1,89 @@
+"""What a session of these tests adds to pytest: the order of files, limits of time, and in CI the skips that are allowed.
+
+`CI=true` in the environment makes a skipped test that is not in `ALLOWED` a failure of the session. `RIGIDMD_CI_WITHOUT`
+names what could not be installed, separated by spaces (`chromium gromacs ffmpeg`): .ci/run sets both.
+"""
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so they begin first.
+LONGEST = (
+    "forces", "body_engine", "sweep", "docs", "run", "dynamics", "compile", "analyse_runs", "ase", "ewald", "bodies",
+    "boxes", "own", "resume", "openmm", "lammps", "watch", "structures", "precision", "fuzz", "looking", "notebook",
+    "strangers", "baths", "auto", "minimise", "threads", "stability", "models", "body_run",
+)  # fmt: skip
+RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
+
+#: Reasons to skip that are properties of a machine, which CI cannot install.
+MACHINE = (
+    "root may write everywhere",  # the folder without permissions: CI runs as root in a container
+    "no small file system can be made here",  # a full disk: mounting needs CAP_SYS_ADMIN
+    "where there is one core",
+    "this machine has one core",
+    "one core",
+    "an instruction of AVX-512",
+    "vectors are not wider than the stack",
+    "this is what all tests run with here",  # vectors of 128 bits
+    "the processors are those of x86",
+)
+#: Reasons to skip that are allowed where the program could not be installed.
+PROGRAMS = {
+    "chromium": "Chromium is not installed",
+    "gromacs": "(GROMACS is not installed|no gmx here)",
+    "ffmpeg": "ffmpeg is not installed",
+}
+
+IN_CI = os.environ.get("CI", "").lower() in ("1", "true", "yes")
+ALLOWED = [re.escape(reason) for reason in MACHINE]
+ALLOWED += [PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS]
+
+_skipped: list[str] = []
+
+
+def missing(what: str) -> None:
+    """Skip a test that needs data from outside, or fail it in CI."""
+    (pytest.fail if IN_CI else pytest.skip)(what)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files come first; a test of the soak tier has no limit of time."""
+    items.sort(key=lambda item: RANKS.get(item.path.name, len(RANKS)))
+    for item in items:
+        if item.get_closest_marker("soak"):
+            item.add_marker(pytest.mark.timeout(0))
+
+
+def _note(report: pytest.TestReport | pytest.CollectReport) -> None:
+    if not report.skipped or hasattr(report, "wasxfail") or not isinstance(report.longrepr, tuple):
+        return
+    path, _, reason = report.longrepr
+    if not any(re.match(allowed, reason.removeprefix("Skipped: ")) for allowed in ALLOWED):
+        _skipped.append(f"{report.nodeid or Path(path).name}: {reason}")
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note a test that was skipped for a reason that is not allowed."""
+    _note(report)
+
+
+def pytest_collectreport(report: pytest.CollectReport) -> None:
+    """Note a file that was skipped for a reason that is not allowed."""
+    _note(report)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """In CI a session with such skips has failed."""
+    if IN_CI and _skipped and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter) -> None:
+    """In CI list them."""
+    if IN_CI and _skipped:
+        terminalreporter.section("skipped tests that CI does not allow (tests/hooks.py)", red=True)
+        for line in sorted(set(_skipped)):
+            terminalreporter.line(line)
