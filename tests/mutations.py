@@ -103,6 +103,8 @@ def verdict(mutation: Mutation, copy: Path, limit: float, whole: bool) -> tuple[
                     return True, f"killed by {first[1] if first else 'an error before the tests'}"
                 if code != PASSED:
                     return False, f"pytest ended with {code}: {printed.strip().splitlines()[-1]}"
+                if not re.search(r"\d passed", printed):
+                    return False, "its tests were skipped"
     except ValueError as error:
         return False, f"does not apply: {error}"
     return False, "survived"
@@ -153,4 +155,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # ends the tests that run too
     sys.exit(main())

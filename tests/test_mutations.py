@@ -54,7 +54,7 @@ def test_a_mutated_file_is_given_back_as_it_was(tmp_path):
     ((1, "FAILED tests/test_x.py::test_y[a - b] - assert 1\n1 failed"), 0, "killed by test_x.py::test_y[a"),
     ((2, "ERROR tests/test_x.py - ImportError\n1 error"), 0, "killed by test_x.py,"),
     ((0, "1 passed"), 1, "survived"), ((5, "no tests ran"), 1, "pytest ended with 5: no tests ran"),
-    ((None, ""), 1, "no verdict within 900 s"),
+    ((None, ""), 1, "no verdict within 900 s"), ((0, "2 skipped"), 1, "its tests were skipped"),
 ])  # fmt: skip
 def test_verdicts(ends, code, words, monkeypatch, capsys, tmp_path):
     """Without a mutation all tests pass, then they end as given."""
