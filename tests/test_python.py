@@ -260,17 +260,6 @@ def test_an_editor_knows_the_types(tmp_path):
     assert {at for severity, at, _ in found if severity == "error"} == {lines, lines + 1}  # it does look
 
 
-def test_the_package_passes_a_type_checker():
-    """With the section [tool.pyright] of pyproject.toml."""
-    found = pyright(ROOT)
-    assert found["summary"]["filesAnalyzed"] > 60
-    assert [
-        f"{entry['file']}:{entry['range']['start']['line'] + 1}: {entry['message']}"
-        for entry in found["generalDiagnostics"]
-        if entry["severity"] != "information"
-    ] == []
-
-
 @pytest.mark.parametrize(
     ("key", "numpy", "plain"),
     [
