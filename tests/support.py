@@ -216,7 +216,7 @@ HOMES = {
     "analyse.history": "kinds_of rebuilt",
     "analyse.motion": "MPA_S NM2_PER_S diffusion msd",
     "analyse.replicas": "over_replicas",
-    "analyse.source": "_evened _last_stage of_folder steady_from",
+    "analyse.source": "_evened of_folder steady_from",
     "analyse.structure": "density_profile hydrogen_bonds rdf structure_factor",
     "analyse.turning": "PER_CM orientation spectrum",
     "assemble.atoms": "element_of element_of_mass",
@@ -261,7 +261,8 @@ HOMES = {
     "forces.pairs.clusters": "clusters_of",
     "forces.pairs.counts": "count_pairs heights",
     "forces.pairs.lists": (
-        "AHEAD BUILDS BUILT ENTRIES IMAGES_FOUND MASKED MET MET_BY_ONE MOST_MET USABLE WINDOW end_of_row farthest"
+        "AHEAD BUILDS BUILT ENTRIES IMAGES_FOUND MASKED MET MET_BY_ONE MOST_MET USABLE WINDOW end_of_row "
+        "farthest"
     ),
     "forces.pairs.loop": "PairWorkspace pair_forces",
     "forces.pairs.sites": "CentralSites blocks_of place_ahead place_sites",
@@ -304,7 +305,8 @@ HOMES = {
     "mechanics.rotor": "ExactRotor NONE NoRotor split_rotor",
     "mechanics.solids": "SOLIDS added_mass_of_ellipsoid solid",
     "molecules": (
-        "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters with_masses"
+        "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters "
+        "with_masses"
     ),
     "output.averages_report": "brief_rows",
     "output.checkpoint": "Checkpoint latest read_checkpoint write_checkpoint",
@@ -318,7 +320,7 @@ HOMES = {
     "output.picture": "Picture",
     "output.precision_report": "write_precision",
     "output.readers": "FORMATS",
-    "output.record": "_stage_of read_record",
+    "output.record": "read_record",
     "output.report": "energy_figure signed summary_text",
     "output.run_files": "Summary read_json",
     "output.scene_file": "write_scene",

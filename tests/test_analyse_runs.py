@@ -16,8 +16,6 @@ from MDAnalysis.analysis.msd import EinsteinMSD
 from MDAnalysis.analysis.rdf import InterRDF
 from support import (
     ROOT,
-    _last_stage,
-    _stage_of,
     build,
     gmx,
     of_folder,
@@ -548,14 +546,16 @@ def test_friction_on_each_molecule_is_told(water):
     assert "the thermostat langevin acts on each molecule" in " ".join(told)
 
 
-def test_stages_of_one_name_are_told_apart(water):
+def test_stages_of_one_name_are_told_apart(tmp_path):
     """Production is the last stage, also where an earlier one has its name."""
-    record = read_record(water)
-    first, second = record.scene.stages
-    scene = record.scene.model_copy(
-        update={"stages": tuple(s.model_copy(update={"name": "x"}) for s in (first, second))}
-    )
-    time = record.columns["time"]
-    columns = record.columns | {"stage": _stage_of(np.full(len(time), "x"), time, scene.stages)}
-    stage, begin, end, _ = _last_stage(replace(record.molecules, scene=scene), columns)
-    assert (stage.ensemble, begin, end) == ("nve", pytest.approx(0.02), pytest.approx(0.22))
+    stages = [
+        {"name": "x", "ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.02},
+        {"name": "x", "duration_ps": 0.2},
+    ]
+    output = {"trajectory_interval_ps": 0.01, "log_interval_ps": 0.01, "figure": False}
+    Simulation(small_scene({"argon": 20}, 25.0, stages=stages, output=output), tmp_path / "run").run()
+    record = read_record(tmp_path / "run")
+    assert np.bincount(record.columns["stage"].astype(int)).tolist() == [3, 20]
+    found = of_folder(record)
+    assert found.stage.ensemble == "nve"
+    assert 0.02 - 1e-6 < found.time[0] < found.time[-1] == pytest.approx(0.22)
