@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
-#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so they begin first.
+#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so they begin first. By CPU
+#: seconds of a cold run on two cores: 232 of forces, 213 of ewald, 106 of body_engine, 14 of notebook.
 LONGEST = (
-    "forces", "body_engine", "sweep", "docs", "run", "dynamics", "compile", "analyse_runs", "ase", "ewald", "bodies",
-    "boxes", "own", "resume", "openmm", "lammps", "watch", "structures", "precision", "fuzz", "looking", "notebook",
-    "strangers", "baths", "auto", "minimise", "threads", "stability", "models", "body_run",
+    "forces", "ewald", "body_engine", "docs", "dynamics", "sweep", "run", "analyse_runs", "ase", "python", "resume",
+    "compile", "bodies", "boxes", "reference", "ensembles", "minimise", "baths", "own", "auto", "lammps", "lanes",
+    "rooms", "looking", "trajectory_structures", "fields", "threads", "body_run", "stability", "precision", "notebook",
 )  # fmt: skip
 RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
 
@@ -39,6 +40,7 @@ PROGRAMS = {
 
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true", "yes")
 ALLOWED = [re.escape(reason) for reason in MACHINE]
+ALLOWED += [r"no .*/spce_monoclinic_sample_periodic4\.txt"]  # a file of NIST that the shared folder does not have
 ALLOWED += [PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS]
 
 _skipped: list[str] = []

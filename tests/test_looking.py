@@ -304,6 +304,7 @@ def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
     assert not path.exists()
 
 
+@pytest.mark.filterwarnings("ignore:Reader has no dt information")  # of MDAnalysis, for a file of one frame
 @pytest.mark.parametrize("fault", ["missing", "other atoms", "other shapes", "noise", "empty"])
 def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(molecule_film, "library", lambda: "")
@@ -527,6 +528,7 @@ def test_the_files_of_a_run_tell_the_same(tmp_path):
     assert np.abs(rotation[-1] - last).max() < 0.02
 
 
+@pytest.mark.filterwarnings("ignore:1 A.3 CRYST1 record")  # a body has no box, and MDAnalysis says so
 def test_a_body_has_its_edges_as_bonds(tmp_path):
     more = {"run.duration_s": 0.01, "output.figures": False}
     results = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run").run()

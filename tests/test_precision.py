@@ -157,6 +157,7 @@ def test_timings_alternate_between_trials(monkeypatch):
     assert shares == pytest.approx(np.arange(1, 7) / 6)
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning:matplotlib")  # an axis on which all points have one value
 def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_path):
     subject, _ = body_subject(Scene.read(TOP), 0.1)
 
