@@ -7,10 +7,13 @@ pilots in those of the stage.
 """
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import SCHEMES, choice, walk
 
 from rigidmd import Scene, Simulation

@@ -8,10 +8,13 @@ barostats have their default strengths. The workloads are those of peers.py.
 
 import argparse
 import statistics
+import sys
 from pathlib import Path
 
 from peers import WORKLOADS, choice, start_of
 from scaling import STEP, speed
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import row_of_stage
 
 from rigidmd import Scene, Simulation

@@ -14,12 +14,15 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numba import literally, njit
 from peers import WORKLOADS, choice, numbers, start_of
 from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import (
     BUILDS,
     DTYPES,

@@ -10,12 +10,15 @@ come after it. 216: the smallest box of scaling.py; the others are those of peer
 
 import argparse
 import statistics
+import sys
 import tempfile
 from pathlib import Path
 
 from peers import WORKLOADS, choice, start_of
 from scaling import STEP, relax, speed
 from scaling import scene as small
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import SCHEMES
 
 from rigidmd import Scene, Simulation

@@ -7,8 +7,10 @@ PME, 10 Å (9 Å of 216), steps of 2 fs, mixed precision, the density given. The
 """
 
 import argparse
+import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import Task, analyse_folder
 
 from rigidmd import Scene, Simulation

@@ -5,9 +5,12 @@ python tests/benchmarks/own_law.py [molecules] [rounds]
 
 import sys
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import build
 from support import row_of_stage as row
 

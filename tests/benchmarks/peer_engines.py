@@ -72,6 +72,7 @@ class Rigidmd:
 
     @staticmethod
     def version() -> str:
+        sys.path.insert(0, str(Path(__file__).parents[1]))
         from support import source_digest
 
         import rigidmd
@@ -80,6 +81,7 @@ class Rigidmd:
 
     @staticmethod
     def run(job: dict, sites: dict, folder: Path) -> dict:
+        sys.path.insert(0, str(Path(__file__).parents[1]))
         from support import SCHEMES, observe
 
         from rigidmd import Scene, Simulation

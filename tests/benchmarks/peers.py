@@ -47,6 +47,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy, environment
 from scipy.spatial import cKDTree
 from scipy.special import erfc
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import FAINT, INK, align, build, cache_folder, intramolecular_energy, observe, slope
 
 from rigidmd import Scene, Simulation

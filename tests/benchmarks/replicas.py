@@ -21,6 +21,8 @@ from pathlib import Path
 import tomli_w
 from peers import choice
 from scaling import STEP, speed
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import row_of_stage as row
 
 from rigidmd import Scene, Simulation, run_together

@@ -22,6 +22,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from peer_engines import environment
 from peers import WORKLOADS, numbers, write_start
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import NOW, SCHEMES, array_bytes
 
 from rigidmd import Scene, Simulation
