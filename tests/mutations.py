@@ -11,11 +11,13 @@ minutes on one core.
 
 import argparse
 import contextlib
+import io
 import os
 import re
 import signal
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -31,19 +33,30 @@ PASSED, FAILED, INTERRUPTED = 0, 1, 2
 
 
 def copy_of_checkout(folder: Path, working_tree: bool) -> Path:
-    """The files of HEAD, or those of the working tree, in a folder that is empty or holds an earlier copy."""
-    copy = folder / "checkout"
-    copy.mkdir(parents=True, exist_ok=True)
+    """The files of HEAD, or those of the working tree, in a folder that is empty or holds an earlier copy.
+
+    Files that are there already keep their times, and so the kernels that were compiled from them.
+    """
     archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, capture_output=True, check=True).stdout
-    subprocess.run(["tar", "-x", "-C", copy], input=archive, check=True)
+    with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+        wanted = {member.name: (files.extractfile(member).read(), member.mode) for member in files if member.isfile()}
     if working_tree:
         listing = ["git", "ls-files", "--modified", "--others", "--exclude-standard", "-z"]
         names = subprocess.run(listing, cwd=ROOT, capture_output=True, check=True, text=True).stdout.split("\0")
-        for name in dict.fromkeys(filter(None, names)):
-            (copy / name).unlink(missing_ok=True)
+        for name in filter(None, names):
+            wanted.pop(name, None)
             if (ROOT / name).is_file():
-                (copy / name).parent.mkdir(parents=True, exist_ok=True)
-                (copy / name).write_bytes((ROOT / name).read_bytes())
+                wanted[name] = (ROOT / name).read_bytes(), (ROOT / name).stat().st_mode
+    copy = folder / "checkout"
+    for path in [path for path in copy.rglob("*") if path.is_file() and "__pycache__" not in path.parts]:
+        if path.relative_to(copy).as_posix() not in wanted:
+            path.unlink()
+    for name, (content, mode) in wanted.items():
+        path = copy / name
+        if not path.is_file() or path.read_bytes() != content:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+            path.chmod(mode)
     return copy
 
 

@@ -20,6 +20,7 @@ from support import (
     draw_momenta,
     observe,
     ramps,
+    remove_momentum,
     small_scene,
 )
 from support import row_of_stage as row
@@ -288,8 +289,6 @@ def test_a_mixture_starts_at_rest_and_at_its_temperature():
 
 def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     """`remove_momentum` keeps all relative velocities, and returns the energy that it takes."""
-    from support import remove_momentum
-
     system = system_of(NVT)
     state, mass = pushed(system)
     before = state.velocity.copy()
