@@ -135,10 +135,10 @@ def is_in_memory(owner: Any) -> bool:
     return isinstance(owner, str | bytes | io.StringIO | io.BytesIO) or owner in (sys.__stdout__, sys.__stderr__)
 
 
-def is_in_polynomial(frame: Any) -> bool:
-    """Whether NumPy's polynomials are at work, which turn any error into a TypeError."""
+def is_elsewhere(frame: Any) -> bool:
+    """Whether NumPy's polynomials are at work, which turn any error into a TypeError, or Python reads a version."""
     while frame is not None:
-        if "/numpy/polynomial/" in frame.f_code.co_filename:
+        if re.search("/numpy/polynomial/|/importlib/metadata/", frame.f_code.co_filename):
             return True
         frame = frame.f_back
     return False
@@ -158,7 +158,7 @@ class AtCall:
         if self._names and (called.__name__ not in self._names or is_in_memory(getattr(called, "__self__", None))):
             return
         self._left -= 1
-        if self._left <= 0 and not is_in_polynomial(frame):
+        if self._left <= 0 and not is_elsewhere(frame):
             sys.setprofile(None)
             self._act()
 
@@ -305,7 +305,8 @@ class Case:
         self.victim = root / "victim"
         self.damage: list[str] = []  # names of files that are not as the run left them
         self.is_other = False  # a checkpoint was forged that may be of another run
-        self.has_failed = False
+        self.has_failed = False  # an attempt
+        self.has_previous = False  # a whole checkpoint before the damaged one, so that the run must be resumed
         self.said = ""
 
     def run(self) -> None:
@@ -324,7 +325,7 @@ class Case:
             raise Found(f"undisturbed run: exit code {code}: {said.getvalue()}")
         self.whole = contents(self.root / "whole")
         for _ in range(self.rng.randint(1, 6)):
-            if self.rng.random() < 0.5 and (self.folder / CHECKPOINT).is_file() and not self.damage:
+            if self.rng.random() < 0.7 and (self.folder / CHECKPOINT).is_file() and not self.damage:
                 self._damage()
             fault = self.rng.choice([None, *FAULTS])
             self._attempt(fault)
@@ -346,11 +347,11 @@ class Case:
         count = int(10 ** (self.rng.uniform(0, 3.3) if names else self.rng.uniform(1, 5.6)))
         act, what, codes = self._fault(fault)
         self.actions[what.split(":")[0]] += 1
-        before = everything(self.folder) if self.folder.is_dir() else {}
+        before = self._files()
         number, read = begun(command, AtCall(names, count, act) if act else None)
         code = waited(number, stops=True)
         if code is None:
-            code = self._while_stopped(number)
+            code = self._while_stopped(number, has_begun=self._files() != before)
         self.said = said_by(read)
         where = f" at {'file ' if names else ''}call {count}" if act else ""
         self.show(f"{' '.join(command)}; {what}{where}; damaged: {self.damage}; exit code {code}")
@@ -391,17 +392,23 @@ class Case:
             )
         return None, "no fault", {0}
 
-    def _while_stopped(self, number: int) -> int:
-        """Try to run in the folder of a process that is stopped; its exit code when it has continued, or been killed."""
+    def _while_stopped(self, number: int, has_begun: bool) -> int:
+        """Try to run in the folder of a process that is stopped; its exit code when it has continued, or been killed.
+
+        has_begun : whether it has changed files, so that the other one must be refused
+        """
         second, read = begun(self._command())
         code, said = waited(second), said_by(read)
         self.show(f"  meanwhile another: exit code {code}")
-        if code == 0:
+        if code == 0 and not has_begun:
             self._compare()
         elif code != 2 or ("another run is writing" not in said and not self.damage):
             raise Found(f"a second run beside a stopped one: exit code {code}: {said}")
         os.kill(number, self.rng.choice([signal.SIGCONT, signal.SIGCONT, signal.SIGKILL]))
         return waited(number)
+
+    def _files(self) -> dict[str, object]:
+        return everything(self.folder) if self.folder.is_dir() else {}
 
     def _check(self, code: int, codes: set[int], fault: str | None, before: dict) -> bool:
         """Whether an attempt ended as it must. Restores damaged files where it was right to refuse them."""
@@ -419,17 +426,19 @@ class Case:
             self.damage = []
             return True
         self.has_failed |= code == 2 and fault is not None
-        allowed = codes | ({2} if self.damage else set()) | ({1} if self.is_other else set())
+        is_refusable = self.damage and not self.has_previous
+        self.has_previous = False  # from now on there may be no checkpoint before the damaged one
+        allowed = codes | ({2} if is_refusable else set()) | ({1} if self.is_other else set())
         if code not in allowed:
             raise Found(f"exit code {code}, not one of {sorted(allowed)}")
         if code == 2 and not re.search("^rigidmd: ", self.said, re.MULTILINE):
             raise Found("no sentence tells why it ended")
-        after = everything(self.folder) if self.folder.is_dir() else {}
+        after = self._files()
         if code in (0, 2) and (
             left := [name for name in after.keys() - before if re.match(r"\..*\.[0-9a-f]{16}", name)]
         ):
             raise Found(f"temporary files stay: {left}")
-        if code == 2 and fault is None and after != before:
+        if code == 2 and fault is None and after != before and "stopped at step" not in self.said:
             changed = [name for name in before | after if before.get(name) != after.get(name)]
             raise Found(f"refused, and files have changed: {changed}")
         if (
@@ -463,7 +472,8 @@ class Case:
         shutil.rmtree(self.kept, ignore_errors=True)
         shutil.copytree(self.folder, self.kept, symlinks=True)
         names = sorted(path.name for path in self.folder.iterdir() if path.name != "notes.txt")
-        name = rng.choice([CHECKPOINT, CHECKPOINT, PREVIOUS, *names])
+        growing = [name for name in names if name.startswith(("log", "trajectory"))]
+        name = rng.choice([CHECKPOINT, CHECKPOINT, PREVIOUS, *growing, *growing, *names])
         path, how = self.folder / name, rng.choice(["flip", "flip", "cut", "link", "pipe", "forge", "forge", "remove"])
         words = name
         if how == "forge":
@@ -491,6 +501,9 @@ class Case:
             elif how == "pipe":
                 os.mkfifo(path) if rng.random() < 0.7 else path.mkdir()
         self.damage = [name]
+        self.has_previous = (
+            name == CHECKPOINT and how in ("flip", "cut", "remove") and (self.folder / PREVIOUS).is_file()
+        )
         self.actions[how] += 1
         self.show(f"{how}: {words}")
 
