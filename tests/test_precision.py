@@ -392,7 +392,7 @@ def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
     assert "(reference)" in said
     assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(advice(found))
     written = write_precision(tmp_path, found, "a command")
-    rows = list(csv.DictReader((tmp_path / "precision_averages.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "precision_averages.csv").read_text().splitlines()))
     assert [path.name for path in written][-1] == "precision_averages.csv"
     assert float(rows[0]["T_rot unbiased (K)"]) == pytest.approx(coarse.averages["T_rot unbiased"][0])
     assert "Averages over 3 ps" in (tmp_path / "precision.html").read_text()
