@@ -36,6 +36,7 @@ PROGRAMS = {
     "chromium": "Chromium is not installed",
     "gromacs": "(GROMACS is not installed|no gmx here)",
     "ffmpeg": "ffmpeg is not installed",
+    "reference": "no outside reference data at",
 }
 
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true", "yes")
@@ -44,11 +45,6 @@ ALLOWED += [r"no .*/spce_monoclinic_sample_periodic4\.txt"]  # a file of NIST th
 ALLOWED += [PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS]
 
 _skipped: list[str] = []
-
-
-def missing(what: str) -> None:
-    """Skip a test that needs data from outside, or fail it in CI."""
-    (pytest.fail if IN_CI else pytest.skip)(what)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
