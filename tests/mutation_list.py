@@ -264,7 +264,7 @@ RINGS = [
             "test_thermostat_states.py::test_chains_go_on_to_the_same_bits_in_double_precision",
         ),
     ),
-    Mutation(  # harmless within a run, whose steps count on; but stages run alone would share their numbers
+    Mutation(  # harmless within a run, whose steps count on; a stage that is run alone would repeat the numbers
         "B21", "random numbers of every stage are those of the first",
         "assemble/rows.py",
         "    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, k)",
@@ -285,7 +285,7 @@ RINGS = [
         "arm.append(np.broadcast_to(body[hydrogen] - body[site], centre.shape))",
         ("test_mixtures.py::test_hydrogen_bonds_of_a_mixture_are_those_of_its_geometry",),
     ),
-    Mutation(  # no pair is missed for cells of less than 30 % strain: the list rests on a wider margin than it has
+    Mutation(  # misses a pair only where cutoff and skin nearly fill the box; the test pins the documented quarter too
         "B24", "neighbour list: images of a changed cell may move 2.4 times as far",
         "forces/pairs/update.py",
         "    return 0.25 * pairs.skin if is_short else 0.0",
