@@ -56,13 +56,14 @@ def main(arguments: list[str] | None = None) -> int:
     from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
     from rigidmd.output.streams import checked_streams, open_streams
 
-    open_streams()
-    options = _parsed(sys.argv[1:] if arguments is None else arguments)
+    options = argparse.Namespace()
 
     def show(message, category, *where, **more):
         warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
 
     try:
+        open_streams()
+        options = _parsed(sys.argv[1:] if arguments is None else arguments)
         with warnings.catch_warnings(), checked_streams(lasting=options.writes):
             others, warnings.showwarning = warnings.showwarning, show
             return options.command(options)
@@ -75,10 +76,6 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("rigidmd: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except MemoryError:
-        what, free = getattr(options, "scene", "this"), in_words(free_memory())
-        print(f"rigidmd: {what}: not enough memory ({free} free); take fewer molecules or samples", file=sys.stderr)
-        return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
     except Exception as error:  # libraries turn what happens into errors of many types; all others are raised again
@@ -86,6 +83,10 @@ def main(arguments: list[str] | None = None) -> int:
         if any(isinstance(cause, KeyboardInterrupt) for cause in causes):
             print("rigidmd: interrupted", file=sys.stderr)
             return INTERRUPTED
+        if any(isinstance(cause, MemoryError) for cause in causes):  # zipfile, too, raises another one in its place
+            what, free = getattr(options, "scene", "this"), in_words(free_memory())
+            print(f"rigidmd: {what}: not enough memory ({free} free); take fewer molecules or samples", file=sys.stderr)
+            return BAD_INPUT
         if any(words in str(cause) for cause in causes for words in NO_ROOM):
             print("rigidmd: not enough memory to load the program; raise the limit (ulimit -v)", file=sys.stderr)
             return BAD_INPUT

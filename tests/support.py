@@ -261,8 +261,7 @@ HOMES = {
     "forces.pairs.clusters": "clusters_of",
     "forces.pairs.counts": "count_pairs heights",
     "forces.pairs.lists": (
-        "AHEAD BUILDS BUILT ENTRIES IMAGES_FOUND MASKED MET MET_BY_ONE MOST_MET USABLE WINDOW end_of_row "
-        "farthest"
+        "AHEAD BUILDS BUILT ENTRIES IMAGES_FOUND MASKED MET MET_BY_ONE MOST_MET USABLE WINDOW end_of_row farthest"
     ),
     "forces.pairs.loop": "PairWorkspace pair_forces",
     "forces.pairs.sites": "CentralSites blocks_of place_ahead place_sites",
@@ -305,8 +304,7 @@ HOMES = {
     "mechanics.rotor": "ExactRotor NONE NoRotor split_rotor",
     "mechanics.solids": "SOLIDS added_mass_of_ellipsoid solid",
     "molecules": (
-        "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters "
-        "with_masses"
+        "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters with_masses"
     ),
     "output.averages_report": "brief_rows",
     "output.checkpoint": "Checkpoint latest read_checkpoint write_checkpoint",

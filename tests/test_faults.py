@@ -28,6 +28,7 @@ from support import (
     read_state,
 )
 
+import rigidmd
 from rigidmd import cli
 from rigidmd.errors import RigidMDError
 
@@ -251,6 +252,30 @@ def test_two_first_compilations_at_once(scene, tmp_path):
     for k, run in enumerate(both):
         assert b"Traceback" not in run.communicate(timeout=900)[1] and run.returncode == 0
         assert same(scene, tmp_path / f"run{k}")
+
+
+def test_a_run_that_was_killed_at_its_first_file_begins_again(scene, tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "..rigidmd-run.0123456789abcdef").write_text("half a na")
+    assert cli.main(["run", str(scene), "-o", str(folder), "--threads", "1", "--resume"]) == 0
+    assert same(scene, folder)
+
+
+@pytest.mark.parametrize("of", [MemoryError, KeyboardInterrupt])
+def test_what_a_library_makes_an_error_of_another_type_is_reported(of, scene, monkeypatch, capsys):
+    """zipfile raises ValueError where memory ends."""
+
+    def read(*given, **more):
+        try:
+            raise of
+        except of:
+            raise ValueError("an open file is in the way")  # noqa: B904
+
+    monkeypatch.setattr(rigidmd.Scene, "read", read)
+    assert cli.main(["check", str(scene)]) == (2 if of is MemoryError else 130)
+    said = capsys.readouterr().err
+    assert ("not enough memory" if of is MemoryError else "interrupted") in said and "way" not in said
 
 
 def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:

@@ -50,7 +50,7 @@ from support import (
 
 import rigidmd
 from rigidmd.cli import main
-from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Observer, Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -918,6 +918,13 @@ class Failing(Observer):
             raise ValueError("it does not work")
 
 
+class FailingTwice(Failing):
+    """One whose file cannot be closed either."""
+
+    def close(self):
+        raise OutputError("the disk is full")
+
+
 FILES_OF = {
     "argon": {"scene.toml", "topology.gro", "trajectory.xtc", "log.csv", "final.npz", "energy.png", "summary.json"},
     "top": {"scene.toml", "topology.pdb", "trajectory.xtc", "motion.csv", "motion.npz", "axis.png", "summary.json"},
@@ -953,6 +960,12 @@ def test_an_observer_that_fails_costs_no_file_of_another(tmp_path, scene_of_both
     again = Simulation(scene, tmp_path / "out", observers=[Every(0.002, seen.append)] * 3, resume=True, warn=str)
     if method == "see" and kind == "argon":
         assert not again.run().interrupted
+
+
+def test_an_error_is_not_hidden_by_those_that_follow_from_it(tmp_path, scene_of_both):
+    run = Simulation(scene_of_both[1], tmp_path / "out", observers=[FailingTwice("see")], warn=str)
+    with pytest.raises(ValueError, match="it does not work"):
+        run.run()
 
 
 def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):

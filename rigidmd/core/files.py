@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import re
 import secrets
 import stat
 import zlib
@@ -56,6 +57,11 @@ def whole_file(path: Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def is_temporary(path: Path) -> bool:
+    """Whether a file is one that a process was writing when it was killed."""
+    return re.fullmatch(r"\..+\.[0-9a-f]{16}(\.\w+)?", path.name) is not None
 
 
 def write_text(path: Path, text: str) -> None:

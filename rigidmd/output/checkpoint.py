@@ -2,13 +2,14 @@
 
 import contextlib
 import json
+import os
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import sync_file, whole_file
+from rigidmd.core.files import file_fault, sync_file, whole_file
 from rigidmd.errors import CheckpointError
 from rigidmd.output.folder import CHECKPOINT, PREVIOUS
 
@@ -91,7 +92,10 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
     faults = []
     for name in (CHECKPOINT, PREVIOUS):
         path = folder / name
-        if not path.is_file():
+        if not os.path.lexists(path):
+            continue
+        if fault := file_fault(path):
+            faults.append(f"{path}: {fault}")
             continue
         try:
             return read_checkpoint(path), faults

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from rigidmd.core.files import file_fault, write_text
+from rigidmd.core.files import file_fault, is_temporary, write_text
 from rigidmd.core.toml_text import cut
 from rigidmd.errors import OutputError
 from rigidmd.output.write import writing
@@ -152,7 +152,8 @@ def never_began(folder: Path) -> bool:
     if CHECKPOINT not in written_by_runs(folder) or any((folder / name).exists() for name in ended):
         return False
     log = folder / LOG
-    is_short = not file_fault(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
+    with writing(log, "read"):
+        is_short = not file_fault(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
     return is_short or not log.exists()
 
 
@@ -162,12 +163,13 @@ def offsets_of(trajectory: Path) -> list[Path]:
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether a folder is absent or holds nothing but a lock."""
-    return not folder.exists() or all(path.name == LOCK for path in folder.iterdir())
+    """Whether a folder is absent or holds nothing but a lock, and what was left by a run that was killed at once."""
+    return not folder.exists() or all(path.name == LOCK or is_temporary(path) for path in folder.iterdir())
 
 
 def written_by_runs(folder: Path, marker: str = MARKER) -> list[str]:
     """Files that an earlier run in this folder may have written; only plain names, whatever its marker contains."""
     path = folder / marker
-    names = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
+    with writing(path, "read"):
+        names = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
     return [name for name in names if name and Path(name).name == name]

@@ -22,6 +22,7 @@ from rigidmd.errors import OutputError
 from rigidmd.mechanics.rotation import to_quaternion
 from rigidmd.molecules import of_each
 from rigidmd.output.connections import charges, connections
+from rigidmd.output.write import writing
 
 #: Å; a viewer draws the central particle as a dot.
 DOT = 0.1
@@ -83,7 +84,8 @@ class GsdFile:
     def close(self) -> None:
         """Finish the file."""
         if self._file is not None:
-            self._file.close()
+            with writing(self._path):
+                self._file.close()
 
     @staticmethod
     def _append(file: Any, frame: Any) -> None:

@@ -22,6 +22,7 @@ from rigidmd.errors import SimulationError
 from rigidmd.output.gsd_file import GsdFile
 from rigidmd.output.traj_file import TrajFile
 from rigidmd.output.trajectory import dimensions, set_frame, universe
+from rigidmd.output.write import writing
 
 NM_PER_A, XTC_PER_NM = 0.1, 1000.0
 #: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
@@ -108,12 +109,14 @@ class TrajectoryFile:
         """Add a frame with its own time (ps) and the box."""
         if self._format in (".xtc", ".trr"):  # as GROMACS does: 32 bits of the step, the time is what counts
             step = (step + 2**31) % 2**32 - 2**31
-        if self._format == ".xtc":
-            self._file.append(self._xtc_frame(state, time, step))
-        else:
-            set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
-            _check_fits(self._path, self._universe.trajectory.ts.positions)
-            self._file.append(self._part_of(self._whole(state, time)))
+        with writing(self._path):  # the file of a frame may find no room in memory
+            if self._format == ".xtc":
+                piece = self._xtc_frame(state, time, step)
+            else:
+                set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
+                _check_fits(self._path, self._universe.trajectory.ts.positions)
+                piece = self._part_of(self._whole(state, time))
+        self._file.append(piece)
         self._frames += 1
         if self._format in COUNTER:
             offset, form = COUNTER[self._format]

@@ -9,6 +9,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from math import inf, isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, cast, overload
@@ -237,7 +238,7 @@ class Simulation(Base):
                     self._prepare()
             prepared = clock.perf_counter() - began
             for observer in observers:
-                stack.callback(self._if_not_forked, observer.close)
+                stack.push(partial(self._close, observer))
             if kept is not None:  # first all that may refuse it, then the first change of a file
                 with fitting(self.folder):
                     for name, observer in named.items():
@@ -269,13 +270,19 @@ class Simulation(Base):
             except Exception as error:  # of a force, or of an observer, after which all files are complete
                 if error is not self._error and os.getpid() == self._process:
                     for observer in observers:
-                        observer.failed(self)
+                        with contextlib.suppress(Exception):  # the first error is the one to report
+                            observer.failed(self)
                 raise
 
     def _if_not_forked(self, function: Callable[[], object]) -> None:
         """Call a function unless this is a forked process: files, their buffers and locks are those of the first."""
         if os.getpid() == self._process:
             function()
+
+    def _close(self, observer: Observer, kind: Any, error: BaseException | None, trace: Any) -> None:
+        """Close the files of an observer; an error before is the one to report."""
+        with contextlib.suppress(*([] if error is None else [OutputError])):
+            self._if_not_forked(observer.close)
 
     def _check_process(self) -> None:
         if os.getpid() != self._process:
