@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numba
 from llvmlite import binding
+from llvmlite.binding.newpassmanagers import create_new_function_pass_manager
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
@@ -168,10 +169,12 @@ class LinkedCode(JITCodeLibrary):
     """
 
     def _optimize_functions(self, ll_module):
-        if _has_addresses(ll_module):
-            super()._optimize_functions(ll_module)
-        else:
-            ll_module.data_layout = self._codegen._data_layout
+        ll_module.data_layout = self._codegen._data_layout
+        for function in ll_module.functions:  # of what Numba does here, what makes it smaller
+            passes, builder = create_new_function_pass_manager(), self._codegen._pass_builder()
+            passes.add_sroa_pass()
+            passes.add_dead_code_elimination_pass()
+            passes.run(function, builder)
 
     def _optimize_final_module(self):
         if _has_addresses(self._final_module):
