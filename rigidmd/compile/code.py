@@ -18,7 +18,7 @@ from numba.extending import NativeValue, intrinsic, models, overload, register_m
 from rigidmd.compile import ahead, crew
 from rigidmd.compile.kernels import kernel, options_of
 from rigidmd.compile.layout import Laid, Word
-from rigidmd.compile.numba_private import callback, kept_callback, uncounted
+from rigidmd.compile.numba_private import LINKED, callback, kept_callback, uncounted
 
 ADDRESS = ir.IntType(8).as_pointer()
 
@@ -272,11 +272,11 @@ def call_blocks(code, name, parcel, blocks):
     raise TypeError("compiled code only")
 
 
-@overload(call, prefer_literal=True, jit_options=options_of(True))
+@overload(call, prefer_literal=True, jit_options=options_of(True) | LINKED)
 def _call(code, name, parcel):
     return lambda code, name, parcel: _jump(address_of(code, name, parcel), parcel, 0)
 
 
-@overload(call_blocks, prefer_literal=True, jit_options=options_of(True))
+@overload(call_blocks, prefer_literal=True, jit_options=options_of(True) | LINKED)
 def _call_blocks(code, name, parcel, blocks):
     return lambda code, name, parcel, blocks: _jump_blocks(address_of(code, name, parcel), parcel, blocks)

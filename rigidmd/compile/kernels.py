@@ -6,7 +6,7 @@ from typing import Any
 from numba import types
 from numba.extending import overload
 
-from rigidmd.compile.numba_private import dispatcher, uncounted
+from rigidmd.compile.numba_private import LINKED, dispatcher, uncounted
 
 
 def kernel(function: Callable | None = None, *, inline=False, counted=True, outer=False) -> Any:
@@ -31,7 +31,7 @@ def kernel(function: Callable | None = None, *, inline=False, counted=True, oute
 
 def implements(stub, inline=False, counted=True):
     """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those of its caller."""
-    return overload(stub, jit_options=options_of(inline) | uncounted(counted))
+    return overload(stub, jit_options=options_of(inline) | uncounted(counted) | LINKED)
 
 
 def options_of(inline: bool) -> dict:

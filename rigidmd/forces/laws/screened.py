@@ -24,8 +24,9 @@ from rigidmd.units import COULOMB_CHARGE
 #: Largest error of a polynomial, relative to the function at r = 0, by the precision of the lanes: smaller than the
 #: rounding error of its evaluation, 5e-15 and 1.5e-7 for alpha times the cut-off up to 4.
 FIT_ERROR = {np.dtype(np.float64): 1e-15, np.dtype(np.float32): 3e-8}
-#: The number of terms is a multiple of this.
-STEP = 2
+#: Numbers of terms of the energy and of the force are multiples of these. The force is what most calls compute; the
+#: energy has few different numbers, each of which is another type of compiled code.
+ENERGY_STEP, FORCE_STEP = 8, 2
 #: Intervals of a table, and coefficients of each.
 INTERVALS, TERMS = 32, 4
 #: Largest error of a table, relative as FIT_ERROR: the rounding error of the polynomial that it replaces.
@@ -44,14 +45,14 @@ def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: floa
     """The polynomials for screening by alpha (1/Å) up to a cut-off (Å), for lanes of a NumPy dtype.
 
     Each series is truncated where the rest is below FIT_ERROR of the value at r = 0, or where the error of the force
-    between unit charges is below `error` (1/Å²). The number of terms is a multiple of STEP, so that small changes of
-    alpha use the same compiled code.
+    between unit charges is below `error` (1/Å²). Numbers of terms are multiples of ENERGY_STEP and FORCE_STEP, so that
+    small changes of alpha use the same compiled code.
     """
     kind = np.dtype(dtype)
     strength = 2 / sqrt(pi) * alpha
-    energy = _cut(_series(alpha * cutoff, 0), 0.0, kind)
+    energy = _cut(_series(alpha * cutoff, 0), 0.0, kind, ENERGY_STEP)
     of_unit = strength * 2 * alpha**2 * cutoff  # 0 without screening
-    force = _cut(_series(alpha * cutoff, 2), error / of_unit if of_unit else 0.0, kind)
+    force = _cut(_series(alpha * cutoff, 2), error / of_unit if of_unit else 0.0, kind, FORCE_STEP)
     return Screening(
         kind.type(2 / cutoff**2),
         tuple(map(kind.type, strength * energy)),
@@ -111,11 +112,11 @@ def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, fl
     return density, table, float(off.max())
 
 
-def _cut(series: np.ndarray, error: float, kind: np.dtype) -> np.ndarray:
-    """Coefficients of powers of t for a Chebyshev series, truncated at the given error."""
+def _cut(series: np.ndarray, error: float, kind: np.dtype, step: int) -> np.ndarray:
+    """Coefficients of powers of t for a Chebyshev series, truncated at the given error to a multiple of `step` terms."""
     left = np.cumsum(np.abs(series[::-1]))[::-1]
     needed = int(np.sum(left > max(error, FIT_ERROR[kind] * left[0])))
-    return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // STEP) * STEP])
+    return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // step) * step])
 
 
 def _series(x: float, power: int) -> np.ndarray:
