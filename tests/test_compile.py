@@ -6,6 +6,7 @@ import ctypes
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from typing import NamedTuple
@@ -354,7 +355,8 @@ KERNEL = "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef twice(x):
 
 def compiled_in(folder, tmp_path, before=""):
     """Run a kernel with the cache in a folder: what it printed, what it warned of."""
-    (tmp_path / "own.py").write_text(KERNEL)
+    if not (tmp_path / "own.py").exists():  # kernels are kept by the time of their file
+        (tmp_path / "own.py").write_text(KERNEL)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
     }  # fmt: skip
@@ -363,23 +365,30 @@ def compiled_in(folder, tmp_path, before=""):
     return done.stdout.strip(), done.stderr
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder with a kernel, and a cache in it that has the kernel."""
+    folder = tmp_path_factory.mktemp("kept")
+    assert compiled_in(folder / "cache", folder) == ("42 0", "")
+    assert compiled_in(folder / "cache", folder) == ("42 1", "")
+    return folder
+
+
 @pytest.mark.parametrize("ending", [".nbi", ".nbc"])
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])
-def test_a_damaged_file_of_the_cache_counts_as_absent(ending, damage, tmp_path):
-    assert compiled_in(tmp_path / "cache", tmp_path) == ("42 0", "")
-    assert compiled_in(tmp_path / "cache", tmp_path) == ("42 1", "")
+def test_a_damaged_file_of_the_cache_counts_as_absent(ending, damage, kept, tmp_path):
+    shutil.copytree(kept / "cache", tmp_path / "cache")
     (path,) = (path for path in (tmp_path / "cache").rglob(f"*twice*{ending}*") if ending in path.name)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 16
     path.write_bytes({"empty": b"", "cut": bytes(data[:40]), "flipped": bytes(data)}[damage])
-    printed, warned = compiled_in(tmp_path / "cache", tmp_path)
+    printed, warned = compiled_in(tmp_path / "cache", kept)
     assert printed == "42 0" and warned.count("is damaged; its code is compiled again") == 1
-    assert compiled_in(tmp_path / "cache", tmp_path) == ("42 1", "")
+    assert compiled_in(tmp_path / "cache", kept) == ("42 1", "")
 
 
-def test_a_cache_that_cannot_be_written_is_read(tmp_path):
-    compiled_in(tmp_path / "cache", tmp_path)
-    before = sorted(tmp_path.rglob("*"))
+def test_a_cache_that_cannot_be_written_is_read(kept):
+    before = sorted(kept.rglob("*"))
     read_only = (
         "import os, tempfile\n"
         "allow = tempfile.TemporaryFile\n"
@@ -388,8 +397,8 @@ def test_a_cache_that_cannot_be_written_is_read(tmp_path):
         "    return allow(dir=dir)\n"
         "tempfile.TemporaryFile = refuse"
     )
-    assert compiled_in(tmp_path / "cache", tmp_path, read_only) == ("42 1", "")
-    assert sorted(tmp_path.rglob("*")) == before
+    assert compiled_in(kept / "cache", kept, read_only) == ("42 1", "")
+    assert sorted(kept.rglob("*")) == before
 
 
 def test_a_kernel_is_compiled_once_for_all_constant_arguments():

@@ -174,7 +174,7 @@ def test_vectors_of_pairs_have_the_forces_of_erfc(x, dtype, rounding):
     assert (np.abs(force - w) < rounding * (1 / r**3 + screened_force(alpha, 0.0))).all()
 
 
-@pytest.mark.parametrize("alpha", [0.2, 0.0])
+@pytest.mark.parametrize("alpha", [0.2, pytest.param(0.0, marks=pytest.mark.soak)])
 def test_damped_shifted_force_is_fennell_and_gezelter(alpha):
     cutoff = 6.0
     forces = {"cutoff_A": cutoff, "electrostatics": "damped_shifted_force", "damping_per_A": alpha}

@@ -1,6 +1,7 @@
 """The rooms of the house: imports point one way, and each heavy library has one room."""
 
 import ast
+import functools
 
 import pytest
 from support import ROOT
@@ -79,8 +80,13 @@ LAZY = {
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
+@functools.cache
 def imports(path):
-    """(module, line, only for type checkers) of every import in a file."""
+    """Modules that a file imports, those only for type checkers left out."""
+    return list(_imports(path))
+
+
+def _imports(path):
     tree = ast.parse(path.read_text())
     typing_only = {
         id(inner)
