@@ -1,6 +1,7 @@
 """Fixtures and hooks of all tests. What tests call is in support.py."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from hooks import (  # noqa: E402, F401
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
-from support import ROOT  # noqa: E402
+from support import MODULES, ROOT  # noqa: E402
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +27,12 @@ def reference() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def no_analysis_outlives_its_test():
+    """Examples of the documentation register analyses, and a worker runs many files."""
+    yield
+    registry = sys.modules.get(f"rigidmd.{MODULES['registry']}")
+    for name in set(registry.KNOWN) - set(registry.ORDER) if registry else ():
+        del registry.KNOWN[name]

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 #: Files that take longest with cold kernels, the longest first: a file is run by one worker, so they begin first. By CPU
-#: seconds of a cold run on two cores: 232 of forces, 213 of ewald, 106 of body_engine, 14 of notebook.
+#: seconds of a cold run on two cores: 232 of forces, 213 of ewald, 106 of body_engine, 14 of notebook. The first two
+#: have no kernels in common, which both workers would compile.
 LONGEST = (
-    "forces", "ewald", "body_engine", "docs", "dynamics", "sweep", "run", "analyse_runs", "ase", "python", "resume",
+    "forces", "body_engine", "ewald", "docs", "dynamics", "sweep", "run", "analyse_runs", "ase", "python", "resume",
     "compile", "bodies", "boxes", "reference", "ensembles", "minimise", "baths", "own", "auto", "lammps", "lanes",
     "rooms", "looking", "trajectory_structures", "fields", "threads", "body_run", "stability", "precision", "notebook",
 )  # fmt: skip

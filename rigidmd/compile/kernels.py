@@ -1,5 +1,6 @@
 """Kernels: compiled functions, with the compiler options that this engine needs."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -29,9 +30,29 @@ def kernel(function: Callable | None = None, *, inline=False, counted=True, oute
     return dispatcher(function, options_of(inline) | uncounted(counted), outer)
 
 
-def implements(stub, inline=False, counted=True):
-    """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those of its caller."""
-    return overload(stub, jit_options=options_of(inline) | uncounted(counted) | LINKED)
+def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=False, counted=True) -> Any:
+    """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those of its caller.
+
+    kinds : NamedTuple classes; the function is then what `stub` does if its first argument is of one of these. Without
+        them the function is called with the types of the arguments, and returns what `stub` does for them, or None
+    """
+    register = overload(stub, jit_options=options_of(inline) | uncounted(counted) | LINKED)
+    if not kinds:
+        return register
+
+    def register_for_kinds(function):
+        def choose(*given):
+            return (
+                function
+                if any(is_a(given[0], kind) for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
+                else None
+            )
+
+        choose.__signature__ = inspect.signature(function)  # pyright: ignore[reportFunctionMemberAccess]
+        register(choose)
+        return function
+
+    return register_for_kinds
 
 
 def options_of(inline: bool) -> dict:

@@ -251,31 +251,19 @@ def _rest_molecules(model, state):
     return rest_molecules
 
 
-@implements(kick)
+@implements(kick, Model)
 def _kick_molecules(model, code, state, load, waiting, h):
-    if not is_a(model, Model):
-        return None
-
-    def kick_molecules(model, code, state, load, waiting, h):
-        if waiting[0] == 0.0:
-            return h, 0.0
-        if waiting[1] == 0.0:
-            return waiting[0], h
-        catch_up(model, code, state, load, waiting)
+    if waiting[0] == 0.0:
         return h, 0.0
+    if waiting[1] == 0.0:
+        return waiting[0], h
+    catch_up(model, code, state, load, waiting)
+    return h, 0.0
 
-    return kick_molecules
 
-
-@implements(drift)
+@implements(drift, Model)
 def _drift_molecules(model, code, state, load, waiting, h):
-    if not is_a(model, Model):
-        return None
-
-    def drift_molecules(model, code, state, load, waiting, h):
-        _move_all(model, code, state, load, waiting, h, True)
-
-    return drift_molecules
+    _move_all(model, code, state, load, waiting, h, True)
 
 
 @implements(catch_up)
@@ -291,36 +279,24 @@ def _catch_up(model, code, state, load, waiting):
     return catch_up_molecules
 
 
-@implements(displace)
+@implements(displace, Model)
 def _displace_molecules(model, state, load, tau):
-    if not is_a(model, Model):
-        return None
-
-    def displace_molecules(model, state, load, tau):
-        for m in range(len(state.position)):
-            share = tau * model.inverse_mass[model.species[m]]
-            for k in range(3):
-                state.position[m, k] += share * load.force[m, k]
-        for m in range(len(state.rotation)):
-            inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
-            turn_along(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
-
-    return displace_molecules
+    for m in range(len(state.position)):
+        share = tau * model.inverse_mass[model.species[m]]
+        for k in range(3):
+            state.position[m, k] += share * load.force[m, k]
+    for m in range(len(state.rotation)):
+        inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
+        turn_along(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
 
 
-@implements(add_gyration)
+@implements(add_gyration, Model)
 def _add_gyration_of_molecules(model, load, tau, gain):
-    if not is_a(model, Model):
-        return None
-
-    def add_gyration_of_molecules(model, load, tau, gain):
-        for m in range(len(load.torque_body)):
-            inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
-            for k in range(3):
-                i, j = (k + 1) % 3, (k + 2) % 3
-                gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]
-
-    return add_gyration_of_molecules
+    for m in range(len(load.torque_body)):
+        inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]
 
 
 @implements(pay)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import MOST_BLOCKS, call_blocks, implements, kernel, opened, packed, task
 from rigidmd.compile.lanes import align_stack
 from rigidmd.core.state import EXAMPLE, HEAT, NOW
 from rigidmd.dynamics.noise import BATCH, Key, chi_square, fill_normals, normals, uniforms
@@ -105,49 +105,36 @@ def apply(bath, model, code, state, room, h, draw):
     raise TypeError("compiled code only")
 
 
-@implements(apply)
+@implements(apply, NoBath)
 def _apply_none(bath, model, code, state, room, h, draw):
-    if is_a(bath, NoBath):
-        return lambda bath, model, code, state, room, h, draw: None
+    return None
 
 
-@implements(apply)
+@implements(apply, VelocityRescaling)
 def _apply_rescaling(bath, model, code, state, room, h, draw):
-    if not is_a(bath, VelocityRescaling):
-        return None
-
-    def rescale(bath, model, code, state, room, h, draw):
-        if bath.time_constant == inf:
-            return
-        moving, turning = kinetic_of(model, code, state, room)
-        kinetic = moving + turning
-        freedom = bath.degrees_of_freedom
-        if kinetic == 0.0 or freedom == 0:
-            return
-        # eq. A7, with one Gaussian apart and the sum of the squares of the others at once
-        c = exp(-h / bath.time_constant)
-        share = 0.5 * present(bath.thermal_energy, state) * (1 - c) / kinetic
-        gauss, _ = normals(bath.key, draw, 0, state.step[NOW])
-        others = chi_square(bath.key, draw + 1, 0, state.step[NOW], freedom - 1)
-        scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
-        state.books[HEAT] += (scale2 - 1) * kinetic
-        scale_momenta(code, state, sqrt(scale2), sqrt(scale2))
-
-    return rescale
+    if bath.time_constant == inf:
+        return
+    moving, turning = kinetic_of(model, code, state, room)
+    kinetic = moving + turning
+    freedom = bath.degrees_of_freedom
+    if kinetic == 0.0 or freedom == 0:
+        return
+    # eq. A7, with one Gaussian apart and the sum of the squares of the others at once
+    c = exp(-h / bath.time_constant)
+    share = 0.5 * present(bath.thermal_energy, state) * (1 - c) / kinetic
+    gauss, _ = normals(bath.key, draw, 0, state.step[NOW])
+    others = chi_square(bath.key, draw + 1, 0, state.step[NOW], freedom - 1)
+    scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
+    state.books[HEAT] += (scale2 - 1) * kinetic
+    scale_momenta(code, state, sqrt(scale2), sqrt(scale2))
 
 
-@implements(apply)
+@implements(apply, (Langevin, Andersen))
 def _apply_by_molecule(bath, model, code, state, room, h, draw):
-    if not (is_a(bath, Langevin) or is_a(bath, Andersen)):
-        return None
-
-    def apply_by_molecule(bath, model, code, state, room, h, draw):
-        blocks = blocks_of(len(state.velocity))
-        call_blocks(code, "stir", packed((bath, model, state, room, h, draw)), blocks)
-        for block in range(blocks):
-            state.books[HEAT] += room[block, 0]
-
-    return apply_by_molecule
+    blocks = blocks_of(len(state.velocity))
+    call_blocks(code, "stir", packed((bath, model, state, room, h, draw)), blocks)
+    for block in range(blocks):
+        state.books[HEAT] += room[block, 0]
 
 
 @task()
@@ -211,21 +198,15 @@ def thermal_sizes(model, moving, turning):
 YOSHIDA = (1 / (2 - 2 ** (1 / 3)), 1 - 2 / (2 - 2 ** (1 / 3)), 1 / (2 - 2 ** (1 / 3)))
 
 
-@implements(apply)
+@implements(apply, NoseHoover)
 def _apply_nose_hoover(bath, model, code, state, room, h, draw):
-    if not is_a(bath, NoseHoover):
-        return None
-
-    def apply_chains(bath, model, code, state, room, h, draw):
-        thermal = present(bath.thermal_energy, state)
-        half = 2 * bath.links
-        moving, turning = kinetic_of(model, code, state, room)
-        scale, heat = drive_chain(bath, state.bath[:half], thermal, moving, bath.freedom_translation, h)
-        scale_turning, heat_turning = drive_chain(bath, state.bath[half:], thermal, turning, bath.freedom_rotation, h)
-        scale_momenta(code, state, scale, scale_turning)
-        state.books[HEAT] += heat + heat_turning
-
-    return apply_chains
+    thermal = present(bath.thermal_energy, state)
+    half = 2 * bath.links
+    moving, turning = kinetic_of(model, code, state, room)
+    scale, heat = drive_chain(bath, state.bath[:half], thermal, moving, bath.freedom_translation, h)
+    scale_turning, heat_turning = drive_chain(bath, state.bath[half:], thermal, turning, bath.freedom_rotation, h)
+    scale_momenta(code, state, scale, scale_turning)
+    state.books[HEAT] += heat + heat_turning
 
 
 @kernel

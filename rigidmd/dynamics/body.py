@@ -22,68 +22,44 @@ class Body(NamedTuple):
     resistance: NoResistance | Resistance = NoResistance()
 
 
-@implements(kick, inline=True)
+@implements(kick, Body, inline=True)
 def _kick_body(model, code, state, load, waiting, h):
-    if not is_a(model, Body):
-        return None
-
-    def kick_body(model, code, state, load, waiting, h):
-        push(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
-        return waiting
-
-    return kick_body
+    push(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
+    return waiting
 
 
-@implements(drift, inline=True)
+@implements(drift, Body, inline=True)
 def _drift_body(model, code, state, load, waiting, h):
-    if not is_a(model, Body):
-        return None
-
-    def drift_body(model, code, state, load, waiting, h):
-        time = state.time[NOW]
-        carry(model.flight, model.rotor, state, time, h)
-        follow(model.frame, state, time, h)
-
-    return drift_body
+    time = state.time[NOW]
+    carry(model.flight, model.rotor, state, time, h)
+    follow(model.frame, state, time, h)
 
 
-@implements(displace, inline=True)
+@implements(displace, Body, inline=True)
 def _displace_body(model, state, load, tau):
-    if not is_a(model, Body):
-        return None
-
-    def displace_body(model, state, load, tau):
-        for k in range(len(load.force)):
-            for i in range(3):
-                state.position[k, i] += tau / model.flight.mass * load.force[k, i]
-        for k in range(len(load.torque_body)):
-            n, time = load.torque_body[k], state.time[NOW]
-            turn_along(
-                state.rotation[k],
-                tau * moments(model.rotor, time, 0)[0] * n[0],
-                tau * moments(model.rotor, time, 1)[0] * n[1],
-                tau * moments(model.rotor, time, 2)[0] * n[2],
-            )
-
-    return displace_body
+    for k in range(len(load.force)):
+        for i in range(3):
+            state.position[k, i] += tau / model.flight.mass * load.force[k, i]
+    for k in range(len(load.torque_body)):
+        n, time = load.torque_body[k], state.time[NOW]
+        turn_along(
+            state.rotation[k],
+            tau * moments(model.rotor, time, 0)[0] * n[0],
+            tau * moments(model.rotor, time, 1)[0] * n[1],
+            tau * moments(model.rotor, time, 2)[0] * n[2],
+        )
 
 
-@implements(add_gyration, inline=True)
+@implements(add_gyration, Body, inline=True)
 def _add_gyration_of_body(model, load, tau, gain):
-    if not is_a(model, Body):
-        return None
-
-    def add_gyration_of_body(model, load, tau, gain):
-        for b in range(len(load.torque_body)):
-            n = load.torque_body[b]
-            i0 = moments(model.rotor, 0.0, 0)[0]
-            i1 = moments(model.rotor, 0.0, 1)[0]
-            i2 = moments(model.rotor, 0.0, 2)[0]
-            gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
-            gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
-            gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
-
-    return add_gyration_of_body
+    for b in range(len(load.torque_body)):
+        n = load.torque_body[b]
+        i0 = moments(model.rotor, 0.0, 0)[0]
+        i1 = moments(model.rotor, 0.0, 1)[0]
+        i2 = moments(model.rotor, 0.0, 2)[0]
+        gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
+        gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
+        gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
 
 
 @implements(pay, inline=True)

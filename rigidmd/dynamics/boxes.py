@@ -202,26 +202,20 @@ def _stretch(box, state, h):
     return stretch
 
 
-@implements(move_box)
+@implements(move_box, Piston)
 def _kick_piston(box, model, terms, state, load, room, cursor, h, draw):
-    if not is_a(box, Piston):
-        return None
-
-    def kick_piston(box, model, terms, state, load, room, cursor, h, draw):
-        if cursor[1] != 1 or room.known[0] == 0:
-            status = tally_bodies(terms, state, load, room, PRESSED)
-            if status != OK:
-                return status
-            cursor[1] = 1
-        volume = volume_of(state.cell)
-        virial = room.tally[0, 1] + room.tally[0, 5] + room.tally[0, 9]
-        pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + box.beyond[1] / volume**2
-        before = state.bath[-1]
-        state.bath[-1] += h * (pressure - asked(box.pressure, state, 0))
-        state.books[WORK] -= 0.5 * box.inverse_mass * (state.bath[-1] ** 2 - before**2)
-        return OK
-
-    return kick_piston
+    if cursor[1] != 1 or room.known[0] == 0:
+        status = tally_bodies(terms, state, load, room, PRESSED)
+        if status != OK:
+            return status
+        cursor[1] = 1
+    volume = volume_of(state.cell)
+    virial = room.tally[0, 1] + room.tally[0, 5] + room.tally[0, 9]
+    pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + box.beyond[1] / volume**2
+    before = state.bath[-1]
+    state.bath[-1] += h * (pressure - asked(box.pressure, state, 0))
+    state.books[WORK] -= 0.5 * box.inverse_mass * (state.bath[-1] ** 2 - before**2)
+    return OK
 
 
 @implements(move_box)

@@ -124,10 +124,9 @@ class NoForce(NamedTuple):
     force: float = 0.0
 
 
-@implements(add_forces)
+@implements(add_forces, NoForce)
 def _add_no_force(term, state, load, tally):
-    if is_a(term, NoForce):
-        return lambda term, state, load, tally: OK
+    return OK
 
 
 #: What is asked of `load_now`: forces; forces with energies and virials; forces into the other load; forces with

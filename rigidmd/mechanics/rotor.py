@@ -111,10 +111,9 @@ def turn(rotor, species, rotation, angular_momentum_body, m, h):
     raise TypeError(f"{type(rotor).__name__} is not a rotor, or this was called outside compiled code")
 
 
-@implements(turn, inline=True)
+@implements(turn, NoRotor, inline=True)
 def _turn_points(rotor, species, rotation, angular_momentum_body, m, h):
-    if is_a(rotor, NoRotor):
-        return lambda rotor, species, rotation, angular_momentum_body, m, h: None
+    return None
 
 
 @implements(turn, inline=True)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import implements, kernel
 from rigidmd.core.state import ASK, OK, State
 from rigidmd.forces.terms import Setup, add_forces, power
 from rigidmd.mechanics.course import Course, value
@@ -68,22 +68,16 @@ class Asked(NamedTuple):
         self.fresh[0] = 1
 
 
-@implements(add_forces, inline=True)
+@implements(add_forces, SteadyForce, inline=True)
 def _add_steady_force(term, state, load, tally):
-    if not is_a(term, SteadyForce):
-        return None
-
-    def add_steady_force(term, state, load, tally):
-        for k in range(len(load.force)):
-            for i in range(3):
-                load.force[k, i] += term.force[i]
-        for k in range(len(load.torque_body)):
-            add_torque(term.point, state.rotation[k], term.force, load.torque_body[k])
-        if tally is not None:
-            tally[0] += steady_energy(term, state.position, state.rotation)
-        return OK
-
-    return add_steady_force
+    for k in range(len(load.force)):
+        for i in range(3):
+            load.force[k, i] += term.force[i]
+    for k in range(len(load.torque_body)):
+        add_torque(term.point, state.rotation[k], term.force, load.torque_body[k])
+    if tally is not None:
+        tally[0] += steady_energy(term, state.position, state.rotation)
+    return OK
 
 
 @kernel(inline=True)
@@ -121,43 +115,31 @@ def add_torque(point, rotation, force_lab, torque_body):
     torque_body[2] += point[0] * b - point[1] * a
 
 
-@implements(add_forces)
+@implements(add_forces, Driving)
 def _add_drive(term, state, load, tally):
-    if not is_a(term, Driving):
-        return None
-
-    def add_drive(term, state, load, tally):
-        now = state.time[0]
-        force = (value(term.force, now, 0), value(term.force, now, 1), value(term.force, now, 2))
-        torque = (value(term.torque, now, 0), value(term.torque, now, 1), value(term.torque, now, 2))
+    now = state.time[0]
+    force = (value(term.force, now, 0), value(term.force, now, 1), value(term.force, now, 2))
+    torque = (value(term.torque, now, 0), value(term.torque, now, 1), value(term.torque, now, 2))
+    for k in range(3):
+        term.force_lab[k] = force[k]
+        term.torque_body[k] = torque[k]
+    if len(state.rotation):
+        q = state.rotation[0]
         for k in range(3):
-            term.force_lab[k] = force[k]
-            term.torque_body[k] = torque[k]
-        if len(state.rotation):
-            q = state.rotation[0]
-            for k in range(3):
-                if term.follows_body:
-                    term.force_lab[k] = q[k, 0] * force[0] + q[k, 1] * force[1] + q[k, 2] * force[2]
-                else:
-                    term.torque_body[k] = along(q, torque, k)
-            add_torque(term.point, q, term.force_lab, term.torque_body)
-        return hand_over(term, load)
-
-    return add_drive
+            if term.follows_body:
+                term.force_lab[k] = q[k, 0] * force[0] + q[k, 1] * force[1] + q[k, 2] * force[2]
+            else:
+                term.torque_body[k] = along(q, torque, k)
+        add_torque(term.point, q, term.force_lab, term.torque_body)
+    return hand_over(term, load)
 
 
-@implements(add_forces)
+@implements(add_forces, Asked)
 def _add_told(term, state, load, tally):
-    if not is_a(term, Asked):
-        return None
-
-    def add_told(term, state, load, tally):
-        if term.fresh[0] == 0:
-            return ASK
-        term.fresh[0] = 0
-        return hand_over(term, load)
-
-    return add_told
+    if term.fresh[0] == 0:
+        return ASK
+    term.fresh[0] = 0
+    return hand_over(term, load)
 
 
 @kernel(inline=True)
@@ -172,18 +154,12 @@ def hand_over(term, load):
     return OK
 
 
-@implements(power)
+@implements(power, (Driving, Asked))
 def _drive_power(term, state, velocity, omega):
-    if not (is_a(term, Driving) or is_a(term, Asked)):
-        return None
-
-    def drive_power(term, state, velocity, omega):
-        total = 0.0
-        for k in range(3):
-            if len(state.position):
-                total += term.force_lab[k] * velocity[k]
-            if len(state.rotation):
-                total += term.torque_body[k] * omega[k]
-        return total
-
-    return drive_power
+    total = 0.0
+    for k in range(3):
+        if len(state.position):
+            total += term.force_lab[k] * velocity[k]
+        if len(state.rotation):
+            total += term.torque_body[k] * omega[k]
+    return total

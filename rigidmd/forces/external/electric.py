@@ -109,12 +109,6 @@ def _along_moment(term, state):
     return total
 
 
-@implements(energy_rate)
+@implements(energy_rate, OscillatingField)
 def _rate_of_oscillating_field(term, state):
-    if not is_a(term, OscillatingField):
-        return None
-
-    def rate_of_oscillating_field(term, state):
-        return term.frequency * sin(term.frequency * state.time[NOW] + term.phase) * _along_moment(term, state)
-
-    return rate_of_oscillating_field
+    return term.frequency * sin(term.frequency * state.time[NOW] + term.phase) * _along_moment(term, state)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces.terms import add_forces
 
@@ -24,18 +24,12 @@ class Weight(NamedTuple):
         return self.acceleration != 0
 
 
-@implements(add_forces)
+@implements(add_forces, Weight)
 def _add_weight(term, state, load, tally):
-    if not is_a(term, Weight):
-        return None
-
-    def add_weight(term, state, load, tally):
-        for m in range(len(state.position)):
-            mass = term.mass[term.species[m]]
-            for k in range(3):
-                load.force[m, k] += mass * term.acceleration[k]
-                if tally is not None:
-                    tally[0] -= mass * term.acceleration[k] * state.position[m, k]
-        return OK
-
-    return add_weight
+    for m in range(len(state.position)):
+        mass = term.mass[term.species[m]]
+        for k in range(3):
+            load.force[m, k] += mass * term.acceleration[k]
+            if tally is not None:
+                tally[0] -= mass * term.acceleration[k] * state.position[m, k]
+    return OK

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces.terms import add_forces
 
@@ -27,19 +27,13 @@ class Restraints(NamedTuple):
         return self.stiffness != 0
 
 
-@implements(add_forces)
+@implements(add_forces, Restraints)
 def _add_restraints(term, state, load, tally):
-    if not is_a(term, Restraints):
-        return None
-
-    def add_restraints(term, state, load, tally):
-        for r in range(len(term.molecule)):
-            m = term.molecule[r]
-            for k in range(3):
-                away = state.position[m, k] - term.place[r, k]
-                load.force[m, k] -= term.stiffness[k] * away
-                if tally is not None:
-                    tally[0] += 0.5 * term.stiffness[k] * away * away
-        return OK
-
-    return add_restraints
+    for r in range(len(term.molecule)):
+        m = term.molecule[r]
+        for k in range(3):
+            away = state.position[m, k] - term.place[r, k]
+            load.force[m, k] -= term.stiffness[k] * away
+            if tally is not None:
+                tally[0] += 0.5 * term.stiffness[k] * away * away
+    return OK

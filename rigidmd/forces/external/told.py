@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import implements
 from rigidmd.core.state import ASK, OK, TALLY_SIZE, State
 from rigidmd.forces.terms import Setup, add_forces
 
@@ -39,24 +39,18 @@ class AskedForces(NamedTuple):
         function(self, state)
 
 
-@implements(add_forces)
+@implements(add_forces, AskedForces)
 def _add_told(term, state, load, tally):
-    if not is_a(term, AskedForces):
-        return None
-
-    def add_told(term, state, load, tally):
-        if term.fresh[0] == 0:
-            return ASK
-        term.fresh[0] = 0
-        for m in range(len(term.force)):
-            for k in range(3):
-                load.force[m, k] += term.force[m, k]
-        for m in range(len(term.torque_body)):
-            for k in range(3):
-                load.torque_body[m, k] += term.torque_body[m, k]
-        if tally is not None:
-            for k in range(len(tally)):
-                tally[k] += term.tally[k]
-        return OK
-
-    return add_told
+    if term.fresh[0] == 0:
+        return ASK
+    term.fresh[0] = 0
+    for m in range(len(term.force)):
+        for k in range(3):
+            load.force[m, k] += term.force[m, k]
+    for m in range(len(term.torque_body)):
+        for k in range(3):
+            load.torque_body[m, k] += term.torque_body[m, k]
+    if tally is not None:
+        for k in range(len(tally)):
+            tally[k] += term.tally[k]
+    return OK

@@ -112,28 +112,22 @@ def _push_site(sites, state, load, m, i, axis, force):
     return push_off_centre
 
 
-@implements(add_forces)
+@implements(add_forces, LennardJonesWalls)
 def _add_lennard_jones_walls(term, state, load, tally):
-    if not is_a(term, LennardJonesWalls):
-        return None
-
-    def add_lennard_jones_walls(term, state, load, tally):
-        at_cutoff = _nine_three(term.sigma / term.cutoff)[0]
-        for m in range(len(state.position)):
-            for i in range(term.sites.first[m], term.sites.first[m + 1]):
-                x = place(term.sites, state, m, i)[term.axis]
-                for outward, distance in ((1.0, x - term.lower), (-1.0, term.upper - x)):
-                    if not distance > 0:
-                        return NOT_FINITE if isnan(distance) else BEHIND_WALL
-                    if distance < term.cutoff:
-                        energy, slope = _nine_three(term.sigma / distance)
-                        force = outward * term.epsilon * slope / distance
-                        push_site(term.sites, state, load, m, i, term.axis, force)
-                        if tally is not None:
-                            tally[0] += term.epsilon * (energy - at_cutoff)
-        return OK
-
-    return add_lennard_jones_walls
+    at_cutoff = _nine_three(term.sigma / term.cutoff)[0]
+    for m in range(len(state.position)):
+        for i in range(term.sites.first[m], term.sites.first[m + 1]):
+            x = place(term.sites, state, m, i)[term.axis]
+            for outward, distance in ((1.0, x - term.lower), (-1.0, term.upper - x)):
+                if not distance > 0:
+                    return NOT_FINITE if isnan(distance) else BEHIND_WALL
+                if distance < term.cutoff:
+                    energy, slope = _nine_three(term.sigma / distance)
+                    force = outward * term.epsilon * slope / distance
+                    push_site(term.sites, state, load, m, i, term.axis, force)
+                    if tally is not None:
+                        tally[0] += term.epsilon * (energy - at_cutoff)
+    return OK
 
 
 @kernel(inline=True)
@@ -144,21 +138,15 @@ def _nine_three(s):
     return 2 / 15 * s9 - s3, 6 / 5 * s9 - 3 * s3
 
 
-@implements(add_forces)
+@implements(add_forces, HarmonicWalls)
 def _add_harmonic_walls(term, state, load, tally):
-    if not is_a(term, HarmonicWalls):
-        return None
-
-    def add_harmonic_walls(term, state, load, tally):
-        for m in range(len(state.position)):
-            for i in range(term.sites.first[m], term.sites.first[m + 1]):
-                x = place(term.sites, state, m, i)[term.axis]
-                for outward, depth in ((1.0, term.lower - x), (-1.0, x - term.upper)):
-                    if depth > 0:
-                        force = outward * term.stiffness * depth
-                        push_site(term.sites, state, load, m, i, term.axis, force)
-                        if tally is not None:
-                            tally[0] += 0.5 * term.stiffness * depth * depth
-        return OK
-
-    return add_harmonic_walls
+    for m in range(len(state.position)):
+        for i in range(term.sites.first[m], term.sites.first[m + 1]):
+            x = place(term.sites, state, m, i)[term.axis]
+            for outward, depth in ((1.0, term.lower - x), (-1.0, x - term.upper)):
+                if depth > 0:
+                    force = outward * term.stiffness * depth
+                    push_site(term.sites, state, load, m, i, term.axis, force)
+                    if tally is not None:
+                        tally[0] += 0.5 * term.stiffness * depth * depth
+    return OK

@@ -93,17 +93,11 @@ def radial(law, r2):
     return ended(law.shape, law.end, law.switched, r2, inverse, u, w)
 
 
-@implements(pairs.pair, inline=True)
+@implements(pairs.pair, ReactionField, inline=True)
 def _pair(law, i, j, r2):
-    if not is_a(law, ReactionField):
-        return None
-
-    def pair(law, i, j, r2):
-        qq = law.charge[i] * load(law.charge, j)
-        u, w = radial(law, r2)
-        return qq * u, qq * w
-
-    return pair
+    qq = law.charge[i] * load(law.charge, j)
+    u, w = radial(law, r2)
+    return qq * u, qq * w
 
 
 @implements(pairs.arrange)

@@ -187,13 +187,7 @@ class Tabulated(NamedTuple):
     uses_root = False
 
 
-@implements(of_distance, inline=True)
+@implements(of_distance, Tabulated, inline=True)
 def _of_table(formula, shared, r2, inverse1, inverse2):
-    if not is_a(formula, Tabulated):
-        return None
-
-    def of_table(formula, shared, r2, inverse1, inverse2):
-        u, slope = cubic_at(shared.coefficients, (r2 - shared.first) * shared.per_step)
-        return formula.scale * u, formula.scale * (-2.0 * shared.per_step) * slope
-
-    return of_table
+    u, slope = cubic_at(shared.coefficients, (r2 - shared.first) * shared.per_step)
+    return formula.scale * u, formula.scale * (-2.0 * shared.per_step) * slope

@@ -113,7 +113,7 @@ def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, fl
 
 
 def _cut(series: np.ndarray, error: float, kind: np.dtype, step: int) -> np.ndarray:
-    """Coefficients of powers of t for a Chebyshev series, truncated at the given error to a multiple of `step` terms."""
+    """Coefficients of powers of t for a Chebyshev series, truncated at an error to a multiple of `step` terms."""
     left = np.cumsum(np.abs(series[::-1]))[::-1]
     needed = int(np.sum(left > max(error, FIT_ERROR[kind] * left[0])))
     return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // step) * step])

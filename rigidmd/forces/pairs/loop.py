@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from rigidmd.compile import Code, call, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import Code, call, call_blocks, implements, kernel, opened, packed, task
 from rigidmd.compile.lanes import (
     add_totals,
     align_stack,
@@ -207,34 +207,28 @@ def into_slots(of_sites, in_slots, order):
         in_slots[slot] = of_sites[i]
 
 
-@implements(terms.add_forces, counted=False)
+@implements(terms.add_forces, PairWorkspace, counted=False)
 def _add_pair_forces(term, state, load, tally):
-    if not is_a(term, PairWorkspace):
-        return None
-
-    def add_pair_forces(term, state, load, tally):
-        code, pairs, sums = term.code, term.pairs, term.sums
-        call(code, "find", packed((term.list_code, term.law, term.arranged, term.sites, pairs, sums, state)))
-        if pairs.counters[STATUS] != OK:
-            return pairs.counters[STATUS]
-        parcel = packed((term.arranged, pairs, sums))
-        blocks = len(sums.tallies)
-        if tally is None:
-            call_blocks(code, "forces", parcel, blocks)
-            call_blocks(code, "gather", parcel, blocks)
-        else:
-            _call_tallied(term.with_energies, code, parcel, blocks)
-            call_blocks(code, "gather_and_count", parcel, blocks)
-        force = InSlots(sums.own, pairs.clusters.slot)
-        call_blocks(code, "load", packed((term.sites, state, load, force)), blocks_of(len(state.position)))
-        if tally is not None:
-            for block in range(blocks):
-                for k in range(len(tally)):
-                    tally[k] += sums.tallies[block, k]
-            virial_of_molecules(term.sites, code, state, force, sums.virial, tally)
-        return OK
-
-    return add_pair_forces
+    code, pairs, sums = term.code, term.pairs, term.sums
+    call(code, "find", packed((term.list_code, term.law, term.arranged, term.sites, pairs, sums, state)))
+    if pairs.counters[STATUS] != OK:
+        return pairs.counters[STATUS]
+    parcel = packed((term.arranged, pairs, sums))
+    blocks = len(sums.tallies)
+    if tally is None:
+        call_blocks(code, "forces", parcel, blocks)
+        call_blocks(code, "gather", parcel, blocks)
+    else:
+        _call_tallied(term.with_energies, code, parcel, blocks)
+        call_blocks(code, "gather_and_count", parcel, blocks)
+    force = InSlots(sums.own, pairs.clusters.slot)
+    call_blocks(code, "load", packed((term.sites, state, load, force)), blocks_of(len(state.position)))
+    if tally is not None:
+        for block in range(blocks):
+            for k in range(len(tally)):
+                tally[k] += sums.tallies[block, k]
+        virial_of_molecules(term.sites, code, state, force, sums.virial, tally)
+    return OK
 
 
 def _call_tallied(with_energies, code, parcel, blocks):

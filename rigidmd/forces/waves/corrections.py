@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces import terms
 from rigidmd.forces.pairs.sites import BodySites, CentralSites, load_from_sites, place_sites
@@ -25,19 +25,13 @@ def background(square: float, alpha: float) -> Background:
     return Background(-pi / (2 * alpha**2) * square)
 
 
-@implements(terms.add_forces)
+@implements(terms.add_forces, Background)
 def _add_background(term, state, load, tally):
-    if not is_a(term, Background):
-        return None
-
-    def add_background(term, state, load, tally):
-        if tally is not None:
-            energy = term.strength / volume_of(state.cell)
-            for k in (0, 1, 5, 9):
-                tally[k] += energy
-        return OK
-
-    return add_background
+    if tally is not None:
+        energy = term.strength / volume_of(state.cell)
+        for k in (0, 1, 5, 9):
+            tally[k] += energy
+    return OK
 
 
 class SurfaceDipole(NamedTuple):
@@ -67,35 +61,29 @@ def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | C
     return SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
 
 
-@implements(terms.add_forces)
+@implements(terms.add_forces, SurfaceWorkspace)
 def _add_surface_dipole(term, state, load, tally):
-    if not is_a(term, SurfaceWorkspace):
-        return None
-
-    def add_surface_dipole(term, state, load, tally):
-        place_sites(term.sites, state, term.position)
-        share = term.strength / volume_of(state.cell)
-        energy = 0.0
-        for k in range(3):
-            dipole = 0.0
-            for i in range(len(term.charge)):
-                dipole += term.charge[i] * term.position[i, k]
-            for i in range(len(term.charge)):
-                term.site_force[i, k] = -2 * share * term.charge[i] * dipole
-            energy += share * dipole * dipole
-        if tally is not None:
-            # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to 1/V
-            for k in (0, 1, 5, 9):
-                tally[k] += energy
-            for i in range(len(term.charge)):
-                for row in range(3):
-                    for k in range(3):
-                        m = term.sites.molecule[i]
-                        tally[1 + 3 * row + k] += term.site_force[i, row] * state.position[m, k]
-        load_from_sites(term.sites, state, load, term.site_force)
-        return OK
-
-    return add_surface_dipole
+    place_sites(term.sites, state, term.position)
+    share = term.strength / volume_of(state.cell)
+    energy = 0.0
+    for k in range(3):
+        dipole = 0.0
+        for i in range(len(term.charge)):
+            dipole += term.charge[i] * term.position[i, k]
+        for i in range(len(term.charge)):
+            term.site_force[i, k] = -2 * share * term.charge[i] * dipole
+        energy += share * dipole * dipole
+    if tally is not None:
+        # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to 1/V
+        for k in (0, 1, 5, 9):
+            tally[k] += energy
+        for i in range(len(term.charge)):
+            for row in range(3):
+                for k in range(3):
+                    m = term.sites.molecule[i]
+                    tally[1 + 3 * row + k] += term.site_force[i, row] * state.position[m, k]
+    load_from_sites(term.sites, state, load, term.site_force)
+    return OK
 
 
 def self_energy(charge: np.ndarray, alpha: float) -> float:

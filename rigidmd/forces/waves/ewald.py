@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Code, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile import Code, call_blocks, implements, kernel, opened, packed, task
 from rigidmd.compile.lanes import fill, lane_count, load, store, total, width_of
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
@@ -126,32 +126,26 @@ def invert_cell(cell, reciprocal):
     return volume
 
 
-@implements(terms.add_forces, counted=False)
+@implements(terms.add_forces, EwaldWorkspace, counted=False)
 def _add_ewald_sum(term, state, load, tally):
-    if not is_a(term, EwaldWorkspace):
-        return None
-
-    def add_ewald_sum(term, state, load, tally):
-        own = term.sums
-        placed, molecules = packed((term.sites, state, own.position)), blocks_of(len(state.position))
-        call_blocks(term.code, "place", placed, molecules)
-        if follow_cell(state.cell, own.cell):
-            volume = abs(invert_cell(own.cell, own.reciprocal))
-            _set_strengths(term.waves, own, term.alpha, volume)
-        parcel = packed((term.alpha, term.waves, own))
-        blocks = len(own.tallies)
-        call_blocks(term.code, "turn", parcel, blocks)
-        call_blocks(term.code, "sum", parcel, blocks)
-        call_blocks(term.code, "push", parcel, blocks)
-        if tally is not None:
-            for block in range(blocks):
-                for k in range(len(tally)):
-                    tally[k] += own.tallies[block, k]
-            virial_of_molecules(term.sites, term.code, state, own.force, own.virial, tally)
-        call_blocks(term.code, "load", packed((term.sites, state, load, own.force)), molecules)
-        return OK
-
-    return add_ewald_sum
+    own = term.sums
+    placed, molecules = packed((term.sites, state, own.position)), blocks_of(len(state.position))
+    call_blocks(term.code, "place", placed, molecules)
+    if follow_cell(state.cell, own.cell):
+        volume = abs(invert_cell(own.cell, own.reciprocal))
+        _set_strengths(term.waves, own, term.alpha, volume)
+    parcel = packed((term.alpha, term.waves, own))
+    blocks = len(own.tallies)
+    call_blocks(term.code, "turn", parcel, blocks)
+    call_blocks(term.code, "sum", parcel, blocks)
+    call_blocks(term.code, "push", parcel, blocks)
+    if tally is not None:
+        for block in range(blocks):
+            for k in range(len(tally)):
+                tally[k] += own.tallies[block, k]
+        virial_of_molecules(term.sites, term.code, state, own.force, own.virial, tally)
+    call_blocks(term.code, "load", packed((term.sites, state, load, own.force)), molecules)
+    return OK
 
 
 @kernel

@@ -171,41 +171,35 @@ class PmeWorkspace(NamedTuple):
         return self._replace(code=Code(**found, **moved))
 
 
-@implements(terms.add_forces, counted=False)
+@implements(terms.add_forces, PmeWorkspace, counted=False)
 def _add_pme(term, state, load, tally):
-    if not is_a(term, PmeWorkspace):
-        return None
-
-    def add_pme(term, state, load, tally):
-        code, mesh = term.code, term.mesh
-        blocks = len(mesh.tallies)
-        parcel = packed((term.alpha, term.charge, term.spline, mesh))
-        placed, molecules = packed((term.sites, state, mesh.position)), blocks_of(len(state.position))
-        call_blocks(code, "place", placed, molecules)
-        if follow_cell(state.cell, mesh.cell):
-            invert_cell(mesh.cell, mesh.reciprocal)
-            call_blocks(code, "weigh", parcel, blocks)
-        call_blocks(code, "scale", parcel, blocks)
+    code, mesh = term.code, term.mesh
+    blocks = len(mesh.tallies)
+    parcel = packed((term.alpha, term.charge, term.spline, mesh))
+    placed, molecules = packed((term.sites, state, mesh.position)), blocks_of(len(state.position))
+    call_blocks(code, "place", placed, molecules)
+    if follow_cell(state.cell, mesh.cell):
+        invert_cell(mesh.cell, mesh.reciprocal)
+        call_blocks(code, "weigh", parcel, blocks)
+    call_blocks(code, "scale", parcel, blocks)
+    for block in range(blocks):
+        if mesh.lost[block]:
+            return NOT_FINITE
+    call(code, "sort", parcel)
+    call_blocks(code, "spread", parcel, blocks)
+    if tally is None:
+        call_blocks(code, "convolve", parcel, blocks)
+    else:
+        call_blocks(code, "convolve_and_count", parcel, blocks)
+    call_blocks(code, "back", parcel, blocks)
+    call_blocks(code, "pull", parcel, blocks)
+    if tally is not None:
         for block in range(blocks):
-            if mesh.lost[block]:
-                return NOT_FINITE
-        call(code, "sort", parcel)
-        call_blocks(code, "spread", parcel, blocks)
-        if tally is None:
-            call_blocks(code, "convolve", parcel, blocks)
-        else:
-            call_blocks(code, "convolve_and_count", parcel, blocks)
-        call_blocks(code, "back", parcel, blocks)
-        call_blocks(code, "pull", parcel, blocks)
-        if tally is not None:
-            for block in range(blocks):
-                for k in range(len(tally)):
-                    tally[k] += mesh.tallies[block, k]
-            virial_of_molecules(term.sites, code, state, mesh.force, mesh.virial, tally)
-        call_blocks(code, "load", packed((term.sites, state, load, mesh.force)), molecules)
-        return OK
-
-    return add_pme
+            for k in range(len(tally)):
+                tally[k] += mesh.tallies[block, k]
+        virial_of_molecules(term.sites, code, state, mesh.force, mesh.virial, tally)
+    call_blocks(code, "load", packed((term.sites, state, load, mesh.force)), molecules)
+    return OK
 
 
 @task(counted=False)
