@@ -356,7 +356,7 @@ HOMES = {
     "study.sweep.processes": "Pool",
     "study.sweep.running": "Waiting code_kind run_points",
     "study.sweep.slurm": "in_hours in_ranges write_script",
-    "study.sweep.table": "Row",
+    "study.sweep.table": "Row measured",
     "study.verify": "verify",
 }
 

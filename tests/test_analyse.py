@@ -147,6 +147,21 @@ def test_wrapped_paths_become_continuous(mixture):
         rebuilt(mixture, far, None, cells[:4], True)
 
 
+def test_paths_are_unwrapped_by_the_cell_of_each_frame(mixture):
+    """Molecules that move with a cell which grows by a half, and are wrapped into it, go through no wall."""
+    (state,) = states(mixture, 1)
+    state.position[:] += 5 * mixture.state.cell[0]
+    moved = [
+        state._replace(position=growth * state.position, cell=growth * state.cell) for growth in np.linspace(1, 1.5, 9)
+    ]
+    cells = np.array([now.cell for now in moved])
+    sites = np.array([mixture.site_positions(now, True) for now in moved])
+    found, _ = rebuilt(mixture, sites, None, cells, wrapped=True)
+    inside = np.einsum("fni,fij->fnj", found.position, np.linalg.inv(cells))
+    assert np.abs(inside - inside[0]).max() < 1e-12
+    assert np.ptp(found.position, axis=0).max() > 10.0
+
+
 def test_torn_molecules_are_found(mixture):
     (state,) = states(mixture, 1)
     sites = np.array([mixture.site_positions(state)] * 2)
@@ -577,6 +592,27 @@ def test_the_error_of_a_dielectric_constant_is_honest():
         found.append((told.value, told.error))
     values, errors = np.array(found, float).T
     assert 0.6 < values.std() / np.sqrt(np.mean(errors**2)) < 1.6
+
+
+def test_the_error_of_a_dielectric_constant_in_a_reaction_field_follows_its_slope():
+    """By differences of the formula, from the error that the same dipoles have with tin foil, which is that of y."""
+    around, found = 4.0, {}
+    fields = {"tin foil": inf, "field": around}
+    for name, permittivity in fields.items():
+        forces = {"cutoff_A": 7.0, "electrostatics": "reaction_field", "reaction_field_permittivity": permittivity}
+        system = build(small_scene({"spce": 30}, 21.0, forces=forces))
+        Q, _ = dipoles(np.random.default_rng(4), system, 4000, 2.0, 0.5)
+        found[name] = dielectric(history(system, 0.5 * np.arange(4000), None, np.eye(3) * 21.0, Q)).value()
+
+    def epsilon(y: float) -> float:
+        """The root of (epsilon - 1)(2 around + 1) = y (2 around + epsilon)."""
+        return (2 * around + 1 + 2 * around * y) / (2 * around + 1 - y)
+
+    y, doubt = found["tin foil"].value - 1, found["tin foil"].error
+    assert found["field"].value == pytest.approx(epsilon(y), rel=1e-9)
+    slope = (epsilon(y + 1e-4) - epsilon(y - 1e-4)) / 2e-4
+    assert slope > 1.5
+    assert found["field"].error == pytest.approx(slope * doubt, rel=1e-6)
 
 
 def test_dipoles_without_a_dielectric_constant():

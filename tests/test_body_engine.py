@@ -276,6 +276,10 @@ def test_wheels_drives_and_friction_in_a_turning_accelerated_frame():
         gaps.append(max(np.abs(found - q).max(), np.abs(spin - w).max()))
         assert np.abs(results["energy_error"]).max() < 1e-4
     assert not np.array_equal(results.system.axes, np.eye(3))  # the centre of mass is off every axis
+    wheels = np.stack([results[f"h_body_{k}"][[0, -1]] for k in (1, 2, 3)], axis=1)
+    slant = np.array([0.0, 1.0, 2.0]) / 5**0.5
+    # the motors' torques over time: 0.15 up to the peak, as much down from it and beyond zero, 0.1 beyond their table
+    assert wheels == pytest.approx(np.array([1.5 * slant, 1.55 * slant + [0.21, 0.0, 0.0]]), abs=1e-12)
     assert gaps[1] < 5e-5
     assert np.log2(gaps[0] / gaps[1]) == pytest.approx(2, abs=0.1)
 

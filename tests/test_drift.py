@@ -89,6 +89,18 @@ def test_what_is_too_short_has_no_error(values):
     assert mean([1.0, np.nan] * 10) == (None, None)
 
 
+@pytest.mark.parametrize("levels", [(-2.0, -1.0, 0.0, 1.0, 2.0), (1.0, -1.0, 0.5, 0.5, -1.0)])
+def test_a_slow_part_below_fast_noise_has_the_error_of_its_batches(levels):
+    """One level a fifth of the samples: the variance of the mean of five, twice what neighbours share, 3/2 of that."""
+    fast = 8.0 * np.random.default_rng(3).standard_normal((5, 1000))
+    values = (fast - fast.mean(axis=1, keepdims=True) + np.array(levels)[:, None]).ravel()
+    offset = np.array(levels) - np.mean(levels)
+    shared = offset[1:] @ offset[:-1] / (offset @ offset) + 1 / 5
+    variance = offset @ offset / 4 / 5 * (1 + 2 * min(max(shared, 0.0), 0.5))
+    lost = 1 - inefficiency(values - values.mean()) / len(values)
+    assert mean(values) == pytest.approx((np.mean(levels), np.sqrt(1.5 * variance / lost)), rel=1e-9, abs=1e-12)
+
+
 def test_few_independent_values_have_the_error_of_student():
     values = np.random.default_rng(0).standard_normal((20_000, 4))
     for count in (2, 3, 4):

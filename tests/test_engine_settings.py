@@ -8,6 +8,7 @@ frequency, in fs and atm; OpenMM has frictions and frequencies in 1/ps, and pres
 
 from math import pi
 
+import numpy as np
 import pytest
 from support import build, lammps_files, portrait, small_scene, write_gromacs, write_openmm
 
@@ -88,6 +89,21 @@ def test_gromacs_has_lengths_in_nm(tmp_path):
     forces = {"cutoff_A": 5.0, "truncation": "switch", "switch_start_A": 4.2, "electrostatics": "none"}
     found = settings(tmp_path, NVT, counts={"argon": 20}, forces=forces)
     assert [float(found[key]) for key in ("rlist", "rvdw", "rcoulomb", "rvdw-switch")] == [0.5, 0.5, 0.5, 0.42]
+
+
+def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
+    """Of a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
+    own = drawn(NVT, counts={"tip5p": 20})
+    write_gromacs(tmp_path, own, own.system.state)
+    block = (tmp_path / "topol.top").read_text().split("[ virtual_sites3 ]\n")[1].split("\n\n")[0]
+    places = own.system.species[0].positions_body / 10  # nm
+    rows = [line.split() for line in block.splitlines()]
+    assert [row[4] for row in rows] == ["4", "4"]
+    for row in rows:
+        site, i, j, k = (places[int(number) - 1] for number in row[:4])
+        a, b, c = map(float, row[5:])
+        assert abs(c) > 1
+        assert i + a * (j - i) + b * (k - i) + c * np.cross(j - i, k - i) == pytest.approx(site, abs=1e-9)
 
 
 # LAMMPS
@@ -209,6 +225,21 @@ def test_openmm_has_the_pressure_and_the_temperature_of_its_barostat(thermostat,
     assert in_units(barostat.getDefaultPressure(), "bar") == pytest.approx(250.0)
     assert in_units(barostat.getDefaultTemperature(), "kelvin") == 310.0
     assert barostat.getFrequency() == 25  # steps of 2 fs
+
+
+def test_openmm_has_the_energy_of_the_tail_at_its_volume(tmp_path):
+    """A formula of the volume v in nm³ that gives kJ/mol."""
+    mm = pytest.importorskip("openmm")
+    own = drawn(NVT | LANGEVIN, tail=True, engine={"name": "openmm"})
+    write_openmm(tmp_path, own, own.system.state)
+    whole = mm.XmlSerializer.deserialize((tmp_path / "system.xml").read_text())
+    (tail,) = [force for force in whole.getForces() if isinstance(force, mm.CustomVolumeForce)]
+    strength, volume = tail.getEnergyFunction().split("/")
+    assert volume == "v"
+    for edge in (13.0, 14.0):  # Å
+        expected = own.system.tail.energy(edge**3) / 100  # u Å²/ps² in kJ/mol
+        assert expected < -0.1
+        assert float(strength) / (edge / 10) ** 3 == pytest.approx(expected, rel=1e-9)
 
 
 def test_openmm_has_an_integrator_for_each_stage(tmp_path):

@@ -595,6 +595,20 @@ def test_frozen_molecules_do_not_act_on_one_another():
     assert pressures["pme"] == pytest.approx(pressures["ewald"], abs=16 * 3e-6 * abs(whole.self))
 
 
+def test_frozen_molecules_do_not_press_on_one_another():
+    """Of what sums over waves and a surface have, with the virial of molecules of several sites."""
+    frozen = {"model": "spce", "name": "ice", "count": 5, "frozen": True}
+    forces = TIGHT_EWALD | {"ewald_surface_permittivity": 3.0}
+    system, other = (
+        build(small_scene({}, 15.0, molecules=molecules, forces=forces))
+        for molecules in ([{"model": "spce", "count": 4}, frozen], [{"model": "spce", "count": 5}])
+    )
+    alone = other.state._replace(position=system.state.position[4:], rotation=system.state.rotation[4:])
+    _, tallies = other.engine().evaluate(alone)
+    virial = tallies["coulomb_reciprocal"].virial + tallies["coulomb_surface"].virial
+    assert system.constant_pressure == pytest.approx(-virial.trace() / (3 * 15.0**3), rel=1e-9)
+
+
 def test_waves_without_compiled_code():
     system, engine, state = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
     engine.evaluate(state)
@@ -732,6 +746,7 @@ def test_forces_are_as_accurate_as_asked_for(method, asked):
     system, _, state = built({"spce": 125}, 15.52, 7, forces=forces)
     found = accuracy(system, state)
     assert 0.5 * asked < found.measured / COULOMB < 2 * asked
+    assert 0.7 * asked < system.force_error / COULOMB < 1.03 * asked  # of both parts of the sum together
     assert found.estimated == pytest.approx(found.measured, rel=0.6)
     grown = state._replace(cell=1.1 * state.cell, position=1.1 * state.position)
     assert estimated_error(system, grown.cell) == pytest.approx(accuracy(system, grown).measured, rel=0.6)

@@ -141,6 +141,9 @@ def test_the_profile_of_a_mixture_is_that_of_its_rotated_sites(axis):
         slice_volume = np.mean(np.linalg.det(found.cell)) / bins
         expected = total / len(found) / slice_volume / GRAM_PER_CM3
         assert seen[f"density {name} (g/cm3)"] == pytest.approx(expected, rel=1e-9)
+    across = np.cross(found.cell[:, k - 2], found.cell[:, k - 1])  # of the two other edges
+    height = np.mean(np.linalg.det(found.cell) / np.linalg.norm(across, axis=1))
+    assert seen[f"{axis} (A)"] == pytest.approx((np.arange(bins) + 0.5) * height / bins, rel=1e-9)
 
 
 @pytest.mark.parametrize(("distance", "angle"), [(3.5, 30.0), (5.0, 60.0)])

@@ -38,6 +38,7 @@ from support import precision_table as table_text
 
 from rigidmd.cli import main
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -584,6 +585,18 @@ def test_what_is_said_of_averages_follows_from_them(oscillators):
     assert "temperatures are held against 300 K" in said
     assert coarse.forces_per_ps == pytest.approx(1e3 / coarse.timestep)
     assert coarse.seconds_per_ns > 0
+
+
+def test_averages_leave_out_what_comes_before_equilibrium():
+    """A fifth of the time sampled comes before it: the means are those of the same run without its first part."""
+    (run,) = averages(springs(), ["baoab"], [10.0], sample=2.0).runs
+    again = springs(integrator="baoab", timestep_fs=10.0, duration_ps=2.4)
+    looked = again.output.model_copy(update={"log_interval_ps": 0.02})
+    results = Simulation(again.model_copy(update={"output": looked})).run()
+    late = results["time"] > 0.4
+    assert (late.sum(), len(late)) == (100, 121)
+    for name, column, share in (("U", "potential", 64), ("T_trans", "temperature_translation", 1)):
+        assert run.averages[name][0] == pytest.approx(results[column][late].mean() / share, rel=1e-9)
 
 
 def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypatch):

@@ -414,8 +414,8 @@ def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
     )
 
 
-def noted(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made):
-    """Notes of the summary of made-up samples of one stage: values (n,) of columns; others are still or noise."""
+def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made):
+    """The summary of made-up samples of one stage: values (n,) of columns; others are still or noise."""
     rng, n = np.random.default_rng(seed), len(next(iter(made.values())))
     given = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.05 * n, "timestep_fs": 4.0} | stage
     scene = small_scene(
@@ -431,8 +431,12 @@ def noted(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made)
         own = {name: float(values[k]) for name, values in made.items()}
         row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
         rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality": 0.0} | own))
-    summary = summarise(system, rows, state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
-    return [note for note in summary["notes"] if "stages.0" in note or "together" in note]
+    return summarise(system, rows, state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
+
+
+def noted(*given, **made):
+    """Notes on the stage, or on a common drift, of the summary of made-up samples."""
+    return [note for note in summarised(*given, **made)["notes"] if "stages.0" in note or "together" in note]
 
 
 KEPT = {"thermostat": "velocity_rescaling"}
@@ -488,6 +492,17 @@ def test_temperatures_of_other_integrators_are_judged_at_the_steps():
     warm = {"temperature_translation_unbiased": 310 + noise, "temperature_rotation_unbiased": np.full(200, np.nan)}
     (told,) = noted(KEPT, {"argon": 40}, **points | warm)
     assert "10 K too hot" in told and "nan" not in told
+
+
+@pytest.mark.parametrize(("thermostat", "freedom"), [("langevin", 6 * 40), ("velocity_rescaling", 6 * 40 - 3)])
+def test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage(thermostat, freedom):
+    """A thermostat that changes the total momentum has three more."""
+    time = 0.05 * np.arange(400)
+    summary = summarised({"thermostat": thermostat}, time=time, drift=0.7 * time, temperature=np.full(400, 300.0))
+    (stage,) = summary["stages"]
+    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(700 / 40)
+    expected = 700 * KJ_PER_MOL / (BOLTZMANN * 300 * freedom)
+    assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +28,12 @@ from support import (
     code_kind,
     in_hours,
     in_ranges,
+    measured,
     over_replicas,
     parse_axis,
     point_name,
     read_manifest,
+    read_record,
     run_points,
     short_keys,
     sweeping,
@@ -217,6 +220,18 @@ def test_a_point_has_the_bits_of_a_run(finished, argon, tmp_path, capsys):
     for command in (["report"], ["analyse", "--only", "rdf"]):
         copy = shutil.copytree(point, tmp_path / command[0])
         assert cli.main([*command, str(copy)]) == 0
+
+
+def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
+    """Of a longer run, whose energies forget themselves from one sample to the next."""
+    record = read_record(finished / "temperature_K=90_seed=1")
+    columns = {name: np.resize(values, 40) for name, values in record.columns.items()}
+    columns["time"] = np.linspace(0.0, 0.5, 40)
+    columns["potential"] = np.random.default_rng(1).standard_normal(40) - 5.0
+    found = measured(replace(record, columns=columns))
+    energy, error = found["Potential Energy (kJ/mole)"]
+    assert error > 0.1
+    assert found["Potential Energy per molecule (kJ/mole)"] == pytest.approx((energy / 20, error / 20))
 
 
 def test_what_has_finished_is_not_run_again(copied, argon, capsys):

@@ -287,6 +287,23 @@ def test_a_mixture_starts_at_rest_and_at_its_temperature():
     assert spin.sum() == pytest.approx(freedom.rotation * 300 * KELVIN)
 
 
+def test_a_start_has_a_thermal_energy_about_each_axis():
+    """<L²/I> = kT about each of three unlike axes and about both of a line; <m v²> = kT of each species along each."""
+    system = system_of(NVT, counts={"spce": 40, "nitrogen": 50, "argon": 30}, box={"lengths_A": 40.0})
+    kind, inertia = system.model.species, system.model.inertia[system.model.species]
+    over = np.divide(1.0, inertia, out=np.zeros_like(inertia), where=inertia > 0)
+    rng, turning, moving = np.random.default_rng(8), [], []
+    for _ in range(200):
+        state = system.state.copy()
+        draw_momenta(system.model, state, 300.0, rng)
+        turning.append(state.angular_momentum_body**2 * over)
+        moving.append(state.velocity**2 * system.model.mass[kind][:, None])
+    for k, axes in enumerate(([1, 1, 1], [0, 1, 1], [0, 0, 0])):  # spce, nitrogen, argon: 6000 values at least
+        seen = [np.mean(values, axis=0)[kind == k].mean(axis=0) / (300 * KELVIN) for values in (turning, moving)]
+        assert seen[0] == pytest.approx(np.array(axes), abs=0.07)  # four times sqrt(2/6000)
+        assert seen[1] == pytest.approx(np.ones(3), abs=0.07)
+
+
 def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     """`remove_momentum` keeps all relative velocities, and returns the energy that it takes."""
     system = system_of(NVT)
