@@ -54,15 +54,6 @@ def copy(water, tmp_path):
     return Path(shutil.copytree(water, tmp_path / "run"))
 
 
-@pytest.fixture
-def own():
-    """Forgets analyses that a test defines."""
-    before = dict(registry.KNOWN)
-    yield
-    registry.KNOWN.clear()
-    registry.KNOWN.update(before)
-
-
 def said(capsys, *arguments, code=2):
     """What the command says of it: one sentence, without a traceback."""
     assert cli.main(["analyse", *map(str, arguments)]) == code
@@ -374,7 +365,7 @@ def test_a_damaged_table_is_told_and_kept(text, copy, capsys):
     assert path.read_text(encoding="latin-1") == text and names(copy) == before
 
 
-def test_files_of_others_are_not_overwritten(copy, capsys, own):
+def test_files_of_others_are_not_overwritten(copy, capsys):
     (copy / "msd.csv").write_text("mine\n")
     assert f"{copy / 'msd.csv'} is there and no file of an analysis" in said(
         capsys, copy, "--only", "msd", "--from", "0.02ps"
@@ -422,7 +413,7 @@ def spins(frames):
 """
 
 
-def test_a_function_of_ones_own_is_found_by_name(copy, capsys, own):
+def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
     (copy.parent / "own.py").write_text(OWN)
     trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
     assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
@@ -436,7 +427,7 @@ def test_a_function_of_ones_own_is_found_by_name(copy, capsys, own):
     assert cli.main(["analyse", str(copy), *trust, "--only", "height"]) == 0  # the same function once more
 
 
-def test_the_mean_of_ones_own_has_an_honest_error(own):
+def test_the_mean_of_ones_own_has_an_honest_error():
     from support import history, noise_with_memory, system_of
 
     system, found = system_of({"argon": 2}), []
@@ -471,7 +462,7 @@ def lambda_of(series):
         ("raise SystemExit(0)", "raised SystemExit"),
     ],
 )  # fmt: skip
-def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys, own):
+def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys):
     before = names(water)
     (tmp_path / "own.py").write_text(f"import rigidmd\n@rigidmd.analysis\ndef mine(frames):\n    {body}\n")
     assert words in said(capsys, water, "--trust", tmp_path / "own.py", "--only", "mine", "--from", "0.02ps")
@@ -489,7 +480,7 @@ def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, caps
         ("import rigidmd\nrigidmd.analysis(lambda frames: frames.time)", "an analysis has the name of its function"),
     ],
 )  # fmt: skip
-def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys, own):
+def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
     (tmp_path / "own.py").write_text(text)
     assert words in said(capsys, water, "--trust", tmp_path / "own.py")
 
