@@ -16,15 +16,38 @@ import numpy as np
 import pytest
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
 from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher, cpu_target
 from support import ROOT
 
 from rigidmd.compile import Bound, Code, Laid, call, call_blocks, kernel, numba_private, opened, packed, task
 from rigidmd.compile.cache import cache_folder
-from rigidmd.compile.numba_private import Index, Inner, Kernel, callback
+from rigidmd.compile.numba_private import Index, Inner, Kernel, LinkedCode, callback
 
 # --- what Numba does not promise -------------------------------------------------------------------------------------
+
+
+#: A kernel that allocates, and two that call it.
+LATER = """
+import numpy as np
+from rigidmd.compile import kernel
+
+
+@kernel
+def inner(x):
+    return np.add(x, x)
+
+
+@kernel(outer=True)
+def twice(x):
+    return inner(x)
+
+
+@kernel(outer=True)
+def four_times(x):
+    return inner(inner(x))
+"""
 
 
 @kernel(outer=True)
@@ -103,6 +126,39 @@ def test_references_are_not_counted_where_it_is_asked_for(counted):
 
     assert after(np.arange(3.0), 2) == 2.0
     assert ("call void @NRT_" in llvm_of(after)) == counted
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_an_inner_kernel_has_no_machine_code_and_is_optimised_in_its_caller():
+    @kernel
+    def inner(x):
+        return x + x
+
+    @kernel(outer=True)
+    def outer(x):
+        return inner(x) + 1.0
+
+    assert outer(2.0) == 5.0
+    (linked,) = inner.overloads.values()
+    (whole,) = outer.overloads.values()
+    assert type(linked.library) is LinkedCode and type(whole.library) is JITCodeLibrary
+    assert linked.library.get_pointer_to_function(linked.fndesc.llvm_func_name) == 0
+    assert whole.library.get_pointer_to_function(whole.fndesc.llvm_cpython_wrapper_name) != 0
+    assert "alloca" not in linked.library.get_llvm_str()  # made smaller before it is linked
+    assert f"call i32 @{linked.fndesc.llvm_func_name}" not in llvm_of(outer)  # inlined
+
+
+def test_an_inner_kernel_is_kept_and_linked_into_other_kernels_later(tmp_path):
+    (tmp_path / "own.py").write_text(LATER)
+    environment = os.environ | {
+        "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+    }  # fmt: skip
+    for name, printed in (("twice", "[2. 4.] 0"), ("four_times", "[4. 8.] 1"), ("four_times", "[4. 8.] 0")):
+        script = f"import numpy as np, own; print(own.{name}(np.array([1.0, 2.0])), sum(own.inner.stats.cache_hits.values()))"
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.strip() == printed
 
 
 def test_a_callback_is_compiled_for_given_types_and_cached():
