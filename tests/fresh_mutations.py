@@ -218,7 +218,10 @@ FRESH: list[Mutation] = [
         "peers/bodies.py",
         "        arm = position - self._mean(position)[self._molecule]\n        if",
         "        count = np.bincount(self._molecule)[:, None]\n        arm = position - (self._sum(position) / count)[self._molecule]\n        if",
-        ("test_lammps.py::test_both_engines_compute_the_same",),
+        (
+            "test_lammps.py::test_both_engines_compute_the_same",
+            "test_openmm.py::test_energies_and_forces_on_bodies_of_a_cluster",
+        ),
     ),
     Mutation(
         "F32", "table of a sweep: the error of the energy of a molecule goes by the root of their number",
