@@ -1,5 +1,6 @@
 """Fixtures and hooks of all tests. What tests call is in support.py."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -8,6 +9,8 @@ import pytest
 
 # Tests run on all cores: a second process for each that compiles would only take time from the others.
 os.environ.setdefault("RIGIDMD_COMPILERS", "1")
+# A worker holds a million objects of Numba. To search them for cycles as often as Python does took 15 % of its time.
+gc.set_threshold(50_000, 20, 20)
 
 pytest.register_assert_rewrite("support")
 from hooks import (  # noqa: E402, F401

@@ -91,10 +91,15 @@ def test_all_models_in_one_box():
     engine.close()
 
 
-def test_a_short_run_is_the_same_on_two_ranks(tmp_path):
+#: Ranks of MPI wait in a loop: two of them take the cores from the other worker of the tests, for 100 s in all.
+RANKS = [1, pytest.param(2, marks=pytest.mark.soak)]
+
+
+@pytest.mark.parametrize("ranks", RANKS)
+def test_a_short_run_is_the_same(ranks):
     """Both turn bodies by the same composition of rotations: what is left is the constants of LAMMPS."""
     scene = small_scene({"spce": 20, "nitrogen": 4, "argon": 2}, 15.0, forces={"cutoff_A": 7.0},
-                        engine={"name": "lammps", "ranks": 2})  # fmt: skip
+                        engine={"name": "lammps", "ranks": ranks})  # fmt: skip
     found = verify(scene)
     assert found.agrees, found.in_words()
     assert found.run[0].apart < 1e-6 and found.run[0].here > 0.1
@@ -164,11 +169,12 @@ def scene(tmp_path) -> Path:
     return path
 
 
-def test_a_run_on_two_ranks_is_a_run_like_any_other(scene, tmp_path, capsys):
+@pytest.mark.parametrize("ranks", RANKS)
+def test_a_run_is_one_like_any_other(ranks, scene, tmp_path, capsys):
     folder = tmp_path / "run"
-    assert cli.main(["run", str(scene), "--engine", "lammps", "--ranks", "2", "-o", str(folder)]) == 0
+    assert cli.main(["run", str(scene), "--engine", "lammps", "--ranks", str(ranks), "-o", str(folder)]) == 0
     said = capsys.readouterr().out
-    assert "computed by LAMMPS on 2 ranks" in said
+    assert f"computed by LAMMPS on {ranks} rank" in said
     assert "stages.0: thermostat nose_hoover, because lammps has no velocity_rescaling" in said
     record = read_record(folder)
     assert list(record.columns["step"]) == [0, 5, 10, 15, 20, 30, 40, 50, 60]
