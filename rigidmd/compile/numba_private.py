@@ -165,8 +165,8 @@ class LinkedCode(JITCodeLibrary):
     """The code of a function that only compiled code calls: it has no machine code of its own.
 
     Numba optimises the code of every function and makes machine code of it, links it into its callers, and does both
-    again there. Here only the outermost function is optimised, with all that it calls: the kernels of water compile in 41 s
-    in place of 49 s.
+    again there. Here only the outermost function is optimised, with all that it calls: the kernels of water compile
+    in 41 s in place of 49 s.
     """
 
     def _optimize_functions(self, ll_module):
