@@ -176,7 +176,7 @@ FRESH: list[Mutation] = [
         "assemble/gsd_format.py",
         "bx / ly, cx / lz, cy / lz]",
         "bx / ly, cx / lz, cy / ly]",
-        ("test_gsd.py::test_it_is_what_hoomd_has",),
+        ("test_gsd.py::test_frames_come_back",),
     ),
     Mutation(
         "F26", "LAMMPS: the pressure of the tail correction is added to that asked for",
