@@ -889,7 +889,8 @@ def conserved(rows):
     return np.array([row.time for row in rows]), np.array([row.conserved for row in rows]) / 216
 
 
-@pytest.mark.parametrize("model", ["spce", pytest.param("tip4p2005", marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("model", ["spce", "tip4p2005"])
 def test_energy_errors_of_pme_are_of_order_2(model):
     """The energy that the grid gives is kept: its fluctuation falls with the square of the step."""
     spread = [np.std(conserved(nve(model, dt, 0.4))[1]) for dt in (2.0, 1.0)]

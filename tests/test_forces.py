@@ -210,12 +210,19 @@ def test_virial_is_the_slope_of_the_energy_with_the_box(angles):
     assert virial.trace() == pytest.approx(-(energy(1 + h) - energy(1 - h)) / (2 * h), rel=1e-6)
 
 
-@pytest.mark.parametrize(("precision", "digits"), [("double", 1e-9), ("mixed", 2e-6)])
-@pytest.mark.parametrize("box", [
-    {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]},
-    {"lengths_A": 21.0},
-    {"lengths_A": 21.0, "periodic": False},
-], ids=["triclinic", "cubic", "none"])  # fmt: skip
+SLANTED = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}
+
+
+@pytest.mark.parametrize(
+    ("box", "precision", "digits"),
+    [
+        pytest.param({"lengths_A": 21.0, "periodic": False}, "double", 1e-9, id="none-double"),
+        pytest.param({"lengths_A": 21.0}, "double", 1e-9, id="cubic-double"),
+        pytest.param({"lengths_A": 21.0}, "mixed", 2e-6, id="cubic-mixed"),
+        pytest.param(SLANTED, "double", 1e-9, id="triclinic-double"),
+        pytest.param(SLANTED, "mixed", 2e-6, id="triclinic-mixed", marks=pytest.mark.soak),
+    ],
+)
 def test_virials_are_sums_over_pairs(box, precision, digits):
     """For a list that has served for some steps, of sites far from the origin; by all pairs of images."""
     forces = {"cutoff_A": 6.0, "truncation": "force_shift"}
@@ -375,7 +382,7 @@ def test_a_box_that_is_no_number_is_told(counts, at):
             engine.evaluate(state)
 
 
-@pytest.mark.parametrize("precision", ["double", "mixed"])
+@pytest.mark.parametrize("precision", ["double", pytest.param("mixed", marks=pytest.mark.soak)])
 @pytest.mark.parametrize("angles", [[90, 90, 90], [70, 100, 115]])
 def test_a_list_serves_while_the_box_changes_little(angles, precision):
     """Pairs across the edges, which move with the images, are those of a new list; of a larger change too, anew."""
@@ -451,8 +458,7 @@ ALIKE = {
 
 
 #: The others have types of kernels that no other test has.
-SHARED = [("one kind", "mixed"), ("no box", "double"), ("charges", "mixed"), ("charges", "double"), ("damped", "double"),
-          ("a text", "double")]  # fmt: skip
+SHARED = [("no box", "double"), ("charges", "mixed"), ("charges", "double"), ("damped", "double"), ("a text", "double")]
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from rigidmd.units import BOLTZMANN
 def points(positions, edge, **law):
     """Engine and state of LJ points (sigma = epsilon = 1)."""
     n = len(positions)
-    sites = CentralSites(np.arange(n + 1), np.arange(n))
-    kind = np.zeros(n, np.int64)
+    sites = CentralSites(np.arange(n + 1, dtype=np.int32), np.arange(n, dtype=np.int32))  # as a scene has them
+    kind = np.zeros(n, np.int32)
     made = lennard_jones(kind, np.ones(1), np.ones(1), **law)
     term = pair_forces(made, sites)
     model = Model(kind, np.ones(1), np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)), NoRotor())

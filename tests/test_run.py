@@ -1191,7 +1191,7 @@ def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
     ends = []
     for interval in (0.01, 0.025):
         scene = small_scene(
-            {"argon": 40}, 20.0, precision="mixed", stages=[{"duration_ps": 0.2}], forces={"truncation": "smooth_switch"},
+            {"nitrogen": 40}, 20.0, precision="mixed", stages=[{"duration_ps": 0.2}],
             output={"log_interval_ps": interval},
         )  # fmt: skip
         ends.append(rigidmd.Simulation(scene, tmp_path / str(interval)).run().state)
