@@ -25,7 +25,11 @@ from pathlib import Path
 
 import numba
 from llvmlite import binding
-from llvmlite.binding.newpassmanagers import create_new_function_pass_manager
+from llvmlite.binding.newpassmanagers import (
+    FunctionPassManager,
+    create_pass_builder,
+    create_pipeline_tuning_options,
+)
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
@@ -170,9 +174,13 @@ class LinkedCode(JITCodeLibrary):
     """
 
     def _optimize_functions(self, ll_module):
+        if not hasattr(FunctionPassManager, "add_sroa_pass"):  # llvmlite before 0.45
+            super()._optimize_functions(ll_module)
+            return
         ll_module.data_layout = self._codegen._data_layout
+        builder = create_pass_builder(self._codegen._tm, create_pipeline_tuning_options())
         for function in ll_module.functions:  # of what Numba does here, what makes it smaller
-            passes, builder = create_new_function_pass_manager(), self._codegen._pass_builder()
+            passes = FunctionPassManager()
             passes.add_sroa_pass()
             passes.add_dead_code_elimination_pass()
             passes.run(function, builder)
