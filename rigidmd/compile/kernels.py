@@ -39,14 +39,11 @@ def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=Fa
     register = overload(stub, jit_options=options_of(inline) | uncounted(counted) | LINKED)
     if not kinds:
         return register
+    classes = kinds if isinstance(kinds, tuple) else (kinds,)
 
     def register_for_kinds(function):
         def choose(*given):
-            return (
-                function
-                if any(is_a(given[0], kind) for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
-                else None
-            )
+            return function if any(is_a(given[0], one) for one in classes) else None
 
         choose.__signature__ = inspect.signature(function)  # pyright: ignore[reportFunctionMemberAccess]
         register(choose)

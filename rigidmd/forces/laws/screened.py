@@ -25,7 +25,7 @@ from rigidmd.units import COULOMB_CHARGE
 #: rounding error of its evaluation, 5e-15 and 1.5e-7 for alpha times the cut-off up to 4.
 FIT_ERROR = {np.dtype(np.float64): 1e-15, np.dtype(np.float32): 3e-8}
 #: Numbers of terms of the energy and of the force are multiples of these: each number is another type of compiled code.
-#: The force is what most calls compute, and has fewer terms too many.
+#: The force, which most calls compute, has the finer step, so that it has at most three terms more than it needs.
 ENERGY_STEP, FORCE_STEP = 8, 4
 #: Intervals of a table, and coefficients of each.
 INTERVALS, TERMS = 32, 4
