@@ -10,65 +10,51 @@ print(results["temperature"].mean(), results.units["temperature"], results.unive
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from rigidmd.core.display import PROVIDERS
+
 if TYPE_CHECKING:
-    from rigidmd.analyse.registry import analysis
-    from rigidmd.dynamics.own import compiled_force, compiled_thermostat
-    from rigidmd.looking.live import LivePlot
-    from rigidmd.own.force import Force
-    from rigidmd.own.pair_law import PairLaw, pair_law
-    from rigidmd.own.trust import trust
+    from rigidmd import analysis, view
+    from rigidmd.assemble.from_atoms import scene_from_atoms
+    from rigidmd.assemble.scenes import atoms_of, resolve
+    from rigidmd.assemble.user_code.force import Force
+    from rigidmd.assemble.user_code.pair_potential import PairLaw, pair_law
+    from rigidmd.assemble.user_code.trust import trust
+    from rigidmd.dynamics.user_kernels import compiled_force, compiled_thermostat
     from rigidmd.run import Every, Moment, Observer, Results, Simulation, run_together
     from rigidmd.scene import BodyScene, MolecularScene, Scene
-    from rigidmd.study.sweep.sweeping import sweep
+    from rigidmd.studies.sweep.sweeping import sweep
+    from rigidmd.view.live import LivePlot
 
     __version__: str
 
+#: Public name -> the module that has it, loaded at first use, so that `rigidmd --help` need not wait for Numba.
+_HOMES = {
+    "BodyScene": "scene", "MolecularScene": "scene", "Scene": "scene",
+    "Every": "run", "Moment": "run", "Observer": "run", "Results": "run", "Simulation": "run", "run_together": "run",
+    "resolve": "assemble.scenes", "atoms_of": "assemble.scenes", "scene_from_atoms": "assemble.from_atoms",
+    "Force": "assemble.user_code.force", "trust": "assemble.user_code.trust",
+    "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
+    "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
+    "LivePlot": "view.live", "sweep": "studies.sweep.sweeping", "analysis": "", "view": "",
+}  # fmt: skip
 __all__ = [
-    "BodyScene",
-    "Every",
-    "Force",
-    "LivePlot",
-    "MolecularScene",
-    "Moment",
-    "Observer",
-    "PairLaw",
-    "Results",
-    "Scene",
-    "Simulation",
-    "analysis",
-    "compiled_force",
-    "compiled_thermostat",
-    "pair_law",
-    "run_together",
-    "sweep",
-    "trust",
-]
+    "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
+    "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "pair_law", "resolve",
+    "run_together", "scene_from_atoms", "sweep", "trust", "view",
+]  # fmt: skip
 
-#: The module in which each of them is.
-_HOMES = (
-    dict.fromkeys(("BodyScene", "MolecularScene", "Scene"), "scene")
-    | dict.fromkeys(("Every", "Moment", "Observer", "Results", "Simulation", "run_together"), "run")
-    | dict.fromkeys(("compiled_force", "compiled_thermostat"), "dynamics.own")
-    | dict.fromkeys(("PairLaw", "pair_law"), "own.pair_law")
-    | {
-        "Force": "own.force",
-        "LivePlot": "looking.live",
-        "analysis": "analyse.registry",
-        "sweep": "study.sweep.sweeping",
-        "trust": "own.trust",
-    }
-)
+PROVIDERS.append("rigidmd.view.notebook")
 
 
 def __getattr__(name: str) -> object:
-    # Loaded when asked for, so that `rigidmd --help` need not wait for Numba and MDAnalysis.
     if name == "__version__":
         from importlib.metadata import version
 
         return version("rigidmd")
-    if name in _HOMES:
-        return getattr(import_module(f"rigidmd.{_HOMES[name]}"), name)
-    raise AttributeError(f"module 'rigidmd' has no attribute {name!r}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'rigidmd' has no attribute {name!r}")
+    home = _HOMES[name]
+    return getattr(import_module(f"rigidmd.{home}"), name) if home else import_module(f"rigidmd.{name}")
 
 
 def __dir__() -> list[str]:

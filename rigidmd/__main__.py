@@ -2,6 +2,6 @@
 
 import sys
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 
 sys.exit(main())

@@ -16,22 +16,23 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 
-from rigidmd.assemble.cells import basis_of, roomiest, standard_rotation
-from rigidmd.assemble.from_atoms import SOURCE, atoms_faults, scene_of_atoms
+from rigidmd.assemble.build import build
+from rigidmd.assemble.from_atoms import SOURCE, atoms_faults, scene_from_atoms
 from rigidmd.assemble.matching import Matched, again, massive, match
 from rigidmd.assemble.species import species_of
-from rigidmd.assemble.structure_files import read_atoms
-from rigidmd.assemble.system import System, build
 from rigidmd.core.state import State, state_of
 from rigidmd.engines.cpu import Engine
+from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
-from rigidmd.measure.atom_forces import Form, in_ase_units
-from rigidmd.measure.minimum import minimum_figures, minimum_in_words
-from rigidmd.molecules import Molecule
+from rigidmd.io.cells import basis_of, roomiest, standard_rotation
+from rigidmd.io.structure_file import read_atoms
+from rigidmd.run.atom_forces import Form, in_ase_units
 from rigidmd.run.minimise import minimise
+from rigidmd.run.minimum import minimum_figures, minimum_in_words
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.forces import Forces
-from rigidmd.validation import meant, settled
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.validation import meant, settled
 
 __all__ = ["RigidMD"]
 
@@ -193,7 +194,7 @@ class RigidMD(Calculator):
             "structure": {"tolerance": self._tolerance},
             "stages": [{"ensemble": "minimise", **limits}],
         }
-        scene = scene_of_atoms(bare, self._models, settings)
+        scene = scene_from_atoms(bare, self._models, **settings)
         if self._own:
             scene = scene.with_own(self._own)
         system = build(scene)

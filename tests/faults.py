@@ -40,7 +40,7 @@ import numpy as np
 import tomli_w
 from support import read_checkpoint, write_checkpoint
 
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import CheckpointError
 
 try:

@@ -26,7 +26,8 @@ from support import (
 )
 
 import rigidmd
-from rigidmd import Scene, Simulation, cli
+from rigidmd import Scene, Simulation
+from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.units import DEBYE
 
@@ -350,7 +351,7 @@ def test_a_folder_that_is_no_run_of_molecules(tmp_path, copy, capsys):
     results = Simulation(body, top).run()
     assert "is the run of a single body, and analyses are of molecules" in said(capsys, top)
     with pytest.raises(OutputError, match="this is the run of a single body, and analyses are of molecules"):
-        results.rdf()
+        rigidmd.analysis.rdf(results)
 
 
 @pytest.mark.parametrize(
@@ -375,12 +376,12 @@ def test_files_of_others_are_not_overwritten(copy, capsys):
     assert cli.main(["analyse", str(copy), "--only", "msd", "--from", "0.02ps"]) == 0
     (copy / "analysis.json").unlink()  # files of this command may be written anew
     assert cli.main(["analyse", str(copy), "--only", "msd,dielectric", "--from", "0.02ps"]) == 0
-    trusted = copy.parent / "own.py"
+    trusted = copy.parent / "assemble/user_code.py"
     for name, words in (
         ("log", "log.csv is there and no file"),
         ("dipole", "dipole.csv is of the analysis dielectric"),
     ):
-        trusted.write_text(f"import rigidmd\n@rigidmd.analysis\ndef {name}(frames):\n    return frames.time\n")
+        trusted.write_text(f"import rigidmd\n@rigidmd.analysis.register\ndef {name}(frames):\n    return frames.time\n")
         before = {path.name: path.read_bytes() for path in copy.iterdir()}
         capsys.readouterr()
         assert words in said(capsys, copy, "--trust", trusted, "--only", name, "--from", "0.02ps")
@@ -402,20 +403,20 @@ def test_a_folder_that_cannot_be_written_is_told(copy, capsys):
 OWN = """import numpy as np
 import rigidmd
 
-@rigidmd.analysis
+@rigidmd.analysis.register
 def height(frames):
     "mean height of the centres (A)"
     return frames.positions[:, :, 2].mean(axis=1)
 
-@rigidmd.analysis
+@rigidmd.analysis.register
 def spins(frames):
     return {"L": np.abs(frames.L).mean(axis=(1, 2)), "one": np.ones(len(frames))}
 """
 
 
 def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
-    (copy.parent / "own.py").write_text(OWN)
-    trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
+    (copy.parent / "assemble/user_code.py").write_text(OWN)
+    trust = ["--trust", str(copy.parent / "assemble/user_code.py"), "--from", "0.02ps"]
     assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
     entries = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert entries["height"]["about"] == "mean height of the centres (A)"
@@ -433,7 +434,7 @@ def test_the_mean_of_ones_own_has_an_honest_error():
     system, found = system_of({"argon": 2}), []
     for seed in range(50):
         series = noise_with_memory(np.random.default_rng(seed), 1000, (1,), 1.0, 5.0, 1.0)[:, 0]
-        rigidmd.analysis(lambda_of(series))
+        rigidmd.analysis.register(lambda_of(series))
         told = registry.KNOWN["noise"].function(history(system, np.arange(1000.0), None)).value()
         found.append((told.value, told.error, told.correlation_ps))
     values, errors, times = np.array(found).T
@@ -464,25 +465,29 @@ def lambda_of(series):
 )  # fmt: skip
 def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys):
     before = names(water)
-    (tmp_path / "own.py").write_text(f"import rigidmd\n@rigidmd.analysis\ndef mine(frames):\n    {body}\n")
-    assert words in said(capsys, water, "--trust", tmp_path / "own.py", "--only", "mine", "--from", "0.02ps")
+    (tmp_path / "assemble/user_code.py").write_text(
+        f"import rigidmd\n@rigidmd.analysis.register\ndef mine(frames):\n    {body}\n"
+    )
+    assert words in said(
+        capsys, water, "--trust", tmp_path / "assemble/user_code.py", "--only", "mine", "--from", "0.02ps"
+    )
     assert names(water) == before
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("x = 1", "defines no analysis: put @rigidmd.analysis before a function of frames"),
-        ("raise ValueError('no')", "own.py raised ValueError: no"),
-        ("def (", "own.py raised SyntaxError"),
-        ("import sys; sys.exit(0)", "own.py raised SystemExit"),
-        ("import rigidmd\n@rigidmd.analysis\ndef rdf(frames): return frames.time", "own.py: rdf is an analysis that comes with"),
-        ("import rigidmd\nrigidmd.analysis(lambda frames: frames.time)", "an analysis has the name of its function"),
+        ("x = 1", "defines no analysis: put @rigidmd.analysis.register before a function of frames"),
+        ("raise ValueError('no')", "assemble/user_code.py raised ValueError: no"),
+        ("def (", "assemble/user_code.py raised SyntaxError"),
+        ("import sys; sys.exit(0)", "assemble/user_code.py raised SystemExit"),
+        ("import rigidmd\n@rigidmd.analysis.register\ndef rdf(frames): return frames.time", "assemble/user_code.py: rdf is an analysis that comes with"),
+        ("import rigidmd\nrigidmd.analysis.register(lambda frames: frames.time)", "an analysis has the name of its function"),
     ],
 )  # fmt: skip
 def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
-    (tmp_path / "own.py").write_text(text)
-    assert words in said(capsys, water, "--trust", tmp_path / "own.py")
+    (tmp_path / "assemble/user_code.py").write_text(text)
+    assert words in said(capsys, water, "--trust", tmp_path / "assemble/user_code.py")
 
 
 def test_the_names_of_analyses_are_kept_for_them():

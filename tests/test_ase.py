@@ -33,8 +33,10 @@ from support import (
     stopped_at,
 )
 
-from rigidmd import BodyScene, MolecularScene, Scene, Simulation, cli
+import rigidmd
+from rigidmd import BodyScene, MolecularScene, Scene, Simulation
 from rigidmd.ase import RigidMD
+from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SceneError, StructureError
 from rigidmd.run import Every
 from rigidmd.units import COULOMB, KJ_PER_MOL
@@ -72,7 +74,7 @@ def same_state(first, second) -> None:
 
 
 def test_atoms_of_a_run_are_its_scene_again(results, waters):
-    found = build(Scene.from_atoms(waters, "spce", forces=FORCES))
+    found = build(rigidmd.scene_from_atoms(waters, "spce", forces=FORCES))
     same_state(results.state, found.state)
     assert found.freedom == results.system.freedom
     assert any("largest 0.0000 Å" in note for note in found.notes)
@@ -86,7 +88,7 @@ def test_any_molecules_come_back(counts, tmp_path):
     """Massless sites, united atoms, points, linear molecules, in a slanted cell; from memory and from ASE's files."""
     box = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 100.0, 75.0]}
     system = build(small_scene(counts, None, box=box))
-    atoms = system.scene.atoms()
+    atoms = rigidmd.atoms_of(system.scene)
     assert len(atoms) == (system.sites.mass > 0).sum()
     assert atoms.get_masses().sum() == pytest.approx(system.sites.mass.sum())
     settings = {"forces": {"cutoff_A": 9.0}, "stages": [NVE]}
@@ -94,7 +96,7 @@ def test_any_molecules_come_back(counts, tmp_path):
     for path in files:
         ase.io.write(path, atoms)
     for found in (atoms, *map(ase.io.read, files)):
-        again = build(Scene.from_atoms(found, list(counts), **settings))
+        again = build(rigidmd.scene_from_atoms(found, list(counts), **settings))
         assert [m.name for m in again.species] == list(counts)
         assert (again.model.species == system.model.species).all()
         digits = 2e-8 if "atomtypes" in found.arrays and found is not atoms else 1e-12  # those of .extxyz
@@ -116,15 +118,15 @@ def test_sites_of_a_geometry_share_names(formula, tmp_path):
         atoms += Atoms(one.symbols[order], one.positions[order] @ turn.T + [10, 10, 10 + 10 * k])
     ase.io.write(tmp_path / "crystal.cif", atoms)
     for found in (atoms, ase.io.read(tmp_path / "crystal.cif")):
-        system = build(Scene.from_atoms(found, [species], forces={"cutoff_A": 6.0}))
+        system = build(rigidmd.scene_from_atoms(found, [species], forces={"cutoff_A": 6.0}))
         assert len(system.state.position) == 3
-        assert np.sort(system.scene.atoms().positions, axis=0) == pytest.approx(np.sort(atoms.positions, axis=0), abs=1e-6)  # fmt: skip
+        assert np.sort(rigidmd.atoms_of(system.scene).positions, axis=0) == pytest.approx(np.sort(atoms.positions, axis=0), abs=1e-6)  # fmt: skip
         assert any("largest 0.0000 Å" in note for note in system.notes)
 
 
 def test_a_scene_holds_its_atoms(waters, tmp_path):
     """No file is needed; a run in a folder has one, and repeats to the bit."""
-    made = Scene.from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine")
+    made = rigidmd.scene_from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine")
     assert isinstance(made, MolecularScene)
     assert made.seed == 3
     assert made.name == "mine"
@@ -138,13 +140,13 @@ def test_a_scene_holds_its_atoms(waters, tmp_path):
     in_memory = Simulation(pickle.loads(pickle.dumps(made))).run()
     assert in_memory.state.position.tobytes() == first.state.position.tobytes()
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
-    assert made != Scene.from_atoms(
+    assert made != rigidmd.scene_from_atoms(
         waters[:-3], ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine"
     )
 
 
 def test_a_run_of_held_atoms_goes_on(waters, tmp_path):
-    made = Scene.from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT)
+    made = rigidmd.scene_from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT)
     looks = Every(0.001, lambda moment: None)
     Simulation(made, tmp_path / "whole", observers=looks).run()
     Simulation(made, tmp_path / "parts", observers=stopped_at({13})).run()
@@ -152,37 +154,39 @@ def test_a_run_of_held_atoms_goes_on(waters, tmp_path):
     assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
     other = waters.copy()
     other.positions[0, 0] += 1e-12
-    moved = Scene.from_atoms(other, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT)
+    moved = rigidmd.scene_from_atoms(other, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT)
     with pytest.raises(RigidMDError, match=r"the file of structure\.file has changed"):
         Simulation(moved, tmp_path / "parts", resume=True).run()
 
 
 def test_what_a_scene_of_atoms_is_without_being_told():
     water = molecule("H2O")
-    still = Scene.from_atoms(water, "spce")
+    still = rigidmd.scene_from_atoms(water, "spce")
     assert still.stages[0].ensemble == "minimise"
     assert not still.box.periodic
     assert any("largest 0.0558 Å" in note for note in build(still).notes)
     water.set_momenta(np.full((3, 3), 0.1))
-    moving = Scene.from_atoms(water, "spce")
+    moving = rigidmd.scene_from_atoms(water, "spce")
     assert (moving.stages[0].ensemble, moving.stages[0].duration_ps) == ("nve", 1.0)
     assert moving.structure.velocities
-    drawn = Scene.from_atoms(water, "spce", start={"temperature_K": 300.0})
+    drawn = rigidmd.scene_from_atoms(water, "spce", start={"temperature_K": 300.0})
     assert not drawn.structure.velocities
     assert drawn.stages[0].ensemble == "nve"
-    given = Scene.from_atoms(water, "spce", stages=[{"ensemble": "nvt", "temperature_K": 300, "duration_ps": 10}])
+    given = rigidmd.scene_from_atoms(
+        water, "spce", stages=[{"ensemble": "nvt", "temperature_K": 300, "duration_ps": 10}]
+    )
     assert given.stages[0].ensemble == "nvt"
     assert given.structure.velocities
     water.set_constraint([FixBondLengths([(0, 1)]), FixAtoms([0])])
     with pytest.warns(RigidMDWarning, match=r"not taken over \(FixAtoms\)"):
-        Scene.from_atoms(water, "spce")
+        rigidmd.scene_from_atoms(water, "spce")
 
 
 def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text((ROOT / "rigidmd" / "models" / "tip3p.toml").read_text())
-    from_file = Scene.from_atoms(molecule("H2O"), ["mine.toml"])
-    heavy = Scene.from_atoms(molecule("H2O"), [{"model": "tip3p", "masses_u": {"H": 2.014}}])
+    from_file = rigidmd.scene_from_atoms(molecule("H2O"), ["mine.toml"])
+    heavy = rigidmd.scene_from_atoms(molecule("H2O"), [{"model": "tip3p", "masses_u": {"H": 2.014}}])
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path / "other")
     light = load_model("tip3p").mass
@@ -190,7 +194,7 @@ def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     Simulation(from_file).write_scene(tmp_path / "run")
     (tmp_path / "mine.toml").unlink()
-    assert Scene.read(tmp_path / "run" / "scene.toml").resolved().molecules[0].file == "input_0_mine.toml"
+    assert rigidmd.resolve(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file == "input_0_mine.toml"
     assert build(heavy).species[0].mass == pytest.approx(light + 2 * (2.014 - 1.008))
 
 
@@ -238,7 +242,10 @@ def broken(what: str) -> Atoms:
 )
 def test_atoms_that_cannot_be_used_are_told(what, said):
     atoms = broken(what)
-    for use in (lambda: build(Scene.from_atoms(atoms, "spce")), lambda: RigidMD("spce").get_potential_energy(atoms)):
+    for use in (
+        lambda: build(rigidmd.scene_from_atoms(atoms, "spce")),
+        lambda: RigidMD("spce").get_potential_energy(atoms),
+    ):
         with pytest.raises((SceneError, StructureError), match=f"^atoms: .*{said}"):
             use()
 
@@ -261,12 +268,12 @@ def test_atoms_that_cannot_be_used_are_told(what, said):
 )
 def test_settings_that_cannot_be_used_are_told(settings, said):
     with pytest.raises(SceneError, match=said):
-        Scene.from_atoms(**{"atoms": molecule("H2O"), "models": ["spce"]} | settings)
+        rigidmd.scene_from_atoms(**{"atoms": molecule("H2O"), "models": ["spce"]} | settings)
 
 
 def test_two_models_that_fit_are_not_chosen_from():
     with pytest.raises(StructureError, match="may be spce or tip3p: give them residue_names"):
-        build(Scene.from_atoms(molecule("H2O"), ["spce", "tip3p"]))
+        build(rigidmd.scene_from_atoms(molecule("H2O"), ["spce", "tip3p"]))
 
 
 def test_frames_of_a_run(results):
@@ -567,7 +574,7 @@ def test_a_trajectory_of_ase_holds_every_digit(traj):
     assert np.abs(velocities - system.site_velocities(states[2])).max() < 1e-12
     assert np.abs(results.rotation[3] - states[3].rotation).max() < 1e-5
     assert all((now.positions == frame.positions).all() for now, frame in zip(present, frames, strict=True))
-    again = build(Scene.from_atoms(frames[3], "tip4p2005", forces=FORCES, stages=[NVE]))
+    again = build(rigidmd.scene_from_atoms(frames[3], "tip4p2005", forces=FORCES, stages=[NVE]))
     same_state(again.state, results.state)
     data = {"structure": {"file": "trajectory.traj", "velocities": True}, "stages": [NVE]}
     data |= {"molecules": [{"model": "tip4p2005"}], "forces": FORCES}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rigidmd.ase import RigidMD
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import RigidMDError
 
 ARGON = """

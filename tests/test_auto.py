@@ -27,7 +27,7 @@ from support import (
     weight,
 )
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import MolecularSimulation, Simulation
 from rigidmd.scene import Scene

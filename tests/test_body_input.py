@@ -3,7 +3,7 @@
 import pytest
 from support import ROOT, build_body
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene
 

@@ -9,7 +9,7 @@ import pytest
 from support import BODIES, ROOT, Keeper, build_body, write_scene
 
 import rigidmd
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
@@ -148,8 +148,8 @@ def test_a_run_that_fails_keeps_the_motion_so_far(tmp_path):
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
 def test_resolved_scenes_are_scenes(path, tmp_path):
     scene = Scene.read(path)
-    resolved = scene.resolved()
-    assert resolved.resolved() == resolved == build_body(scene).scene
+    resolved = rigidmd.resolve(scene)
+    assert rigidmd.resolve(resolved) == resolved == build_body(scene).scene
     assert resolved.output.interval_s == (scene.output.interval_s or scene.run.duration_s / 2000)
     assert resolved.output.trajectory_A_per_m > 0
     assert resolved.watch.orthogonality == 1e-9
@@ -163,14 +163,14 @@ def test_resolved_scenes_are_scenes(path, tmp_path):
 def test_resolved_scenes_hold_what_a_solver_needs(name, integrator, tmp_path):
     """And no formulation of a point, which does not turn."""
     scene = Scene.read(ROOT / "systems" / f"{name}.toml", {"run.integrator": integrator})
-    resolved = scene.resolved()
-    assert resolved.resolved() == resolved
+    resolved = rigidmd.resolve(scene)
+    assert rigidmd.resolve(resolved) == resolved
     assert resolved.run.formulation == ("matrix" if build_body(scene).turns else None)
     tolerance = 1e-10 if integrator == "dop853" else None
     assert resolved.run.relative_tolerance == resolved.run.absolute_tolerance == tolerance
     assert resolved.watch.orthogonality == 0.1
     write_scene(tmp_path, resolved)
-    assert Scene.read(tmp_path / "scene.toml").resolved().model_dump() == resolved.model_dump()
+    assert rigidmd.resolve(Scene.read(tmp_path / "scene.toml")).model_dump() == resolved.model_dump()
 
 
 def test_wheels_are_shown(tmp_path):

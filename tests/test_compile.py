@@ -149,7 +149,7 @@ def test_an_inner_kernel_has_no_machine_code_and_is_optimised_in_its_caller():
 
 
 def test_an_inner_kernel_is_kept_and_linked_into_other_kernels_later(tmp_path):
-    (tmp_path / "own.py").write_text(LATER)
+    (tmp_path / "assemble/user_code.py").write_text(LATER)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
     }  # fmt: skip
@@ -340,7 +340,7 @@ def test_one_compiler_plans_nothing(tmp_path):
 
 @pytest.mark.parametrize("named", ["0", "three", ""])
 def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
-    asked = "from rigidmd.compile.ahead import compilers\ncompilers()"
+    asked = "from rigidmd.compile.second_process import compilers\ncompilers()"
     done = with_compilers(named, asked, tmp_path)
     assert f"RIGIDMD_COMPILERS is {named!r}, must be 1 or 2" in done.stderr
 
@@ -400,7 +400,7 @@ def test_a_folder_in_which_nothing_is_kept_is_named(tmp_path, monkeypatch):
 
 
 def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):
-    asked = "import rigidmd.forces.terms, rigidmd.dynamics.advance, rigidmd.dynamics.noise"
+    asked = "import rigidmd.forces.terms, rigidmd.dynamics.step_loop, rigidmd.dynamics.noise"
     environment = os.environ | {"RIGIDMD_CACHE": str(tmp_path / "cache")}
     subprocess.run([sys.executable, "-c", asked], env=environment, cwd=ROOT, check=True)
     assert not (tmp_path / "cache").exists()
@@ -411,8 +411,8 @@ KERNEL = "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef twice(x):
 
 def compiled_in(folder, tmp_path, before=""):
     """Run a kernel with the cache in a folder: what it printed, what it warned of."""
-    if not (tmp_path / "own.py").exists():  # kernels are kept by the time of their file
-        (tmp_path / "own.py").write_text(KERNEL)
+    if not (tmp_path / "assemble/user_code.py").exists():  # kernels are kept by the time of their file
+        (tmp_path / "assemble/user_code.py").write_text(KERNEL)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
     }  # fmt: skip

@@ -23,7 +23,8 @@ from support import (
 )
 from support import differences_in_words as in_words
 
-from rigidmd import Scene, Simulation, cli
+from rigidmd import Scene, Simulation
+from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError
 
 DEEP = "[" * 5000 + "]" * 5000

@@ -28,7 +28,7 @@ from pydantic import BaseModel
 from support import CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters
 
 import rigidmd
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 

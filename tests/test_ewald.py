@@ -41,7 +41,7 @@ from support import (
     waves,
 )
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
@@ -1042,12 +1042,12 @@ import sys
 sys.modules["rocket_fft"] = None  # an import of it fails
 sys.path.insert(0, "tests")
 from support import build
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.scene import Scene
 for forces in ({}, {"electrostatics": "ewald", "cutoff_A": 6.0}):
     data = {"box": {"lengths_A": 18.1}, "molecules": [{"model": "spce", "count": 9}], "forces": forces,
             "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.1}]}
     build(Scene.from_dict(data))
-assert "rigidmd.forces.waves.mesh" not in sys.modules
+assert "rigidmd.forces.ewald.pme" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, timeout=300)

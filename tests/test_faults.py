@@ -29,7 +29,7 @@ from support import (
 )
 
 import rigidmd
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import RigidMDError
 
 SCENE = """\

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from scenes import FROM_FILE, SATELLITE, STRUCTURES
 from support import Checkpoint, Saved, read_checkpoint, state_of, write_checkpoint, write_state
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import UNSEEN, CheckpointError
 
 SECONDS, BYTES = 5.0, 2e9  # of computing, that an input may take

@@ -31,7 +31,7 @@ from support import (
 from support import comparison_in_words as in_words
 from support import mean_and_error as mean
 
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.run import Simulation
 

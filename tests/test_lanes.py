@@ -13,8 +13,8 @@ from numba import types
 from support import BUILDS, ROOT, SCHEMES, build, built, move, small_scene
 from support import pair_loop as pairs
 
-from rigidmd.compile import SIMD_BITS, Parcel, kernel, lanes
-from rigidmd.compile.records import load_matrices, load_vectors, store_matrices, store_vectors
+from rigidmd.compile import SIMD_BITS, Parcel, kernel, simd
+from rigidmd.compile.simd_records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.units import KJ_PER_MOL
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}
@@ -23,30 +23,30 @@ W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}
 
 @kernel(inline=True)
 def cube(x):
-    _, one, two = lanes.root_and_cube(x)
+    _, one, two = simd.root_and_cube(x)
     return one * two
 
 
 @kernel(outer=True)
 def every_operation(a, b, out, sums):
-    width = lanes.width_of(a)
-    x, y = lanes.load(a, 0), lanes.load(b, 0)
+    width = simd.width_of(a)
+    x, y = simd.load(a, 0), simd.load(b, 0)
     results = (
-        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, lanes.larger(x, y), lanes.smaller(x, 1.5), lanes.inverse_root(x),
-        lanes.select(x < y, x, 0.0), lanes.select(lanes.mask_of(5, x), y, x), cube(x),
+        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, simd.larger(x, y), simd.smaller(x, 1.5), simd.inverse_root(x),
+        simd.select(x < y, x, 0.0), simd.select(simd.mask_of(5, x), y, x), cube(x),
     )  # fmt: skip
     for k in range(12):
-        lanes.store(out, k * width, results[k])
-    sums[0] = lanes.total(x)
-    sums[1] = lanes.largest(x)
-    sums[2] = lanes.bits((x > 1.0) & (y <= 2.0))
-    sums[3] = lanes.lowest_bit(40)
-    sums[4] = lanes.lane(lanes.narrowed(lanes.load_four(sums, 0), a), 1)
+        simd.store(out, k * width, results[k])
+    sums[0] = simd.total(x)
+    sums[1] = simd.largest(x)
+    sums[2] = simd.bits((x > 1.0) & (y <= 2.0))
+    sums[3] = simd.lowest_bit(40)
+    sums[4] = simd.lane(simd.narrowed(simd.load_four(sums, 0), a), 1)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
 def test_vectors_compute_as_arrays_do(dtype):
-    width = lanes.lane_count(dtype)
+    width = simd.lane_count(dtype)
     assert width * np.dtype(dtype).itemsize * 8 == SIMD_BITS
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0.1, 3, (2, width)).astype(dtype)
@@ -66,15 +66,15 @@ def test_vectors_compute_as_arrays_do(dtype):
 
 @kernel(outer=True)
 def sums_of_six(x, out):
-    width = lanes.width_of(x)
-    one = lanes.load(x, 0), lanes.load(x, width), lanes.load(x, 2 * width)
-    two = lanes.load(x, 3 * width), lanes.load(x, 4 * width), lanes.load(x, 5 * width)
-    lanes.add_totals(out, 1, 3, one, two)
+    width = simd.width_of(x)
+    one = simd.load(x, 0), simd.load(x, width), simd.load(x, 2 * width)
+    two = simd.load(x, 3 * width), simd.load(x, 4 * width), simd.load(x, 5 * width)
+    simd.add_totals(out, 1, 3, one, two)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
 def test_six_sums_over_lanes_are_added_in_pairs(dtype):
-    x = np.random.default_rng(2).uniform(-1, 1, (6, lanes.lane_count(dtype))).astype(dtype)
+    x = np.random.default_rng(2).uniform(-1, 1, (6, simd.lane_count(dtype))).astype(dtype)
     out = np.arange(10).astype(dtype)
     sums_of_six(x.ravel(), out)
     expected = np.arange(10.0)
@@ -85,14 +85,14 @@ def test_six_sums_over_lanes_are_added_in_pairs(dtype):
 
 @kernel(outer=True)
 def records_in_lanes(vectors, matrices, out):
-    width = lanes.width_of(out)
+    width = simd.width_of(out)
     x, y, z = load_vectors(vectors, 1)
     nine = load_matrices(matrices, 1)
-    lanes.store(out, 0, x)
-    lanes.store(out, width, y)
-    lanes.store(out, 2 * width, z)
+    simd.store(out, 0, x)
+    simd.store(out, width, y)
+    simd.store(out, 2 * width, z)
     for k in range(9):
-        lanes.store(out, (3 + k) * width, nine[k])
+        simd.store(out, (3 + k) * width, nine[k])
     store_vectors(vectors, 0, (z, x, y))
     store_matrices(matrices, 0, nine)
 
@@ -100,7 +100,7 @@ def records_in_lanes(vectors, matrices, out):
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
 def test_records_are_loaded_into_lanes_and_stored(dtype):
     """From the second record on; they are written one record earlier, and what lies beside them stays."""
-    rng, width = np.random.default_rng(3), lanes.lane_count(dtype)
+    rng, width = np.random.default_rng(3), simd.lane_count(dtype)
     vectors, matrices = rng.random((width + 2, 3)).astype(dtype), rng.random((width + 2, 3, 3)).astype(dtype)
     moved, turned, out = vectors.copy(), matrices.copy(), np.zeros(12 * width, dtype)
     records_in_lanes(moved, turned, out)
@@ -113,19 +113,19 @@ def test_records_are_loaded_into_lanes_and_stored(dtype):
 
 @kernel(inline=True)
 def root(x):
-    found, _, _ = lanes.root_and_cube(x)
+    found, _, _ = simd.root_and_cube(x)
     return found
 
 
 @kernel(outer=True)
 def inverses(x, out):
-    width = lanes.width_of(x)
+    width = simd.width_of(x)
     for i in range(0, len(x), width):
-        at = lanes.load(x, i)
-        lanes.store(out[0], i, lanes.inverse(at))
-        lanes.store(out[1], i, lanes.inverse_root(at))
-        lanes.store(out[2], i, cube(at))
-        lanes.store(out[3], i, root(at))
+        at = simd.load(x, i)
+        simd.store(out[0], i, simd.inverse(at))
+        simd.store(out[1], i, simd.inverse_root(at))
+        simd.store(out[2], i, cube(at))
+        simd.store(out[3], i, root(at))
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
@@ -143,7 +143,7 @@ def test_inverses_are_accurate_to_the_last_digits(dtype):
 def test_the_stack_is_aligned_to_vectors():
     @numba.njit
     def aligned(x):
-        lanes.align_stack()
+        simd.align_stack()
         return x + 1
 
     assert aligned(1) == 2
@@ -153,20 +153,20 @@ def test_the_stack_is_aligned_to_vectors():
 
 @kernel(outer=True)
 def part(x, out):
-    width = lanes.width_of(x)
-    whole, rest = lanes.parted(lanes.load(x, 0))
-    lanes.store(out, 0, rest)
-    lanes.store(out, width, lanes.select(whole < fives(x), lanes.load(x, 0), 0.0))
+    width = simd.width_of(x)
+    whole, rest = simd.parted(simd.load(x, 0))
+    simd.store(out, 0, rest)
+    simd.store(out, width, simd.select(whole < fives(x), simd.load(x, 0), 0.0))
 
 
 @kernel(inline=True)
 def fives(x):
-    five, _ = lanes.parted(lanes.fill(5.0, x))
+    five, _ = simd.parted(simd.fill(5.0, x))
     return five
 
 
 def test_numbers_are_parted_into_whole_and_rest():
-    width = lanes.lane_count(np.float32)
+    width = simd.lane_count(np.float32)
     x = np.random.default_rng(1).uniform(-10, 10, width).astype(np.float32)
     x[:3] = 5.0, np.nextafter(np.float32(5), np.float32(0)), -7.0
     out = np.zeros(2 * width, np.float32)
@@ -177,11 +177,11 @@ def test_numbers_are_parted_into_whole_and_rest():
 
 @kernel(outer=True)
 def pick(table, x, out):
-    k, _ = lanes.parted(lanes.load(x, 0))
-    lanes.store(out, 0, lanes.picked(lanes.load(table, 0), lanes.load(table, 16), k))
+    k, _ = simd.parted(simd.load(x, 0))
+    simd.store(out, 0, simd.picked(simd.load(table, 0), simd.load(table, 16), k))
 
 
-@pytest.mark.skipif(not lanes.HAS_AVX512, reason="an instruction of AVX-512")
+@pytest.mark.skipif(not simd.HAS_AVX512, reason="an instruction of AVX-512")
 def test_numbers_are_picked_from_two_vectors():
     rng = np.random.default_rng(2)
     table = rng.normal(size=32).astype(np.float32)

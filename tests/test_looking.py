@@ -16,7 +16,8 @@ from matplotlib.image import imread
 from PIL import Image, ImageSequence
 from support import ROOT, SOLIDS, UNITS, build_body, connections, mesh_of, molecule_film, read_record, solid, write_film
 
-from rigidmd import Scene, Simulation, cli
+from rigidmd import Scene, Simulation
+from rigidmd.commands import cli
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""

@@ -30,7 +30,7 @@ from support import (
     write_report,
 )
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene

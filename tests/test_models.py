@@ -19,7 +19,7 @@ from support import (
     write_scene,
 )
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import MoleculeError, SceneError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

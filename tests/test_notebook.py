@@ -11,7 +11,7 @@ import pytest
 from support import ROOT, SYSTEMS, live_plot, notebooks, progress, save_figure, small_scene
 
 import rigidmd
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import RigidMDWarning
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -171,7 +171,7 @@ def test_a_scene_that_cannot_be_built_shows_why(tmp_path):
 
 def test_plots_are_of_the_columns_with_their_units():
     results = argon().run()
-    figure = results.plot("temperature_translation", "pressure_bar", "temperature")
+    figure = rigidmd.view.plot(results, "temperature_translation", "pressure_bar", "temperature")
     kelvin, pressure = figure.axes
     assert (kelvin.get_ylabel(), pressure.get_ylabel()) == ("K", "pressure (bar)")
     assert pressure.get_xlabel() == "time (ps)"
@@ -179,13 +179,13 @@ def test_plots_are_of_the_columns_with_their_units():
     assert (pressure.lines[0].get_ydata() == results["pressure_bar"]).all()
     assert (pressure.lines[0].get_xdata() == results["time"]).all()
     body = Simulation(top()).run()
-    (axis,) = body.plot("energy_error", log=True).axes
+    (axis,) = rigidmd.view.plot(body, "energy_error", log=True).axes
     assert axis.get_yscale() == "log"
     assert (axis.lines[0].get_ydata() == np.abs(body["energy_error"])).all()
     assert axis.get_xlabel() == "time (s)"
-    assert body.plot().get_suptitle() == "heavy_top_3: path of the body axis"
-    assert body.plot("angles").get_suptitle() == "heavy_top_3: Euler angles (3-1-3)"
-    png, size = body.plot("theta")._repr_png_()
+    assert rigidmd.view.plot(body).get_suptitle() == "heavy_top_3: path of the body axis"
+    assert rigidmd.view.plot(body, "angles").get_suptitle() == "heavy_top_3: Euler angles (3-1-3)"
+    png, size = rigidmd.view.plot(body, "theta")._repr_png_()
     assert png.startswith(b"\x89PNG")
     assert size["width"] == 576
 
@@ -196,18 +196,18 @@ def test_plots_are_of_the_columns_with_their_units():
 )
 def test_a_column_that_cannot_be_plotted(name, expected):
     with pytest.raises(KeyError, match=expected):
-        argon().run().plot("temperature", name)
+        rigidmd.view.plot(argon().run(), "temperature", name)
 
 
 def test_the_figure_of_a_run_is_its_file(tmp_path):
     results = argon(tmp_path / "out").run()
-    save_figure(results.plot(), tmp_path / "again.png", dpi=150)
+    save_figure(rigidmd.view.plot(results), tmp_path / "again.png", dpi=150)
     assert (tmp_path / "again.png").read_bytes() == (tmp_path / "out" / "energy.png").read_bytes()
 
 
 def test_the_film_of_a_body_is_a_page_in_a_frame(tmp_path):
     results = Simulation(top()).run()
-    film = results.view()
+    film = rigidmd.view.show(results)
     assert film.save(tmp_path / "film.html").read_text() == film.page
     for part in ("<canvas", "rigidmdPlayer", 'id="film-data"'):
         assert part in film.page
@@ -230,8 +230,8 @@ def shifted(simulation):
 def test_the_film_of_molecules_is_a_widget(tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
     memory, files = (shifted(argon(folder)).run() for folder in (None, tmp_path / "out"))
-    memory.view().save(str(tmp_path / "memory.json"))
-    files.view().save(str(tmp_path / "files.json"))
+    rigidmd.view.show(memory).save(str(tmp_path / "memory.json"))
+    rigidmd.view.show(files).save(str(tmp_path / "files.json"))
     told = [json.loads((tmp_path / name).read_text()) for name in ("memory.json", "files.json")]
     place = []
     for data in told:
@@ -245,7 +245,7 @@ def test_the_film_of_molecules_is_a_widget(tmp_path):
 def test_without_chemiscope_one_sentence_says_so(monkeypatch):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
     with pytest.raises(ImportError, match=r"needs the extra rigidmd\[view\]: pip install chemiscope"):
-        argon().run().view()
+        rigidmd.view.show(argon().run())
 
 
 # the tutorial

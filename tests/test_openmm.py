@@ -31,7 +31,7 @@ from support import (
 )
 from support import openmm_faults as faults
 
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import EngineError, SceneError
 from rigidmd.units import BAR, BOLTZMANN, COULOMB
 

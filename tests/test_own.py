@@ -43,7 +43,7 @@ from support import lennard_jones_tail as tail
 from support import own_energy_and_force as energy_and_force
 
 import rigidmd
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.units import KJ_PER_MOL
 

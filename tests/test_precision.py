@@ -36,7 +36,7 @@ from support import precision_advice as advice
 from support import precision_row as row
 from support import precision_table as table_text
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -210,11 +210,11 @@ HOVER = {
     'results["energy"]': "ndarray[",
     "results.universe()": "Universe",
     "results.state": "State",
-    "results.plot()": "Picture",
-    "results.view()": "StructureWidget | Film",
+    "rigidmd.view.plot(results)": "Picture",
+    "rigidmd.view.show(results)": "StructureWidget | Film",
     "results.atoms()": "Atoms",
     "results.atoms(slice(3))": "list[Atoms]",
-    'rigidmd.Scene.from_atoms(results.atoms(), ["spce"], seed=3)': "MolecularScene",
+    'rigidmd.scene_from_atoms(results.atoms(), ["spce"], seed=3)': "MolecularScene",
 }
 
 

@@ -37,7 +37,7 @@ from support import (
     write_checkpoint,
 )
 
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import CheckpointError, OutputError, SimulationError
 from rigidmd.run import Every, Simulation, run_together
 from rigidmd.scene import Scene

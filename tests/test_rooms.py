@@ -33,48 +33,48 @@ RANK = {name: rank for rank, names in enumerate(ROOMS) for name in names}
 
 LIBRARIES = {
     "ase": {
-        "assemble/atoms.py", "assemble/ase_formats.py", "assemble/lammps_formats.py", "assemble/own_formats.py", "assemble/structure_files.py",
-        "assemble/matching.py", "assemble/cells.py", "assemble/own_model.py", "assemble/from_atoms.py", "assemble/to_atoms.py", "assemble/traj_format.py",
-        "output/traj_file.py", "run/atoms.py", "ase.py",
+        "io/atoms.py", "io/formats/through_ase.py", "io/formats/lammps.py", "io/formats/text.py", "io/structure_file.py",
+        "assemble/matching.py", "io/cells.py", "assemble/model_from_geometry.py", "assemble/from_atoms.py", "io/ase_atoms.py", "io/formats/traj.py",
+        "io/formats/traj_writer.py", "run/ase_frames.py", "ase.py",
     },
     "MDAnalysis": {
-        "assemble/frame_reader.py", "output/readers.py", "output/trajectory.py", "output/trajectory_file.py",
+        "io/formats/frame_reader.py", "io/mdanalysis_readers.py", "io/trajectory.py", "io/trajectory_writer.py",
     },
-    "distributed": {"study/sweep/cluster.py"},
-    "gsd": {"assemble/gsd_format.py", "output/gsd_file.py"},
-    "tomli_w": {"output/scene_file.py"},
-    "rocket_fft": {"forces/waves/mesh.py"},
-    "sympy": {"forces/laws/formulas.py", "peers/formulas.py"},
-    "openmm": {"peers/openmm_system.py", "peers/openmm_files.py"},
+    "distributed": {"studies/sweep/cluster.py"},
+    "gsd": {"io/formats/gsd.py", "io/formats/gsd_writer.py"},
+    "tomli_w": {"io/scene_file.py"},
+    "rocket_fft": {"forces/ewald/pme.py"},
+    "sympy": {"forces/potentials/formulas.py", "engines/expressions.py"},
+    "openmm": {"engines/openmm/system.py", "engines/openmm/files.py"},
     "matplotlib": {
-        "output/figure.py", "output/page.py", "output/picture.py", "output/body_figures.py", "output/precision_report.py",
-        "output/stability_report.py", "output/molecule_figure.py", "output/averages_report.py", "looking/plots.py",
-        "looking/film.py", "analyse/files.py", "study/sweep/figure.py", "looking/draw_body.py", "looking/draw_molecules.py", "looking/gallery.py",
+        "figures/style.py", "view/page.py", "figures/picture.py", "figures/body.py", "studies/accuracy/report.py",
+        "studies/stability/report.py", "view/molecule_figure.py", "studies/accuracy/averages_report.py", "view/plots.py",
+        "view/film.py", "analysis/files.py", "studies/sweep/figure.py", "view/draw_body.py", "view/draw_molecules.py", "view/gallery.py",
     },
     "pydantic": {
-        "analyse/files.py", "molecules.py", "output/run_files.py", "output/sweep_folder.py", "run/body.py",
-        "run/molecules.py", "run/provenance.py", "run/resuming.py", "run/stretches.py", "scene/__init__.py",
-        "scene/actions.py", "scene/base.py", "scene/body.py", "scene/engine.py", "scene/fields.py",
-        "scene/forces.py", "scene/molecules.py", "scene/place.py", "scene/species.py", "scene/stage.py",
-        "validation.py",
+        "analysis/files.py", "scene/models.py", "io/run_files.py", "studies/sweep/folder.py", "run/body.py",
+        "run/molecular.py", "run/provenance.py", "run/resume.py", "run/segments.py", "scene/__init__.py",
+        "scene/body_forces.py", "scene/base.py", "scene/body.py", "scene/engine.py", "scene/fields.py",
+        "scene/forces.py", "scene/molecules.py", "scene/start.py", "scene/species.py", "scene/stage.py",
+        "scene/validation.py",
     },
-    "IPython": {"output/progress.py"},
-    "chemiscope": {"looking/inline.py"},
+    "IPython": {"io/progress.py"},
+    "chemiscope": {"view/inline.py"},
     "numba": {
-        "compile/settings.py", "compile/cache.py", "compile/code.py", "compile/crew.py", "compile/kernels.py", "compile/lane_math.py",
+        "compile/settings.py", "compile/cache.py", "compile/code.py", "compile/thread_pool.py", "compile/kernels.py", "compile/simd_math.py",
         "compile/layout.py",
-        "compile/lane_types.py", "compile/lanes.py", "compile/machine.py", "compile/numba_private.py",
-        "compile/own.py", "compile/records.py", "forces/pairs/loop.py", "forces/pairs/sites.py", "forces/terms.py",
+        "compile/simd_types.py", "compile/simd.py", "compile/machine.py", "compile/numba_private.py",
+        "compile/own.py", "compile/simd_records.py", "forces/neighbors/pair_loop.py", "forces/neighbors/sites.py", "forces/terms.py",
     },
 }  # fmt: skip
 
 # Inside of a function: a value tells what would be made of it, and shows itself in a notebook.
 LAZY = {
-    ("scene/molecules.py", "rigidmd.assemble.system"), ("scene/molecules.py", "rigidmd.assemble.to_atoms"),
+    ("scene/molecules.py", "rigidmd.assemble.build"), ("scene/molecules.py", "rigidmd.io.ase_atoms"),
     ("scene/body.py", "rigidmd.assemble.body"), ("scene/base.py", "rigidmd.assemble.from_atoms"),
-    ("scene/base.py", "rigidmd.looking.notebook"), ("run/loop.py", "rigidmd.looking.notebook"),
-    ("run/results.py", "rigidmd.looking.notebook"), ("run/results.py", "rigidmd.looking.columns"),
-    ("run/results.py", "rigidmd.looking.inline"),
+    ("scene/base.py", "rigidmd.view.notebook"), ("run/simulation.py", "rigidmd.view.notebook"),
+    ("run/results.py", "rigidmd.view.notebook"), ("run/results.py", "rigidmd.view.columns"),
+    ("run/results.py", "rigidmd.view.inline"),
 }  # fmt: skip
 
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -49,7 +49,7 @@ from support import (
 )
 
 import rigidmd
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Observer, Simulation
 from rigidmd.scene import MolecularScene, Scene
@@ -556,15 +556,15 @@ def test_warnings_reach_whoever_calls_from_python():
 def test_when_total_momentum_is_taken_out():
     pme = {"electrostatics": "pme", "cutoff_A": 9.0}
     frozen = [{"model": "spce", "count": 2}, {"model": "argon", "count": 2, "frozen": True}]
-    assert argon().resolved().run.remove_momentum_interval_ps is False
-    assert argon(forces=pme).resolved().run.remove_momentum_interval_ps == 1.0
-    assert argon(forces=pme | {"electrostatics": "ewald"}).resolved().run.remove_momentum_interval_ps is False
+    assert rigidmd.resolve(argon()).run.remove_momentum_interval_ps is False
+    assert rigidmd.resolve(argon(forces=pme)).run.remove_momentum_interval_ps == 1.0
+    assert rigidmd.resolve(argon(forces=pme | {"electrostatics": "ewald"})).run.remove_momentum_interval_ps is False
     assert (
-        argon(forces=pme, run={"remove_momentum_interval_ps": False}).resolved().run.remove_momentum_interval_ps
+        rigidmd.resolve(argon(forces=pme, run={"remove_momentum_interval_ps": False})).run.remove_momentum_interval_ps
         is False
     )
-    assert small_scene({}, 25.0, molecules=frozen, forces=pme).resolved().run.remove_momentum_interval_ps is False
-    assert small_scene({"argon": 3}, None).resolved().run.remove_momentum_interval_ps is False
+    assert rigidmd.resolve(small_scene({}, 25.0, molecules=frozen, forces=pme)).run.remove_momentum_interval_ps is False
+    assert rigidmd.resolve(small_scene({"argon": 3}, None)).run.remove_momentum_interval_ps is False
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
@@ -593,7 +593,7 @@ def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, 
     assert "ewald_accuracy" not in again.forces.model_fields_set
     assert again.start.temperature_K == 300.0
     assert again.forces.skin_A == 1.9
-    assert scene.resolved() == first.system.scene
+    assert rigidmd.resolve(scene) == first.system.scene
     assert again.model_dump() == first.system.scene.model_dump()
     repeated = Simulation(again).run()
     for one, other in zip(first.state, repeated.state, strict=True):
@@ -605,8 +605,8 @@ def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, 
 def test_a_resolved_scene_has_every_number_and_resolves_to_itself(electrostatics, angles):
     box = {"lengths_A": [22.0, 23.0, 24.0], "angles_deg": angles}
     scene = small_scene({"spce": 30}, None, box=box, forces={"electrostatics": electrostatics})
-    resolved = scene.resolved()
-    assert resolved.resolved() == resolved != scene
+    resolved = rigidmd.resolve(scene)
+    assert rigidmd.resolve(resolved) == resolved != scene
     for key in {"skin_A", *DECIDED.get(electrostatics, DECIDED["reaction_field"])}:
         assert getattr(resolved.forces, key) is not None, key
     assert resolved.forces.ewald_accuracy is None  # what follows from it is there
@@ -614,11 +614,11 @@ def test_a_resolved_scene_has_every_number_and_resolves_to_itself(electrostatics
     assert resolved.start.temperature_K == 300.0
     assert resolved.output.velocities is False
     again = MolecularScene.model_validate(resolved.model_dump(exclude_none=True))
-    assert again.resolved() == again
+    assert rigidmd.resolve(again) == again
 
 
 def test_without_a_box_there_is_no_cut_off_to_decide():
-    resolved = small_scene({"spce": 3}, None).resolved()
+    resolved = rigidmd.resolve(small_scene({"spce": 3}, None))
     assert resolved.forces.cutoff_A is resolved.forces.switch_start_A is None
 
 
@@ -627,13 +627,13 @@ def test_a_cell_that_leans_too_much_leaves_only_the_grid_open():
     box = {"lengths_A": [24.0, 24.0, 24.0], "angles_deg": [60.0, 60.0, 45.0]}
     forces = {"electrostatics": "pme", "cutoff_A": 8.0}
     scene = small_scene({"spce": 30}, None, box=box, forces=forces)
-    resolved = scene.resolved()
-    assert resolved.resolved() == resolved
+    resolved = rigidmd.resolve(scene)
+    assert rigidmd.resolve(resolved) == resolved
     assert resolved.forces.pme_grid is None
     first, again = (build(each).terms["coulomb_reciprocal"] for each in (scene, resolved))
     assert (resolved.forces.ewald_accuracy, resolved.forces.pme_order) == (1e-5, first.order)
     assert (first.grid, first.order) == (again.grid, again.order)
-    even = small_scene({"spce": 30}, None, box=box, forces=forces | {"pme_grid": [60, 60, 60]}).resolved()
+    even = rigidmd.resolve(small_scene({"spce": 30}, None, box=box, forces=forces | {"pme_grid": [60, 60, 60]}))
     assert (even.forces.pme_grid, even.forces.ewald_accuracy) == ((60, 60, 60), None)
 
 
@@ -1072,7 +1072,7 @@ def test_energy_of_the_dimer_in_every_unit(capsys):
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
-    code = "import sys; from rigidmd.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\nprint(sorted({'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'} & set(sys.modules)))"
+    code = "import sys; from rigidmd.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\nprint(sorted({'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
     assert "example" in done.stdout

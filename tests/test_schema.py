@@ -7,7 +7,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from support import SYSTEMS, available_models
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.scene import schema
 
 VALIDATOR = Draft202012Validator(schema())

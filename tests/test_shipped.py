@@ -7,7 +7,7 @@ import tomllib
 import pytest
 from support import BODIES, ROOT, SHIPPED, SYSTEMS
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.scene import Scene
 
 
@@ -117,6 +117,6 @@ def test_what_cannot_be_copied_is_said(arguments, expected, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("arguments", [["examples"], ["help"], ["help", "manual"]])
 def test_what_only_prints_is_quick_and_imports_nothing_heavy(arguments):
-    code = f"import sys; from rigidmd.cli import main\nmain({arguments})\nprint(sorted({{'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'}} & set(sys.modules)))"
+    code = f"import sys; from rigidmd.commands.cli import main\nmain({arguments})\nprint(sorted({{'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

@@ -12,7 +12,7 @@ from support import stability_picture as picture
 from support import stability_table as table_text
 from support import stability_words as words
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 
 NAMES = [case.name for case in chosen(None)]

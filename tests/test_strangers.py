@@ -15,7 +15,7 @@ from support import COLUMNS, Sample, Samples, Saved, build, line_of, memory, rea
 from support import memory_room as room
 from support import wave_vectors as vectors
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import MoleculeError, SceneError, StructureError
 from rigidmd.scene import MolecularScene, Scene
 

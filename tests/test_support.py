@@ -9,7 +9,15 @@ import support
 from support import ROOT
 
 TESTS = ROOT / "tests"
-PUBLIC = {"rigidmd", "rigidmd.ase", "rigidmd.cli", "rigidmd.errors", "rigidmd.run", "rigidmd.scene", "rigidmd.units"}
+PUBLIC = {
+    "rigidmd",
+    "rigidmd.ase",
+    "rigidmd.commands.cli",
+    "rigidmd.errors",
+    "rigidmd.run",
+    "rigidmd.scene",
+    "rigidmd.units",
+}
 OPEN = "the assumptions about Numba and the rules of compiled code are what it tests"
 #: Past the door: file -> the inner packages that it imports itself, why.
 PAST = {

@@ -43,7 +43,7 @@ from support import (
 from support import axis_settings as settings
 
 import rigidmd
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
 

@@ -15,8 +15,8 @@ from support import ROOT, SCHEMES, small_scene
 
 from rigidmd import Every, Simulation, run_together
 from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
-from rigidmd.compile.crew import CLAIMED, FIRST_HELPER, SLEEPS, _crew, _pause, _read, _take, _write  # noqa: F401
 from rigidmd.compile.machine import MOST_THREADS
+from rigidmd.compile.thread_pool import CLAIMED, FIRST_HELPER, SLEEPS, _crew, _pause, _read, _take, _write  # noqa: F401
 from rigidmd.errors import SimulationError
 
 

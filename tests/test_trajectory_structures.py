@@ -27,7 +27,7 @@ from support import (
     write_topology,
 )
 
-from rigidmd import cli
+from rigidmd.commands import cli
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -23,7 +23,7 @@ from support import (
     watch,
 )
 
-from rigidmd.cli import main
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

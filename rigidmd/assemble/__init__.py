@@ -1,1 +1,1 @@
-"""From a scene to what runs: species, start, terms (`system`). Only this room uses ASE, to read structure files."""
+"""From a scene to a system: defaults, species, starting configuration, force terms, user code."""

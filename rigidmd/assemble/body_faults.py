@@ -3,10 +3,10 @@
 import numpy as np
 
 from rigidmd.assemble.body_parts import frame_of, inertia_at_centre, principal, resistance_of
-from rigidmd.core.schemes import SCHEMES, SOLVERS
+from rigidmd.core.integrators import SCHEMES, SOLVERS
 from rigidmd.forces.body.frame import Turning
 from rigidmd.forces.body.resistance import NoResistance
-from rigidmd.mechanics.course import keeps_direction
+from rigidmd.mechanics.time_functions import keeps_direction
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import axis_of_symmetry
 

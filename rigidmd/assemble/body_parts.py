@@ -4,17 +4,17 @@ from itertools import permutations
 
 import numpy as np
 
-from rigidmd.forces.body.fields import Drive, SteadyForce
+from rigidmd.forces.body.applied import Drive, SteadyForce
 from rigidmd.forces.body.frame import Inertial, Turning
 from rigidmd.forces.body.resistance import NoResistance, Resistance
-from rigidmd.mechanics.course import Course, integral, is_steady, steady, table, total, window
+from rigidmd.mechanics.free_rotor import DrivenRotor, split_rotor
 from rigidmd.mechanics.inertia import inertia_tensor, shifted
 from rigidmd.mechanics.rotation import direction
-from rigidmd.mechanics.rotor import DrivenRotor, split_rotor
 from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
+from rigidmd.mechanics.time_functions import Course, integral, is_steady, steady, table, total, window
 from rigidmd.scene import BodyScene
-from rigidmd.scene.actions import Timed
-from rigidmd.validation import settled
+from rigidmd.scene.body_forces import Timed
+from rigidmd.scene.validation import settled
 
 #: Principal moments of a tensor are equal if they differ by less than this fraction of the largest.
 ROUNDING = 1e-13

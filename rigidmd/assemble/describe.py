@@ -5,22 +5,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.body import BodySystem, build_body
-from rigidmd.assemble.cells import angles_deg, right_angled
+from rigidmd.assemble.body import build_body
+from rigidmd.assemble.build import build
 from rigidmd.assemble.fields import fields_in_words
-from rigidmd.assemble.room import bytes_of
-from rigidmd.assemble.stage_words import stage_in_words
-from rigidmd.assemble.system import System, build
+from rigidmd.assemble.memory_check import bytes_of
+from rigidmd.assemble.stage_description import stage_in_words
 from rigidmd.compile.machine import threads_for
-from rigidmd.core.schemes import Scheme, Solver
-from rigidmd.dynamics.body import Body
-from rigidmd.forces.pairs.loop import PairForces
-from rigidmd.forces.pairs.space import cell_of
+from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.system import System
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.neighbors.space import cell_of
+from rigidmd.io.cells import angles_deg, right_angled
+from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
-from rigidmd.mechanics.rotor import NoRotor
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.own import name_of
-from rigidmd.validation import settled
+from rigidmd.scene.user_code import name_of
+from rigidmd.scene.validation import settled
 
 #: The arithmetic of forces, in words. Times: docs/benchmarks.md; the error is what tests/test_lanes.py allows.
 PRECISIONS = {

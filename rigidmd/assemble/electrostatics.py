@@ -6,28 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.resolve import charges_in
 from rigidmd.core.state import State
+from rigidmd.engines.system import charges_in
 from rigidmd.errors import SceneError
-from rigidmd.forces.laws.coulomb import reaction_field, self_energy
-from rigidmd.forces.laws.lennard_jones import Tail
-from rigidmd.forces.laws.screened import damped_self_energy, damped_shifted_force, screened_coulomb
-from rigidmd.forces.pairs.loop import pair_forces
-from rigidmd.forces.pairs.sites import BodySites, CentralSites
-from rigidmd.forces.pairs.space import Space, cell_of
-from rigidmd.forces.waves import corrections, ewald, vectors
-from rigidmd.forces.waves.errors import (
-    Charges,
-    mesh_error,
-    radius_of,
-    real_error,
-    wave_error,
-    wave_radius_for,
-)
-from rigidmd.molecules import Molecule, of_each
+from rigidmd.forces.ewald import corrections, direct_sum, k_vectors
+from rigidmd.forces.ewald.errors import Charges, mesh_error, radius_of, real_error, wave_error, wave_radius_for
+from rigidmd.forces.neighbors.pair_loop import pair_forces
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites
+from rigidmd.forces.neighbors.space import Space, cell_of
+from rigidmd.forces.potentials.coulomb import reaction_field, self_energy
+from rigidmd.forces.potentials.lennard_jones import Tail
+from rigidmd.forces.potentials.screened_coulomb import damped_self_energy, damped_shifted_force, screened_coulomb
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.models import Molecule, of_each
+from rigidmd.scene.validation import settled
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
-from rigidmd.validation import settled
 
 #: A net charge below this fraction of the sum of |q| is rounding.
 NEUTRAL = 1e-10
@@ -109,7 +102,7 @@ class _Ewald(NamedTuple):
 
     real_error: float  # e²/Å², see ewald_errors
     wave_error: float
-    waves: vectors.Waves | None  # with PME only for the interactions of frozen molecules
+    waves: k_vectors.Waves | None  # with PME only for the interactions of frozen molecules
 
 
 def _waves(scene: MolecularScene, charged: Charged, space: Space, basis: np.ndarray, grid: Grid | None) -> _Ewald:
@@ -122,15 +115,15 @@ def _waves(scene: MolecularScene, charged: Charged, space: Space, basis: np.ndar
         left = mesh_error(charges, alpha, cell, grid, settled(forces.pme_order))
         over = None
         if charged.frozen.any():
-            over = vectors.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
+            over = k_vectors.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
         return _Ewald(beyond, left, over)
     most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
     if isinstance(most, int):
         most = (most, most, most)
     if radius is None:
-        over = vectors.waves(settled(most), forces.ewald_k2_max, basis)
+        over = k_vectors.waves(settled(most), forces.ewald_k2_max, basis)
     else:
-        over = vectors.waves_within(reciprocal, radius, most, basis)
+        over = k_vectors.waves_within(reciprocal, radius, most, basis)
     if over.total == 0:
         raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no wave at all"])
     return _Ewald(beyond, wave_error(charges, alpha, radius_of(over.total, volume), volume), over)
@@ -152,12 +145,12 @@ def _ewald(
     law = screened_coulomb(charged.charge_e, cutoff, alpha, shifted, FIT_SHARE * found.real_error)
     if grid is None:
         waves = settled(found.waves)
-        over = ewald.EwaldSum(alpha, charge, charged.sites, waves)
+        over = direct_sum.EwaldSum(alpha, charge, charged.sites, waves)
         how = f"{waves.total} waves, |n| up to {' '.join(map(str, waves.most))}"
-        if forces.ewald_k_max is not None and not np.array_equal(basis, vectors.AS_GIVEN):
+        if forces.ewald_k_max is not None and not np.array_equal(basis, k_vectors.AS_GIVEN):
             how += "; these are the waves that ewald_k_max means in the cell that was described"
     else:
-        from rigidmd.forces.waves.mesh import Pme  # rocket-fft is for scenes with PME only
+        from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
         order = settled(forces.pme_order)
         over = Pme(alpha, charge, charged.sites, grid, order)
@@ -205,7 +198,7 @@ def _of_frozen(
     charge: np.ndarray,
     space: Space,
     alpha: float,
-    waves: vectors.Waves,
+    waves: k_vectors.Waves,
     permittivity: float,
     state: State,
 ) -> tuple[float, float]:
@@ -218,7 +211,7 @@ def _of_frozen(
     if len(state.rotation):
         arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
     position = state.position[sites.molecule] + arms
-    energy, force, virial = ewald.sum_of(charge, position, cell_of(space), alpha, waves)
+    energy, force, virial = direct_sum.sum_of(charge, position, cell_of(space), alpha, waves)
     dipole = charge @ position
     surface = 2 * pi / ((2 * permittivity + 1) * volume)
     force -= 2 * surface * charge[:, None] * dipole

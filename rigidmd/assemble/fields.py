@@ -5,21 +5,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.momenta import kept_momentum
 from rigidmd.core.state import State
-from rigidmd.dynamics.advance import Model
+from rigidmd.dynamics.momenta import kept_momentum
+from rigidmd.dynamics.step_loop import Model
 from rigidmd.errors import SceneError
-from rigidmd.forces.external.electric import ElectricField, OscillatingField
-from rigidmd.forces.external.gravity import Weight
-from rigidmd.forces.external.restraints import Restraints
-from rigidmd.forces.external.walls import HarmonicWalls, LennardJonesWalls
-from rigidmd.forces.pairs.sites import sites_of
-from rigidmd.forces.pairs.space import Orthorhombic, Space, Unbounded
-from rigidmd.molecules import Molecule
+from rigidmd.forces.fields.electric import ElectricField, OscillatingField
+from rigidmd.forces.fields.gravity import Weight
+from rigidmd.forces.fields.restraints import Restraints
+from rigidmd.forces.fields.walls import HarmonicWalls, LennardJonesWalls
+from rigidmd.forces.neighbors.sites import sites_of
+from rigidmd.forces.neighbors.space import Orthorhombic, Space, Unbounded
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES, Walls
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.validation import settled
 from rigidmd.units import KJ_PER_MOL, METRE_PER_S2, VOLT_PER_NM
-from rigidmd.validation import settled
 
 #: The least distance of a lattice's molecules from a Lennard-Jones wall, in sigma: that of its well.
 WELL = (2 / 5) ** (1 / 6)

@@ -3,16 +3,16 @@
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import numpy as np
 
-from rigidmd.assemble.ase_formats import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
-from rigidmd.assemble.cells import cell_fault
-from rigidmd.core.toml_text import plain_values
+from rigidmd.core.toml import plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
+from rigidmd.io.cells import cell_fault
+from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.molecules import HELD
+from rigidmd.scene.molecules import HELD, Settings
 from rigidmd.scene.species import SPECIES_FILES
 
 if TYPE_CHECKING:
@@ -24,10 +24,21 @@ DURATION = 1.0
 SOURCE = "atoms"
 
 
-def scene_of_atoms(
-    atoms: "ase.Atoms", models: str | Sequence[str | Mapping[str, Any]], settings: Mapping[str, Any]
+def scene_from_atoms(
+    atoms: "ase.Atoms", models: str | Sequence[str | Mapping[str, Any]], **settings: Unpack[Settings]
 ) -> MolecularScene:
-    """See `Scene.from_atoms`. Raises SceneError."""
+    """The scene of an `ase.Atoms`, whose atoms become molecules as those of a structure file do.
+
+    Its cell, its periodicity (along all axes or none) and its momenta are taken. Massless sites, as the M of TIP4P,
+    need not be among the atoms. The scene holds the atoms; a run in a folder writes them there.
+
+    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file
+    settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
+        start={"temperature_K": 300} draws momenta in place of those of the atoms. Without stages there is one: 1 ps
+        of nve, or a minimisation where neither atoms nor settings give momenta
+
+    Raises SceneError; that the atoms are no molecules of these models is found when the system is built.
+    """
     if faults := atoms_faults(atoms):
         raise SceneError(SOURCE, faults)
     data = plain_values(settings)

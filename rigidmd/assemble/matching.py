@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
-from rigidmd.assemble.cells import pairs_within
+from rigidmd.io.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
+from rigidmd.io.cells import pairs_within
 from rigidmd.mechanics.rotation import align
-from rigidmd.molecules import Molecule
+from rigidmd.scene.models import Molecule
 
 #: Atoms are bonded up to this multiple of the template's longest bond between such atoms. Hydrogen bonds of water are
 #: at least 1.6 times its bonds.

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.assemble.cells import pairs_within
-from rigidmd.assemble.momenta import mobile
 from rigidmd.core.state import State
-from rigidmd.molecules import Molecule, of_each
+from rigidmd.dynamics.momenta import mobile
+from rigidmd.io.cells import pairs_within
+from rigidmd.scene.models import Molecule, of_each
 
 if TYPE_CHECKING:
-    from rigidmd.assemble.system import System
+    from rigidmd.engines.system import System
 
 #: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
 #: is 1750 epsilon, which does not occur in liquids.

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.structure_files import read_geometry
 from rigidmd.errors import Faults, SceneError, StructureError
-from rigidmd.molecules import (
+from rigidmd.io.structure_file import read_geometry
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.models import (
     Molecule,
     Site,
     find_site,
@@ -17,9 +18,8 @@ from rigidmd.molecules import (
     with_masses,
     with_parameters,
 )
-from rigidmd.scene import MolecularScene
 from rigidmd.scene.species import Molecules
-from rigidmd.validation import settled
+from rigidmd.scene.validation import settled
 
 
 def species_of(scene: MolecularScene) -> list[Molecule]:

@@ -4,20 +4,20 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.cells import cell_fault
 from rigidmd.assemble.fields import start_lattice
-from rigidmd.assemble.momenta import draw_momenta, mobile, remove_momentum
-from rigidmd.assemble.room import check_molecules
+from rigidmd.assemble.memory_check import check_molecules
 from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
 from rigidmd.core.state import State
-from rigidmd.dynamics.advance import Model
+from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
+from rigidmd.dynamics.step_loop import Model
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.io.cells import cell_fault
 from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.molecules import Molecule
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.validation import settled
 from rigidmd.units import GRAM_PER_CM3
-from rigidmd.validation import settled
 
 
 def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:

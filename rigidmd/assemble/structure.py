@@ -6,8 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.atoms import SAME_MASS, Atoms
-from rigidmd.assemble.cells import (
+from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
+from rigidmd.assemble.memory_check import check_molecules
+from rigidmd.core.state_file import read_state
+from rigidmd.errors import StructureError
+from rigidmd.forces.ewald.k_vectors import AS_GIVEN
+from rigidmd.io.atoms import SAME_MASS, Atoms
+from rigidmd.io.cells import (
     angles_deg,
     basis_in_words,
     basis_of,
@@ -19,14 +24,9 @@ from rigidmd.assemble.cells import (
     same_lattice,
     standard_rotation,
 )
-from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
-from rigidmd.assemble.room import check_molecules
-from rigidmd.assemble.structure_files import read_atoms
-from rigidmd.core.state_file import read_state
-from rigidmd.errors import StructureError
-from rigidmd.forces.waves.vectors import AS_GIVEN
-from rigidmd.molecules import Molecule
-from rigidmd.validation import meant, settled
+from rigidmd.io.structure_file import read_atoms
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.validation import meant, settled
 
 MOST_NAMED = 5  # molecules that a message names; of more it gives the number
 ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge

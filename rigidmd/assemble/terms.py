@@ -6,16 +6,16 @@ import numpy as np
 
 from rigidmd.assemble.electrostatics import Charged, Interactions, electrostatics
 from rigidmd.core.state import State
-from rigidmd.dynamics.advance import Model
+from rigidmd.dynamics.step_loop import Model
 from rigidmd.errors import SceneError
-from rigidmd.forces.laws.lennard_jones import LennardJones, lennard_jones, tail
-from rigidmd.forces.pairs.loop import pair_forces
-from rigidmd.forces.pairs.sites import groups, sites_of
-from rigidmd.forces.pairs.space import Space
-from rigidmd.mechanics.rotor import NoRotor
-from rigidmd.molecules import Molecule, named_sites, of_each
+from rigidmd.forces.neighbors.pair_loop import pair_forces
+from rigidmd.forces.neighbors.sites import groups, sites_of
+from rigidmd.forces.neighbors.space import Space
+from rigidmd.forces.potentials.lennard_jones import LennardJones, lennard_jones, tail
+from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import ROUNDED, short_cutoff
+from rigidmd.scene.models import Molecule, named_sites, of_each
 from rigidmd.units import KJ_PER_MOL
 
 

@@ -16,10 +16,10 @@ from rigidmd.compile.code import (
     packed,
     task,
 )
-from rigidmd.compile.crew import jump_to, set_threads
 from rigidmd.compile.kernels import implements, is_a, kernel
 from rigidmd.compile.layout import Laid
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
+from rigidmd.compile.thread_pool import jump_to, set_threads
 
 __all__ = [
     "BLOCKS",

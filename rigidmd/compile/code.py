@@ -15,7 +15,7 @@ from numba.core.errors import TypingError
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
-from rigidmd.compile import ahead, crew
+from rigidmd.compile import second_process, thread_pool
 from rigidmd.compile.kernels import kernel, options_of
 from rigidmd.compile.layout import Laid, Word
 from rigidmd.compile.numba_private import LINKED, callback, kept_callback, uncounted
@@ -78,8 +78,8 @@ class Task:
     def address(self, parcel: Parcel) -> int:
         """Address of the machine code for a parcel of this type, which is compiled or read from the cache."""
         if parcel not in self.compiled:
-            ahead.wait_for(*self.name, parcel)
-            crew.begin()
+            second_process.wait_for(*self.name, parcel)
+            thread_pool.begin()
             code = callback(self.function, (parcel, types.intp), self.options)
             self.compiled.setdefault(parcel, code)  # another thread may use what it has made meanwhile
         return self.compiled[parcel].address
@@ -92,7 +92,7 @@ class Task:
     def is_ready(self, parcel: Parcel) -> bool:
         """Whether `address` has nothing to compile."""
         if parcel not in self.compiled:
-            crew.begin()
+            thread_pool.begin()
             code = kept_callback(self.function, (parcel, types.intp), self.options)
             if code is None:
                 return False
@@ -117,7 +117,7 @@ def compile_together(make: Callable[[], object]) -> None:
     The function is first called for the tasks and types of its codes alone: these have no addresses, and it must not
     call them.
     """
-    if ahead.compilers() == 1:
+    if second_process.compilers() == 1:
         return
     with _compiling:
         wanted: list[tuple[Task, Parcel]] = []
@@ -127,8 +127,8 @@ def compile_together(make: Callable[[], object]) -> None:
         finally:
             _plan.reset(before)
         missing = [(*one.name, parcel) for one, parcel in dict.fromkeys(wanted) if not one.is_ready(parcel)]
-        if len(missing) >= ahead.FEWEST:
-            with ahead.helped(missing):
+        if len(missing) >= second_process.FEWEST:
+            with second_process.helped(missing):
                 make()
 
 
@@ -259,7 +259,7 @@ def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
         _jump(address, parcel, 0)
     else:
-        crew.share_out(address, parcel, blocks)
+        thread_pool.share_out(address, parcel, blocks)
 
 
 def call(code, name, parcel):

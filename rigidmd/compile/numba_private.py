@@ -38,7 +38,7 @@ from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 
 from rigidmd.compile.cache import cache_folder, shared_folder
-from rigidmd.core.own_code import BY_CONTENT
+from rigidmd.core.user_modules import BY_CONTENT
 from rigidmd.errors import RigidMDWarning
 
 

@@ -1,1 +1,1 @@
-"""What every room may name without compiling anything: the state, status codes, integrators as rows."""
+"""What every package may import, and compiles nothing: the state, status codes, integrators, file helpers."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.compile.lanes import load, store, width_of
+from rigidmd.compile.simd import load, store, width_of
 
 #: Purposes. Each has its own stream, so that an additional draw for one changes nothing for the others.
 LATTICE, MOMENTA, BATH, BOX = 1, 2, 3, 4

@@ -4,7 +4,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import Load, State
 
 

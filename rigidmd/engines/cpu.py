@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.compile import compile_together, set_threads
 from rigidmd.compile.machine import threads_for
 from rigidmd.compile.own import CompileError
-from rigidmd.core.schemes import Scheme, Solver
+from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import (
     ASK,
     BEHIND_WALL,
@@ -23,15 +23,15 @@ from rigidmd.core.state import (
     State,
     no_load,
 )
-from rigidmd.dynamics.advance import Advance, Model, advance_body, code_of, row_of
-from rigidmd.dynamics.baths import NoBath, heat_room
-from rigidmd.dynamics.body import Body
-from rigidmd.dynamics.boxes import BoxRoom, NoBox, Piston, box_room
-from rigidmd.dynamics.gradient import Probe, probe_for
-from rigidmd.dynamics.sums import Extent, Sums, sums_over
+from rigidmd.dynamics.barostats import BoxRoom, NoBox, Piston, box_room
+from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.dynamics.force_gradient import Probe, probe_for
+from rigidmd.dynamics.observables import Extent, Sums, sums_over
+from rigidmd.dynamics.step_loop import Advance, Model, advance_body, code_of, row_of
+from rigidmd.dynamics.thermostats import NoBath, heat_room
 from rigidmd.engines import Tally
 from rigidmd.errors import SimulationError
-from rigidmd.forces.external.walls import Behind, LennardJonesWalls
+from rigidmd.forces.fields.walls import Behind, LennardJonesWalls
 from rigidmd.forces.terms import (
     Loading,
     NoForce,
@@ -44,7 +44,7 @@ from rigidmd.forces.terms import (
     with_room,
     workspace_of,
 )
-from rigidmd.mechanics.rotor import NONE, ExactRotor, SplitRotor
+from rigidmd.mechanics.free_rotor import NONE, ExactRotor, SplitRotor
 
 __all__ = ["BehindWallError", "CompileError", "Engine", "NotFiniteError", "Precision", "keep_time"]
 

@@ -1,1 +1,1 @@
-"""What acts: the one dispatch over terms (`terms`), laws between pairs, pairs, waves, and what acts on one body."""
+"""Forces: the dispatch over force terms, pair potentials, neighbour lists, Ewald sums, fields, forces on a body."""

@@ -1,11 +1,11 @@
 """Runs of molecules and single bodies, from a scene to its results."""
 
 from rigidmd.run.body import BodySimulation
-from rigidmd.run.loop import Simulation
-from rigidmd.run.molecules import MolecularSimulation
+from rigidmd.run.molecular import MolecularSimulation
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Every, Observer
 from rigidmd.run.results import Results
+from rigidmd.run.simulation import Simulation
 from rigidmd.run.together import run_together
 
 __all__ = [

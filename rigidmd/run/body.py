@@ -8,32 +8,33 @@ from typing import Any, Unpack
 
 from pydantic import PositiveFloat
 
-from rigidmd.assemble.body import BodySystem, Pose, build_body
+from rigidmd.assemble.body import build_body
 from rigidmd.compile.cache import kept_in_words
-from rigidmd.core.schemes import Scheme
+from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN
+from rigidmd.engines.body_motion import Motion, Snapshot, motion
+from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.cpu import Engine
-from rigidmd.engines.textbook import OdeEngine
+from rigidmd.engines.ode import OdeEngine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.measure.body_summary import summarise_body
-from rigidmd.measure.motion import Motion, Snapshot, motion
-from rigidmd.measure.stable_step import body_rate, stable_angle
-from rigidmd.measure.subjects import decided_for_body
-from rigidmd.output.checkpoint import Checkpoint
-from rigidmd.output.report import body_summary_text
-from rigidmd.output.scene_file import write_scene
+from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
-from rigidmd.run.loop import Simulation
+from rigidmd.run.body_summary import summarise_body
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Frames, Observer, SceneFile
 from rigidmd.run.options import Options
+from rigidmd.run.pilot.stable_step import body_rate, stable_angle
+from rigidmd.run.pilot.subjects import decided_for_body
 from rigidmd.run.provenance import plain
+from rigidmd.run.report import body_summary_text
 from rigidmd.run.results import Results
-from rigidmd.run.resuming import Record, check_same_scene, read_as, state_from
+from rigidmd.run.resume import Record, check_same_scene, read_as, state_from
+from rigidmd.run.segments import Costs, Stretch
 from rigidmd.run.signals import interruptible
-from rigidmd.run.stretches import Costs, Stretch
+from rigidmd.run.simulation import Simulation
 from rigidmd.scene import BodyScene
-from rigidmd.validation import settled
+from rigidmd.scene.validation import settled
 
 
 class BodyRecord(Record):

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.state import NOW, State
-from rigidmd.measure.motion import Motion, Snapshot, motion
-from rigidmd.measure.watch import BODY_PATIENCE, LOOKS, BodyCheck
-from rigidmd.output.body_figures import FIGURES, draw_motion
-from rigidmd.output.checkpoint import Checkpoint
-from rigidmd.output.folder import MOTION, MOTION_NPZ
-from rigidmd.output.run_figures import body_figures
-from rigidmd.output.write import write_columns, write_npz
+from rigidmd.engines.body_motion import Motion, Snapshot, motion
+from rigidmd.figures.body import FIGURES, draw_motion
+from rigidmd.figures.run import body_figures
+from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.folder import MOTION, MOTION_NPZ
+from rigidmd.io.write import write_columns, write_npz
+from rigidmd.run.checks import BODY_PATIENCE, LOOKS, BodyCheck
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
-from rigidmd.run.resuming import state_from
-from rigidmd.validation import settled
+from rigidmd.run.resume import state_from
+from rigidmd.scene.validation import settled
 
 if TYPE_CHECKING:
     from rigidmd.run.body import BodySimulation

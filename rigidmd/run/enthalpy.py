@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.momenta import mobile
-from rigidmd.assemble.system import System
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.boxes import COMPONENTS, COUPLINGS
+from rigidmd.dynamics.barostats import COMPONENTS, COUPLINGS
+from rigidmd.dynamics.momenta import mobile
+from rigidmd.engines.system import System
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR

@@ -6,14 +6,14 @@ from math import inf, isfinite
 
 import numpy as np
 
-from rigidmd.assemble.system import System
 from rigidmd.core.state import WORK, State
-from rigidmd.dynamics.boxes import LONGEST_DRIFT
+from rigidmd.dynamics.barostats import LONGEST_DRIFT
+from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
-from rigidmd.measure import watch
-from rigidmd.measure.minimum import Minimum
+from rigidmd.run import checks
 from rigidmd.run.enthalpy import Enthalpy, Point
-from rigidmd.run.relief import LONGEST_MOVE, relieve
+from rigidmd.run.minimum import Minimum
+from rigidmd.run.overlap_removal import LONGEST_MOVE, relieve
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, KJ_PER_MOL
 
@@ -209,11 +209,11 @@ def _check_volume(system: System, start: Point, point: Point) -> None:
 
 def _check_charges(system: System, point: Point) -> None:
     """Raise SimulationError if opposite charges are on top of each other: the energy then has no lower bound."""
-    pair = watch.pair_in_core(system, point.state, None)
+    pair = checks.pair_in_core(system, point.state, None)
     if pair is None or not pair.bare:
         return
     a, b = (
-        f"{system.sites.name[site]} of {watch.named(system, system.sites.molecule[site])}"
+        f"{system.sites.name[site]} of {checks.named(system, system.sites.molecule[site])}"
         for site in (pair.first, pair.second)
     )
     one, other = system.sites.name[[pair.first, pair.second]]

@@ -8,20 +8,20 @@ from rigidmd.core.files import whole_file
 from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
 from rigidmd.engines.cpu import Engine
-from rigidmd.measure import watch
-from rigidmd.measure.samples import Samples
-from rigidmd.output.checkpoint import Checkpoint, count_list
-from rigidmd.output.figure import save_figure
-from rigidmd.output.folder import ENERGY, FINAL, LAST_GOOD, LOG
-from rigidmd.output.log import Log
-from rigidmd.output.pressure import TENSOR_FILE, TensorFile, tensor_row
-from rigidmd.output.run_figures import run_figures
+from rigidmd.engines.samples import Samples
+from rigidmd.figures.run import run_figures
+from rigidmd.figures.style import save_figure
+from rigidmd.io.checkpoint import Checkpoint, count_list
+from rigidmd.io.folder import ENERGY, FINAL, LAST_GOOD, LOG
+from rigidmd.io.log import Log
+from rigidmd.io.pressure import TENSOR_FILE, TensorFile, tensor_row
+from rigidmd.run import checks
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Growing, Observer
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
-    from rigidmd.run.molecules import MolecularSimulation
+    from rigidmd.run.molecular import MolecularSimulation
     from rigidmd.run.results import Results
 
 
@@ -95,7 +95,7 @@ class Sampler(Observer):
 
     ends = reads_energies = True
 
-    def __init__(self, run: "MolecularSimulation", interval: float, check: watch.StepCheck):
+    def __init__(self, run: "MolecularSimulation", interval: float, check: checks.StepCheck):
         self.interval = interval
         self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.own))
         self.last_good: Good | None = None
@@ -123,7 +123,7 @@ class Sampler(Observer):
             self._check.rescale(seen.kinetic)
         if finding := self._check.finding(run.state, seen.load, stage, run.extent):
             raise finding
-        if finding := watch.sample_finding(run.system, run.scene.watch, samples.row(since), now):
+        if finding := checks.sample_finding(run.system, run.scene.watch, samples.row(since), now):
             raise finding
         self._check.rescale(seen.kinetic)
         self._keep(moment.step, moment.time)
@@ -174,8 +174,8 @@ class StepWatch(Observer):
 
     ends = True
 
-    def __init__(self, run: "MolecularSimulation", check: watch.StepCheck):
-        self.steps = watch.steps_between(run.system)
+    def __init__(self, run: "MolecularSimulation", check: checks.StepCheck):
+        self.steps = checks.steps_between(run.system)
         self._run, self._check = run, check
 
     def see(self, moment: Moment) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 from rigidmd.core.state import State
 
 if TYPE_CHECKING:
-    from rigidmd.measure.samples import Sample
-    from rigidmd.run.loop import Simulation
-    from rigidmd.run.molecules import MolecularSimulation
+    from rigidmd.engines.samples import Sample
+    from rigidmd.run.molecular import MolecularSimulation
+    from rigidmd.run.simulation import Simulation
 
 
 class Moment:

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.core.state import NOW
-from rigidmd.output.checkpoint import Checkpoint, count_list
-from rigidmd.output.folder import SCENE
-from rigidmd.output.frame import Frame
+from rigidmd.io.checkpoint import Checkpoint, count_list
+from rigidmd.io.folder import SCENE
+from rigidmd.io.frame import Frame
 from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
-    from rigidmd.run.loop import Simulation
     from rigidmd.run.results import Results
+    from rigidmd.run.simulation import Simulation
 
 
 def above_zero(interval: float, name: str) -> float:
@@ -153,7 +153,7 @@ class Frames(Growing):
         """Write the topology and open the trajectory."""
         self._run, self._frames = run, []
         if run.folder is not None:
-            from rigidmd.output.trajectory_file import write_topology  # MDAnalysis is slow to import
+            from rigidmd.io.trajectory_writer import write_topology  # MDAnalysis is slow to import
 
             write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)
             self._open(None)
@@ -172,7 +172,7 @@ class Frames(Growing):
         self._open(counts)
 
     def _open(self, kept: Sequence[int] | None) -> None:
-        from rigidmd.output.trajectory_file import open_trajectory
+        from rigidmd.io.trajectory_writer import open_trajectory
 
         run, path = self._run, self._run.path(self._names[1])
         self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, kept)

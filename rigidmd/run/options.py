@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 if TYPE_CHECKING:
-    from rigidmd.assemble.body import Pose
-    from rigidmd.own.force import Force, HasStage, HasTerm
-    from rigidmd.own.pair_law import PairLaw
+    from rigidmd.assemble.user_code.force import Force, HasStage, HasTerm
+    from rigidmd.assemble.user_code.pair_potential import PairLaw
+    from rigidmd.engines.body_system import Pose
     from rigidmd.run.observers import Observer
 
 

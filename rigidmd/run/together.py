@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from typing import cast
 
 from rigidmd.compile.machine import MOST_THREADS
-from rigidmd.run.loop import Simulation
 from rigidmd.run.results import Results
 from rigidmd.run.signals import ending_signals, handled
+from rigidmd.run.simulation import Simulation
 
 #: Seconds between two looks at who has asked to stop.
 TICK = 0.2

@@ -5,9 +5,9 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode, JsonSchemaValue, models_json_schema
 
-from rigidmd.molecules import available_models
 from rigidmd.scene.base import Scene, parse_override
 from rigidmd.scene.body import BodyScene
+from rigidmd.scene.models import available_models
 from rigidmd.scene.molecules import MolecularScene
 
 __all__ = ["BodyScene", "MolecularScene", "Scene", "parse_override", "schema"]

@@ -2,14 +2,15 @@
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Unpack, overload
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, overload
 
 from pydantic import Field, PrivateAttr, ValidationError
 
+from rigidmd.core.display import Displayed
 from rigidmd.core.files import file_fault
-from rigidmd.core.toml_text import (
+from rigidmd.core.toml import (
     DEEPEST,
     TOMLDecodeError,
     impossible_values,
@@ -20,19 +21,17 @@ from rigidmd.core.toml_text import (
     whole_number,
 )
 from rigidmd.errors import SceneError
-from rigidmd.shipped import examples
-from rigidmd.validation import Section, faults_of, meant, nearest, numbers_beyond, perhaps, place
+from rigidmd.scene.shipped import examples
+from rigidmd.scene.validation import Section, faults_of, meant, nearest, numbers_beyond, perhaps, place
 
 if TYPE_CHECKING:
-    import ase
-
     from rigidmd.scene.body import BodyScene
-    from rigidmd.scene.molecules import MolecularScene, Settings
+    from rigidmd.scene.molecules import MolecularScene
 
 LONGEST_NAME = 100
 
 
-class Scene(Section):
+class Scene(Section, Displayed):
     """The complete description of a run. Read one with `Scene.read(path)`.
 
     A scene with a table [body] is a `BodyScene`, any other a `MolecularScene`.
@@ -52,11 +51,6 @@ class Scene(Section):
         return f"<{type(self).__name__} {self.in_short}>"
 
     __str__ = __repr__
-
-    def _repr_html_(self) -> str:
-        from rigidmd.looking.notebook import scene_html
-
-        return scene_html(self)
 
     @property
     def in_short(self) -> str:
@@ -121,26 +115,6 @@ class Scene(Section):
         data, text = read_tables(path)
         data.setdefault("name", name_of_file(path))
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
-
-    @classmethod
-    def from_atoms(
-        cls, atoms: "ase.Atoms", models: "str | Sequence[str | dict[str, Any]]", **settings: "Unpack[Settings]"
-    ) -> "MolecularScene":
-        """The scene of an `ase.Atoms`, whose atoms become molecules as those of a structure file do.
-
-        Its cell, its periodicity (along all axes or none) and its momenta are taken. Massless sites, as the M of TIP4P,
-        need not be among the atoms. The scene holds the atoms; a run in a folder writes them there.
-
-        models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file
-        settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
-            start={"temperature_K": 300} draws momenta in place of those of the atoms. Without stages there is one: 1 ps
-            of nve, or a minimisation where neither atoms nor settings give momenta
-
-        Raises SceneError; that the atoms are no molecules of these models is found when the system is built.
-        """
-        from rigidmd.assemble.from_atoms import scene_of_atoms
-
-        return scene_of_atoms(atoms, models, settings)
 
     @overload
     @classmethod

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.core.schemes import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_faults, rotor_fault
+from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_faults, rotor_fault
 from rigidmd.mechanics.inertia import impossible, shifted
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
@@ -21,7 +21,8 @@ from rigidmd.mechanics.rotation import (
     orthogonality_error,
 )
 from rigidmd.mechanics.solids import NUMBERS, SOLIDS
-from rigidmd.scene.actions import (
+from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.body_forces import (
     Applied,
     ChangingInertia,
     Fluid,
@@ -32,9 +33,8 @@ from rigidmd.scene.actions import (
     PositiveVector,
     Wheel,
 )
-from rigidmd.scene.base import Scene, file_name
-from rigidmd.scene.watch import BodyWatch
-from rigidmd.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, place
+from rigidmd.scene.limits import BodyWatch
+from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, place
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -367,15 +367,6 @@ class BodyScene(Scene):
         pinned = ", pinned" if self.body.pinned else ""
         return f"{self.name}: one body{pinned}; {run.duration_s:g} s{how}, {run.integrator}"
 
-    def resolved(self) -> "BodyScene":
-        """The same scene with every number that a run of it uses; it runs to the same bits.
-
-        An integrator that is "auto" stays so until a run has chosen one. Raises SceneError.
-        """
-        from rigidmd.assemble.body import build_body
-
-        return build_body(self).scene
-
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
         found: list[tuple[list, str]] = []
@@ -421,3 +412,7 @@ class BodyScene(Scene):
                 yield "fluid: buoyancy needs [gravity]"
         if self.output.interval_s is not None and self.output.interval_s > self.run.duration_s:
             yield f"output.interval_s = {self.output.interval_s:g} is longer than run.duration_s"
+
+
+SAMPLES = 2000  # of the motion of a body
+FORMULATION = "matrix"

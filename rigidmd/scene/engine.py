@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from rigidmd.validation import Count, Section
+from rigidmd.scene.validation import Count, Section
 
 #: Other engines by their key, as their own pages write them.
 OTHERS = {"lammps": "LAMMPS", "openmm": "OpenMM"}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, Strict, field_validator
 
 from rigidmd.scene.species import ResidueNumber, checked_numbers, spans
-from rigidmd.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
+from rigidmd.scene.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
 
 if TYPE_CHECKING:
     from rigidmd.scene.molecules import MolecularScene

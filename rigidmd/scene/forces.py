@@ -5,9 +5,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from rigidmd.core.toml_text import shortened
-from rigidmd.molecules import Mixing
-from rigidmd.validation import MOST_TABLES, Count, Flag, Line, NonNegative, Number, Positive, Section
+from rigidmd.core.toml import shortened
+from rigidmd.scene.models import Mixing
+from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Line, NonNegative, Number, Positive, Section
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]

@@ -6,22 +6,22 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
 
-from rigidmd.core.toml_text import shortened
+from rigidmd.core.toml import shortened
 from rigidmd.errors import SceneError
-from rigidmd.molecules import SIZES
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
-from rigidmd.scene.own import Own, not_given
-from rigidmd.scene.place import BESIDE, NAMELESS, Box, Start, Structure
+from rigidmd.scene.limits import Watch
+from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
-from rigidmd.scene.watch import Watch
-from rigidmd.validation import MOST_TABLES, Count, Flag, Section
+from rigidmd.scene.start import BESIDE, NAMELESS, Box, Start, Structure
+from rigidmd.scene.user_code import Own, not_given
+from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Section
 
 if TYPE_CHECKING:
-    import ase
+    pass
 
 #: Name of the structure file of a scene that holds atoms.
 HELD = "atoms.xyz"
@@ -164,23 +164,6 @@ class MolecularScene(Scene):
             raise SceneError(self.source, [f"--until {until:g} ps is more than {MOST_STEPS:g} steps away"])
         stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": until - before}))
         return self.model_copy(update={"stages": stages})
-
-    def resolved(self) -> "MolecularScene":
-        """The same scene with every number that a run of it uses; it runs to the same bits.
-
-        An integrator that is "auto" stays so until a run has chosen one. Raises what building the system raises.
-        """
-        from rigidmd.assemble.system import build
-
-        return build(self).scene
-
-    def atoms(self) -> "ase.Atoms":
-        """The start as an `ase.Atoms`, before overlaps are relieved: see `Results.atoms`. Raises as `resolved` does."""
-        from rigidmd.assemble.system import build
-        from rigidmd.assemble.to_atoms import atoms_of
-
-        system = build(self)
-        return atoms_of(system, system.state)
 
     @property
     def in_short(self) -> str:

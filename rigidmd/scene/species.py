@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.molecules import Site, SiteName, model_fault
-from rigidmd.validation import Count, Flag, Line, Positive, Section
+from rigidmd.scene.models import Site, SiteName, model_fault
+from rigidmd.scene.validation import Count, Flag, Line, Positive, Section
 
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")

@@ -4,8 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
 
-from rigidmd.core.schemes import AUTO, SCHEMES, WITH_BATH, Rotor, Scheme, auto_faults, rotor_fault
-from rigidmd.validation import Count, Line, Number, Positive, Section
+from rigidmd.core.integrators import AUTO, SCHEMES, WITH_BATH, Rotor, Scheme, auto_faults, rotor_fault
+from rigidmd.scene.validation import Count, Line, Number, Positive, Section
 
 MOST_STEPS = 1e12
 

@@ -4,7 +4,7 @@ import numpy as np
 import rigidmd
 
 
-@rigidmd.analysis
+@rigidmd.analysis.register
 def layers(frames):
     "share of molecules in the lower half of the box, and spread of their heights (Å)"
     height = frames.positions[:, :, 2] % frames.cell[:, 2, 2][:, None]
@@ -20,6 +20,6 @@ if __name__ == "__main__":
             "output": {"trajectory_interval_ps": 0.1},
         }
     )
-    found = rigidmd.Simulation(scene).run().analyse("layers")
+    found = rigidmd.analysis.analyse(rigidmd.Simulation(scene).run(), "layers")
     print(found)
     assert len(found.values) == 2

@@ -3,7 +3,7 @@ from math import sqrt
 from typing import NamedTuple
 
 import rigidmd
-from rigidmd.dynamics.baths import kinetic_energy, scale_array, translational_energy
+from rigidmd.dynamics.thermostats import kinetic_energy, scale_array, translational_energy
 from rigidmd.units import BOLTZMANN
 
 

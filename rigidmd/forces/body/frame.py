@@ -9,8 +9,8 @@ from math import sqrt
 from typing import NamedTuple
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.mechanics.course import Course, value
-from rigidmd.mechanics.rotor import sine_and_versine, turned
+from rigidmd.mechanics.free_rotor import sine_and_versine, turned
+from rigidmd.mechanics.time_functions import Course, value
 
 
 class Inertial(NamedTuple):

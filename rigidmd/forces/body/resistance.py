@@ -13,8 +13,8 @@ import numpy as np
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import WORK
 from rigidmd.forces.body.frame import frame_rate
-from rigidmd.mechanics.flight import Pinned, along, inertial_mass
-from rigidmd.mechanics.rotor import NoRotor, moments
+from rigidmd.mechanics.free_rotor import NoRotor, moments
+from rigidmd.mechanics.translation import Pinned, along, inertial_mass
 
 MOST_TRIALS = 100  # values of |v|; about six are needed
 SAME_SIZE = 1e-14  # relative error of |v|

@@ -1,1 +1,0 @@
-"""Analyses of runs of molecules: values with errors, curves, figures."""

@@ -1,0 +1,206 @@
+"""What the molecules of a run did: their frames as rigid bodies, rebuilt from the positions and velocities of sites."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from rigidmd.engines.system import System
+from rigidmd.errors import OutputError
+from rigidmd.run.rigid_fit import Bodies, Kind, Rebuilt, kinds_of
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import meant
+from rigidmd.units import BOLTZMANN
+
+#: Two intervals between frames that differ by less than this fraction are equal.
+EVEN = 1e-3
+#: Largest fraction of the box that a wrapped molecule may move between two frames to be followed.
+FAR = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """Frames of a stretch of a run, for analyses. Molecules are whole and their paths continuous.
+
+    f frames, n molecules; Å, ps, u:
+    time (f,), cell (f, 3, 3) rows a, b, c, infinite edges without a box
+    positions (f, n, 3) centres of mass, lab frame; Q (f, n, 3, 3) body to lab, principal axes
+    velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where no frame has them
+    columns : samples of the same stretch by their names in `results[...]`
+    tensor : (l, 7) lines of pressure_tensor.csv, ps and bar, of the same stretch; None where the run kept none
+    interval : time between frames, ps; None if they are not evenly spaced
+    notes : what was mended
+    """
+
+    system: System
+    stage: Stage
+    time: np.ndarray
+    cell: np.ndarray
+    positions: np.ndarray
+    Q: np.ndarray
+    velocities: np.ndarray | None
+    L: np.ndarray | None
+    columns: dict[str, np.ndarray]
+    tensor: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __repr__(self) -> str:
+        return f"<History: {len(self)} frames over {self.span:g} ps>"
+
+    @property
+    def span(self) -> float:
+        """Time from the first frame to the last, ps."""
+        return float(self.time[-1] - self.time[0])
+
+    @cached_property
+    def interval(self) -> float | None:
+        """Time between frames, ps; None if they are not evenly spaced."""
+        gaps = np.diff(self.time)
+        rounding = 2 * float(np.spacing(np.float32(np.abs(self.time).max())))  # files hold times in single precision
+        if len(gaps) == 0 or gaps.min() <= 0 or np.ptp(gaps) > EVEN * gaps.max() + rounding:
+            return None
+        return self.span / len(gaps)
+
+    @property
+    def has_box(self) -> bool:
+        return bool(np.isfinite(self.cell[0, 0, 0]))
+
+    @property
+    def volume(self) -> np.ndarray:
+        """Volume of the cell in each frame (f,), Å³."""
+        return np.linalg.det(self.cell)
+
+    @cached_property
+    def temperature(self) -> float:
+        """Mean temperature of the samples, K."""
+        return float(np.mean(self.columns["temperature"]))
+
+    @property
+    def thermal_energy(self) -> float:
+        """kB T, u Å²/ps²."""
+        return BOLTZMANN * self.temperature
+
+    @cached_property
+    def kinds(self) -> list[Kind]:
+        """The species, frozen ones apart, that have molecules."""
+        return kinds_of(self.system)
+
+    @property
+    def moving(self) -> list[Kind]:
+        """Those that move."""
+        return [kind for kind in self.kinds if kind.moves]
+
+    @cached_property
+    def paths(self) -> np.ndarray:
+        """Paths of centres (f, n, 3), Å, without what a barostat scaled: sums of displacements as fractions of the
+        cell, each times the cell at its end."""
+        if not self.has_box or np.ptp(self.cell, axis=0).max() == 0.0:
+            return self.positions
+        inside = np.einsum("fni,fij->fnj", self.positions, np.linalg.inv(self.cell))
+        moves = np.einsum("fni,fij->fnj", np.diff(inside, axis=0), self.cell[1:])
+        return np.concatenate([self.positions[:1], self.positions[0] + np.cumsum(moves, axis=0)])
+
+    def sites(self, name: str, frames: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (f, k, 3) of what is called `name`, and the molecules (k,) that they belong to.
+
+        name : a site's name (HW1, or HW for HW1 and HW2) or element, or a species for its centres of mass. Raises
+        OutputError.
+        """
+        at, molecules = [], []
+        for kind in self.kinds:
+            chosen = np.array(chosen_sites(kind.molecule, name), int)
+            centre = self.positions[frames][:, kind.index]
+            if kind.name == name:
+                at.append(centre)
+                molecules.append(kind.index)
+            elif len(chosen):
+                offset = kind.molecule.positions_body[chosen]
+                arms = np.zeros((1, 1, 1, 3))
+                if self.Q.shape[1]:
+                    arms = np.einsum("fnij,sj->fnsi", self.Q[frames][:, kind.index], offset)
+                at.append((centre[:, :, None] + arms).reshape(len(centre), -1, 3))
+                molecules.append(np.repeat(kind.index, len(chosen)))
+        if not at:
+            known = names_of(self.system)
+            raise OutputError(f"there is no site {name!r}{meant(name, known) or ';'} there are {', '.join(known)}")
+        return np.concatenate(at, axis=1), np.concatenate(molecules)
+
+    def part(self, first: int, end: int) -> "History":
+        """Some of its frames, as a history. The samples stay those of the whole."""
+        return self._of(slice(first, end))
+
+    def thinned(self, most: int) -> "History":
+        """At most so many of its frames, evenly spaced."""
+        return self._of(slice(None, None, max(1, -(-len(self) // most))))
+
+    def _of(self, frames: slice) -> "History":
+        return replace(
+            self,
+            time=self.time[frames],
+            cell=self.cell[frames],
+            positions=self.positions[frames],
+            Q=self.Q[frames],
+            velocities=None if self.velocities is None else self.velocities[frames],
+            L=None if self.L is None else self.L[frames],
+        )
+
+
+def chosen_sites(molecule: Molecule, name: str) -> list[int]:
+    """Sites of a molecule with this name, or else with it but for a number at the end, or else of this element."""
+    found = [k for k, own in enumerate(molecule.site_names) if own == name]
+    found = found or [k for k, own in enumerate(molecule.site_names) if own.rstrip("0123456789") == name]
+    return found or [k for k, own in enumerate(molecule.elements) if own == name and name != "X"]
+
+
+def names_of(system: System) -> list[str]:
+    """What `History.sites` knows: names of sites, then species."""
+    known = dict.fromkeys(name for m in system.species for name in m.site_names)
+    return list(known | dict.fromkeys(m.name for m in system.species))
+
+
+def rebuilt(
+    system: System,
+    sites: np.ndarray,
+    velocities: np.ndarray | None,
+    cells: np.ndarray,
+    wrapped: bool,
+    step: Callable[[float], object] = lambda share: None,
+) -> tuple[Bodies, list[str]]:
+    """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
+
+    sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
+    wrapped : whether centres were put into the box; their paths are made continuous
+    step : called with the share that is done
+    """
+    fit, n, f = Rebuilt(system), len(system.model.species), len(sites)
+    turning = n if len(system.state.rotation) else 0
+    position, Q = np.empty((f, n, 3)), np.empty((f, turning, 3, 3))
+    velocity, L = (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, turning, 3)))
+    for k, frame in enumerate(sites):
+        try:
+            found = fit.bodies(frame, None if velocities is None else velocities[k])
+        except OutputError as error:
+            raise OutputError(f"frame {k + 1}: {error}") from None
+        for array, values in zip((position, Q, velocity, L), found, strict=True):
+            if array is not None:
+                array[k] = values
+        step((k + 1) / f)
+    notes = []
+    if wrapped and np.isfinite(cells[0, 0, 0]) and f > 1:
+        inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))
+        moves = np.diff(inside, axis=0)
+        moves -= np.round(moves)
+        if (far := float(np.abs(moves).max())) > FAR:
+            raise OutputError(
+                f"molecules move by {far:.2f} of the box between two frames, and the frames hold them wrapped: their "
+                "paths cannot be told. Write output.positions = 'unwrapped', or frames more often"
+            )
+        inside[1:] = inside[0] + np.cumsum(moves, axis=0)
+        position = np.einsum("fni,fij->fnj", inside, cells)
+        notes.append("frames hold wrapped molecules; their paths were made continuous")
+    return Bodies(position, Q, velocity, L), notes

@@ -1,0 +1,149 @@
+"""The system of a scene of molecules: species, model, start, terms. Faults are collected and raised together."""
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+
+from rigidmd.assemble.defaults import Facts, resolve, resolve_momentum
+from rigidmd.assemble.engine_defaults import handed_over
+from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_terms, fields_left_out
+from rigidmd.assemble.memory_check import check_room
+from rigidmd.assemble.overlaps import overlaps
+from rigidmd.assemble.species import frozen_apart, species_of
+from rigidmd.assemble.stage_description import stage_notes
+from rigidmd.assemble.start import arrange, residue_numbers, set_momenta
+from rigidmd.assemble.terms import interactions, left_out
+from rigidmd.core.state import state_of
+from rigidmd.dynamics.momenta import freedom_of, kept_momentum, mobile
+from rigidmd.dynamics.step_loop import Model
+from rigidmd.engines.system import System
+from rigidmd.errors import SceneError, StructureError
+from rigidmd.forces.neighbors.space import space_of
+from rigidmd.forces.potentials.lennard_jones import sum_of
+from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.user_code import not_given
+
+
+def build(scene: MolecularScene, bare: bool = False) -> System:
+    """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found.
+
+    bare : leave out what users add, their code too; for looking at a run that has ended
+    """
+    scene, handover_notes = handed_over(scene)
+    species = species_of(scene)
+    arrangement = arrange(scene, species)
+    space, number = space_of(arrangement.cell), residue_numbers(arrangement)
+    species, index, frozen, faults = frozen_apart(scene, species, arrangement.species, number)
+    counts = np.bincount(index, minlength=len(species))
+    resolved = resolve(scene, Facts(species, counts, space, arrangement.basis))
+    if faults := [*faults, *resolved.faults]:
+        raise SceneError(scene.source, faults)
+    scene = resolved.scene
+    model = _model(species, index, frozen)
+    turning = any(m.inertia.any() for m in species)
+    state = state_of(
+        position=between_walls(scene, space, arrangement.position),
+        rotation=arrangement.rotation if turning else None,
+        cell=arrangement.cell,
+    )
+    acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
+    acting.terms.update(field_terms(scene, Parts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
+    model = model._replace(keeps_momentum=kept_momentum(model, acting.terms))
+    scene = resolve_momentum(scene, model.keeps_momentum)
+    system = System(
+        scene=scene,
+        species=species,
+        model=model,
+        space=space,
+        state=state,
+        terms=acting.terms,
+        freedom=freedom_of(model),
+        constants=acting.constants,
+        constant_pressure=acting.pressure,
+        tail=acting.tail,
+        residue_number=number,
+        from_lattice=scene.structure is None,
+        left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
+        force_error=acting.force_error,
+        notes=[*handover_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
+    )
+    if not bare:
+        if scene.from_python != scene.own.names:
+            raise SceneError(scene.source, [not_given(scene.from_python, scene.own.names)])
+        if scene.forces.custom or scene.from_python:
+            system = with_own(system)
+            scene, model = system.scene, system.model
+    if tied := system.tied_to_places:
+        words = ", ".join(name.replace("_", " ") for name in tied)
+        faults = [
+            f"stages.{k}: {stage.ensemble} changes the box, and {words} depend on places in it: keep the volume"
+            for k, stage in enumerate(scene.stages)
+            if stage.changes_box
+        ]
+        if faults:
+            raise SceneError(scene.source, faults)
+    check_room(system)
+    system.notes.extend(scene.rounded_times())
+    system.notes.extend(
+        f"stages.{k}: the total momentum is conserved and zero, so that nothing moves and there is no temperature; "
+        "thermostat = 'langevin' moves it"
+        for k, stage in enumerate(scene.stages)
+        if not stage.is_minimisation and len(index) and system.freedom_in(k).total == 0 and mobile(model).any()
+    )
+    system.notes.extend(set_momenta(scene, model, state, arrangement))
+    system.notes.extend(
+        f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
+        for m in {m.name: m for m in species}.values()
+        if m.mixing not in (None, scene.forces.mixing)
+    )
+    if scene.structure is not None:
+        system.notes.append(
+            f"{len(index)} molecules read from {scene.structure.file}; atoms against rigid templates: "
+            f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
+        )
+        system.notes.extend(f"{scene.structure.file}: {note}" for note in arrangement.notes)
+        if faults := overlaps(system):
+            if not scene.stages[0].is_minimisation:
+                raise StructureError(scene.structure_source, faults)
+            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation moves them apart")
+    else:
+        system.notes.extend(f"box: {note}" for note in arrangement.notes)
+    return system
+
+
+def with_own(system: System) -> System:
+    """The system with what users add. Raises SceneError with every fault."""
+    from rigidmd.assemble.user_code.binding import own_terms
+
+    added = own_terms(system)
+    model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.moves)
+    return replace(
+        system,
+        scene=resolve_momentum(system.scene, model.keeps_momentum),
+        # those that Python computes come first: until they are told, nothing else need be computed
+        terms={name: added.terms[name] for name in added.told} | system.terms | added.terms,
+        model=model,
+        freedom=freedom_of(model),
+        told=added.told,
+        thermostat=added.thermostat,
+        tail=sum_of([*([system.tail] if system.tail is not None else []), *added.tails]),
+        own=added.words,
+        notes=[*system.notes, *added.notes],
+    )
+
+
+def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:
+    inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
+    rotor = split_rotor(inertia)
+    mass = np.array([m.mass for m in species])
+    return Model(
+        index.astype(np.int32),
+        mass,
+        np.where(frozen, 0.0, 1 / mass),
+        inertia,
+        rotor.inverse_inertia,
+        rotor if inertia.any() else NoRotor(),
+    )

@@ -1,0 +1,130 @@
+"""A model of one's own, from the geometry of one molecule and a table of parameters."""
+
+from collections import Counter
+from itertools import count
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.species import sites_of_geometry
+from rigidmd.core.files import file_fault
+from rigidmd.errors import MoleculeError, StructureError
+from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms
+from rigidmd.io.structure_file import read_atoms, read_geometry
+from rigidmd.scene.models import Molecule, MoleculeFile, Site, find_site, molecule, read_table
+from rigidmd.scene.validation import ValidationError, faults_of
+
+#: Factor on the sum of covalent radii up to which two atoms are bonded.
+SLACK = 1.25
+#: A sum of charges this near to a whole number is meant to be one; this near, it is one but for rounding.
+NEARLY, EXACTLY = 0.05, 1e-9
+
+
+class OwnModel(NamedTuple):
+    """A model as its file would tell it, the molecule that it is, and what to know about it."""
+
+    file: MoleculeFile
+    molecule: Molecule
+    notes: list[str]
+
+
+def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnModel:
+    """The model of a structure file with one molecule, its positions as they are there.
+
+    parameters : a table of parameters by atom name or element; without one there are masses and no interactions
+    name : default: that of the file. Raises StructureError or MoleculeError, with all faults.
+    """
+    name = geometry.stem if name is None else name
+    notes, told = [], [f"geometry of {geometry.name}"]
+    if fault := file_fault(geometry):
+        raise StructureError(str(geometry), [fault])
+    if parameters is None:
+        names, elements, *_ = read_geometry(geometry)
+        sites = sites_of_geometry(geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), "")
+        notes.append("it has no interactions yet: give its sites charge_e, sigma_A and epsilon_kJ_mol, or --parameters")
+    else:
+        table = read_table(parameters)
+        sites = sites_of_geometry(geometry, (), table.sites, "the table")
+        told.append(f"parameters of {parameters.name}" + (f": {table.source}" if table.source else ""))
+        names, elements, *_ = read_geometry(geometry)
+        used = [find_site(table.sites, *atom) for atom in dict.fromkeys(zip(names, elements, strict=True))]
+        if idle := [entry.name for entry in table.sites if entry not in used]:
+            notes.append(f"{parameters}: no atom uses {', '.join(idle)}")
+    sites = _numbered(sites)
+    if long := sorted({atom for atom in names if len(atom) > 5}):
+        notes.append(f"names of atoms have five characters at most: {', '.join(long)} are cut")
+    atoms = read_atoms(geometry)
+    data = {"name": name, "source": "; ".join(told), "residue_names": _residue(atoms), "sites": sites}
+    try:
+        file = MoleculeFile.model_validate(data)
+    except ValidationError as error:
+        raise MoleculeError(str(geometry), faults_of(error, MoleculeFile)) from None
+    found = molecule(file.name, file.sites, file.title, file.source, file.residue_names)
+    notes += _one_molecule(geometry, atoms, elements)
+    whole = round(found.charge)
+    off = abs(found.charge - whole)
+    if off > EXACTLY:
+        nearly = f"nearly but not exactly {f'{whole:+d}' if whole else 0}" if off < NEARLY else "not a whole number"
+        notes.append(f"the charges sum to {found.charge:+.6g} e, {nearly}")
+    return OwnModel(file, found, notes)
+
+
+def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
+    """Sites with unique names: those that share one are numbered, C1, C2, ..., within five characters."""
+    times = Counter(site.name for site in sites)
+    numbers = {name: count(1) for name in times}
+    taken = {name for name in times if times[name] == 1}
+    named = []
+    for site in sites:
+        name = site.name
+        while times[site.name] > 1 and (name == site.name or name in taken):
+            number = str(next(numbers[site.name]))
+            name = site.name[: 5 - len(number)] + number
+        taken.add(name)
+        named.append(site.model_copy(update={"name": name}))
+    return tuple(named)
+
+
+def _residue(atoms: Atoms) -> tuple[str, ...]:
+    """The name of the only residue, if it is one that structure files can hold."""
+    names = {residue[1] for residue in atoms.residue if len(residue) > 1}
+    return tuple(
+        name for name in names if len(names) == 1 and name.isascii() and name.isprintable() and " " not in name
+    )
+
+
+def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:
+    """Notes on atoms that are joined or not. Raises StructureError of several molecules, or of one cut by its cell."""
+    massive = [k for k, element in enumerate(elements) if element != "X"]
+    symbols = ["H" if elements[k] in HEAVY_HYDROGEN else elements[k] for k in massive]
+    part = _parts(symbols, atoms.position[massive], None)
+    count, notes = part.max(initial=-1) + 1, []
+    if atoms.cell is not None:
+        joined = _parts(symbols, atoms.position[massive], atoms.cell).max(initial=-1) + 1
+        if joined < count:
+            raise StructureError(
+                str(path),
+                ["its atoms are joined through the sides of its cell: make the molecule whole, without a cell"],
+            )
+        notes.append("its cell is left out: the model is one rigid body of all its atoms")
+    members = [Counter(symbols[k] for k in np.flatnonzero(part == group)) for group in range(count)]
+    if count > 1 and all(member == members[0] for member in members) and sum(members[0].values()) > 1:
+        formula = "".join(f"{element}{number if number > 1 else ''}" for element, number in sorted(members[0].items()))
+        raise StructureError(str(path), [f"holds {count} molecules {formula}: keep one"])
+    if count > 1:
+        notes.append(f"its atoms are in {count} parts that no bond joins: the model is one rigid body of all of them")
+    return notes
+
+
+def _parts(symbols: list[str], position: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
+    """Number of the part (n,) to which each atom belongs: atoms within bonding distance are of one part."""
+    from ase import Atoms as AseAtoms
+    from ase.neighborlist import natural_cutoffs, neighbor_list
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    atoms = AseAtoms(symbols, position, cell=cell, pbc=cell is not None)
+    first, second = neighbor_list("ij", atoms, natural_cutoffs(atoms, SLACK))
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(len(symbols), len(symbols)))
+    return connected_components(links)[1]

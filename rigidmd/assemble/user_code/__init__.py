@@ -1,0 +1,1 @@
+"""Code of users in a scene: forces, pair potentials, thermostats, and which files may be imported."""

@@ -1,0 +1,184 @@
+"""From what users give to the terms of a system."""
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.user_code.force import Bound, Force, OwnError, changes_momentum
+from rigidmd.assemble.user_code.pair_potential import LawError, PairLaw, check_reach, pair_law
+from rigidmd.assemble.user_code.trust import trusted_module
+from rigidmd.core.state import State
+from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
+from rigidmd.engines.cpu import CompileError
+from rigidmd.errors import SceneError, told
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.potentials.lennard_jones import Tail
+from rigidmd.scene.user_code import Own, name_of
+from rigidmd.scene.validation import meant
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
+    from rigidmd.scene import MolecularScene
+    from rigidmd.scene.forces import CustomForce
+
+
+class OwnTerms(NamedTuple):
+    """What users add to a system."""
+
+    terms: dict[str, NamedTuple]
+    told: dict[str, Callable[[Any, State], None]]  # of those that Python computes: what the engine asks
+    moves: np.ndarray  # (3,) whether they may change components of the total momentum
+    thermostat: Any
+    notes: list[str]
+    words: dict[str, str]  # what each term is
+    tails: list[Tail]  # what the cut-offs of pair laws take away
+
+
+def custom_forces(scene: "MolecularScene") -> list[Any]:
+    """The objects of [[forces.custom]]. Raises SceneError with every fault."""
+    found, faults = [], []
+    for k, entry in enumerate(scene.forces.custom):
+        try:
+            found.append(_custom(scene, entry, f"forces.custom.{k}"))
+        except SceneError as error:
+            faults += [(entry.module, f"forces.custom.{k}: {fault}") for fault in error.faults]
+        except ValueError as error:
+            faults.append((None, f"forces.custom.{k}: {error}"))
+    if faults:  # of a file once
+        told = {module or fault: fault for module, fault in reversed(faults)}
+        raise SceneError(scene.source, list(told.values())[::-1])
+    return found
+
+
+def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
+    if entry.energy is not None:
+        pairs = {pair.sites: pair.parameters for pair in entry.pairs}
+        return pair_law(
+            entry.energy, entry.parameters or None, sites=entry.sites, pairs=pairs, mixing=entry.mixing,
+            truncation=entry.truncation, cutoff_A=entry.cutoff_A, switch_start_A=entry.switch_start_A, name=entry.name,
+        )  # fmt: skip
+    assert entry.module is not None  # or the entry is not validated
+    module = trusted_module(scene.path(entry.module), f"{key}.module")
+    if not hasattr(module, entry.name):
+        there = [name for name in vars(module) if not name.startswith("_")]
+        raise ValueError(f"name: {entry.module} has no {entry.name}{meant(entry.name, there) or ''}")
+    made = getattr(module, entry.name)
+    if isinstance(made, type) or (callable(made) and not isinstance(made, Force)):
+        try:
+            made = made(**entry.parameters)
+        except (Exception, SystemExit) as error:  # whatever a stranger's code raises
+            raise ValueError(f"{entry.name}(...) raised {told(error)}") from error
+    elif entry.parameters:
+        raise ValueError(f"parameters would do nothing: {entry.name} is not called with any")
+    return _Named(entry.name, made)
+
+
+class _Named(NamedTuple):
+    """An object under the name that a scene gives it."""
+
+    name: str
+    made: Any
+
+
+@contextmanager
+def told_plainly(system: "System") -> Iterator[None]:
+    """Turn errors of a user's code before the first step, Numba's too, into a SceneError."""
+    try:
+        yield
+    except OwnError as error:
+        raise SceneError(system.scene.source, [f"at the start: {error}"]) from error
+    except CompileError as error:
+        if not system.own and system.thermostat is None:
+            raise
+        unknown = re.findall(r">>> (\S.*)", str(error))
+        plain = re.findall(r"Untyped global name '(\w+)'", str(error))
+        files = re.findall(r'File "(?!<)([^"]+)", line (\d+)', str(error))
+        ours = [(file, line) for file, line in files if "/rigidmd/" not in file and "/numba/" not in file]
+        where = f" (near line {ours[-1][1]} of {Path(ours[-1][0]).name})" if ours else ""
+        if plain:
+            why = f"it uses {plain[-1]}, which is not compiled: if it is a function, put numba.njit before it"
+        else:
+            why = f"Numba knows no {unknown[-1]}" if unknown else str(error).strip().splitlines()[-1]
+        names = ", ".join([*system.own, *(["the thermostat"] if system.thermostat is not None else [])])
+        raise SceneError(system.scene.source, [f"{names}: cannot be compiled{where}: {why}"]) from None
+
+
+def own_terms(system: "System") -> OwnTerms:
+    """The terms of what a scene and Python add. Raises SceneError with every fault."""
+    scene = system.scene
+    everything = Own((*custom_forces(scene), *scene.own.forces))
+    names = everything.of_forces([*system.terms, *system.constants])
+    found = OwnTerms({}, {}, np.zeros(3, bool), scene.own.thermostat, [], {}, [])
+    faults = []
+    for name, given in zip(names, everything.forces, strict=True):
+        made = given.made if isinstance(given, _Named) else given
+        try:
+            term = _term(made, name, system, found)
+            if not isinstance(term, PairForces):
+                found.moves[:] |= changes_momentum(term)
+        except (LawError, SceneError) as error:
+            faults += [f"{name}: {fault}" for fault in error.faults]
+            continue
+        except (ValueError, OwnError) as error:
+            faults.append(f"{name}: {error}")
+            continue
+        found.terms[name] = term
+    thermostat = found.thermostat
+    if thermostat is not None and not (type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")):
+        faults.append(
+            f"thermostat: {thermostat!r:.60} is neither a NamedTuple of a class with rigidmd.compiled_thermostat nor "
+            "has it a method for_stage(system, k) that makes one"
+        )
+    if faults:
+        raise SceneError(scene.source, faults)
+    if thermostat is not None:
+        found.notes.append(f"thermostat: {name_of(thermostat)}, from Python, in place of that of every stage")
+    return found
+
+
+def _term(made: Any, name: str, system: "System", found: OwnTerms) -> NamedTuple:
+    """The term of one object. Raises LawError, ValueError, OwnError."""
+    if isinstance(made, PairLaw):
+        law = made.bind(system)
+        if law.formula.error:
+            found.notes.append(f"{name}: the error of its spline is {law.formula.error:.1e} of its deepest energy")
+        found.notes.extend(f"{name}: {note}" for note in law.notes)
+        if law.tail is not None:
+            found.tails.append(law.tail)
+        cutoff = made.cutoff_A or system.cutoff
+        reach = (
+            f"cut-off {cutoff:g} Å, {made.truncation or system.scene.forces.truncation}"
+            if cutoff < inf
+            else "no cut-off"
+        )
+        found.words[name] = f"{law.formula.text}, {len(law.term.group)} sites, {reach}"
+        return law.term
+    if isinstance(made, Force):
+        bound = Bound(made, name, system)
+        found.told[name] = bound
+        found.words[name] = f"{type(made).__qualname__}, computed by Python"
+        return bound.term
+    if hasattr(made, "term"):
+        try:
+            made = made.term(system)
+        except (ValueError, SceneError):
+            raise
+        except (Exception, SystemExit) as error:  # whatever a stranger's code raises
+            raise ValueError(f"term(system) raised {told(error)}") from error
+    if isinstance(made, PairForces):  # of a law that is not a `PairLaw`
+        check_reach(made.law.cutoff, system)  # type: ignore[attr-defined]  # every law has a cut-off
+    if not (isinstance(made, PairForces) or type(made) in FORCES):
+        raise ValueError(
+            f"{made!r:.80} is no force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "
+            "rigidmd.compiled_force, or an object whose term(system) makes one"
+        )
+    numbers = ", ".join(
+        f"{key} = {value:.6g}" for key, value in made._asdict().items() if isinstance(value, int | float)
+    )
+    found.words[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
+    return made

@@ -1,0 +1,195 @@
+"""Forces of users in plain Python."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+
+from rigidmd.core.state import State
+from rigidmd.errors import SimulationError, told
+from rigidmd.forces.fields.python_forces import AskedForces, ToldForces
+from rigidmd.units import KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
+
+EVERY = (True, True, True)
+
+
+class HasTerm(Protocol):
+    """What makes a compiled term from the numbers of a system."""
+
+    def term(self, system: "System") -> Any:
+        """The term, a NamedTuple of a class with `compiled_force`."""
+        ...
+
+
+class HasStage(Protocol):
+    """What makes a compiled thermostat for a stage."""
+
+    def for_stage(self, system: "System", k: int) -> Any:
+        """The thermostat of stage k, a NamedTuple of a class with `compiled_thermostat`."""
+        ...
+
+
+class OwnError(SimulationError):
+    """A force of a user's cannot be computed."""
+
+
+class Force:
+    """A force on molecules in plain Python: derive a class from it and define `on_sites` or `on_molecules`.
+
+    class Spring(rigidmd.Force):
+        def on_molecules(self, state):
+            return 0.5 * (state.position**2).sum(), -state.position
+
+    It is asked once for every new set of positions, between steps of the compiled loop; a `compiled_force` is faster.
+
+    name : in logs and messages; default: the name of the class
+    changes_momentum : which components of the total momentum it may change; all but of forces between molecules
+    tied_to_places : whether its energy depends on places in the lab, which excludes a barostat. Otherwise it must give
+        its virial as the last of what it returns
+    """
+
+    name: ClassVar[str | None] = None
+    changes_momentum: ClassVar[Sequence[bool]] = EVERY
+    tied_to_places: ClassVar[bool] = True
+
+    def begin(self, system: "System") -> None:
+        """Called once with the system: `sites` with names, elements, masses and charges, `species`, `model`."""
+
+    def on_sites(self, position: np.ndarray, state: State) -> tuple:
+        """(energy in kJ/mol, forces (s, 3) on all sites in kJ/mol/Å) at their positions (s, 3), Å, not wrapped.
+
+        Sites are those of `system.sites`, in its order. A third value is the molecular virial (3, 3), kJ/mol.
+        """
+        raise NotImplementedError
+
+    def on_molecules(self, state: State) -> tuple:
+        """(energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, torques (n, 3) in kJ/mol, body frame).
+
+        Torques may be left out. A fourth value is the molecular virial (3, 3), kJ/mol.
+        """
+        raise NotImplementedError
+
+
+class Bound:
+    """A `Force` in a system: asks it, checks what it gives, and turns forces on sites into those on bodies."""
+
+    def __init__(self, force: Force, name: str, system: "System"):
+        self.force, self.name, self.system = force, name, system
+        self._by_site = type(force).on_sites is not Force.on_sites
+        if self._by_site == (type(force).on_molecules is not Force.on_molecules):
+            raise OwnError(f"the force {name} must define one of on_sites and on_molecules")
+        self._called("begin", force.begin, system)
+        n, turns = len(system.state.velocity), len(system.state.rotation) > 0
+        self.term = ToldForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
+
+    def __call__(self, workspace: AskedForces, state: State) -> None:
+        """Fill a workspace with the forces at a state. Raises OwnError."""
+        seen = State(*(_read_only(array) for array in state))
+        if self._by_site:
+            position = _read_only(self.system.site_positions(seen))
+            energy, force, torque, virial = self._of_sites(position, seen)
+        else:
+            energy, force, torque, virial = self._parts(self._called("on_molecules", self.force.on_molecules, seen), 4)
+        shape = workspace.force.shape
+        self._fill(workspace.force, force, "forces", shape)
+        self._fill(workspace.torque_body, torque, "torques", workspace.torque_body.shape)
+        if not np.isfinite(energy):
+            raise OwnError(f"the force {self.name} gave the energy {energy}")
+        workspace.tally[0] = energy * KJ_PER_MOL
+        workspace.tally[1:] = self._virial(virial)
+        workspace.fresh[0] = 1
+
+    def _virial(self, given: Any) -> np.ndarray:
+        """A virial (9,), u Å²/ps²; None is 0."""
+        virial = np.zeros((3, 3)) if given is None else _numbers(given)
+        if virial is None or virial.shape != (3, 3) or not np.isfinite(virial).all():
+            raise OwnError(f"the force {self.name} gave {given!r:.60} as its virial, not (3, 3) finite numbers")
+        return KJ_PER_MOL * virial.ravel()
+
+    def _of_sites(self, position: np.ndarray, state: State) -> tuple:
+        system = self.system
+        energy, force, virial, _ = self._parts(self._called("on_sites", self.force.on_sites, position, state), 3)
+        on_sites = np.zeros(position.shape)
+        self._fill(on_sites, force, "forces", position.shape, system.sites.molecule, 1.0)
+        of = system.sites.molecule
+        total = np.zeros((len(state.velocity), 3))
+        np.add.at(total, of, on_sites)
+        torque = None
+        if len(state.rotation):
+            lab = np.zeros_like(total)
+            np.add.at(lab, of, np.cross(position - state.position[of], on_sites))
+            torque = np.einsum("nji,nj->ni", state.rotation, lab)
+        return energy, total, torque, virial
+
+    def _parts(self, found: Any, most: int) -> list:
+        """Energy and up to three further values, None for those that are left out."""
+        if not isinstance(found, tuple) or not 2 <= len(found) <= most:
+            given = f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
+            more = " and perhaps torques and a virial" if most == 4 else " and perhaps a virial"
+            raise OwnError(f"the force {self.name} gave {given}; it must give a tuple of an energy, forces{more}")
+        try:
+            energy = float(found[0])
+        except (TypeError, ValueError):
+            raise OwnError(f"the force {self.name} gave {found[0]!r:.60} as its energy, not a number") from None
+        return [energy, *found[1:], *[None] * (4 - len(found))]
+
+    def _fill(
+        self,
+        room: np.ndarray,
+        given: Any,
+        what: str,
+        shape: tuple,
+        molecule: np.ndarray | None = None,
+        size: float = KJ_PER_MOL,
+    ) -> None:
+        """Copy an array into its room; None is 0."""
+        if given is None:
+            room[:] = 0.0
+            return
+        array = _numbers(given)
+        if array is None:
+            raise OwnError(f"the force {self.name} gave {given!r:.60} as {what}, not real numbers of the shape {shape}")
+        if array.shape != shape:
+            raise OwnError(f"the force {self.name} gave {what} of the shape {array.shape}, not {shape}")
+        if not np.isfinite(array).all():
+            row = int(np.argmin(np.isfinite(array).all(axis=1)))
+            of = row if molecule is None else int(molecule[row])
+            which = f"molecule {of + 1} ({self.system.species[self.system.model.species[of]].name})"
+            raise OwnError(f"the force {self.name} gave {array[row]} as {what} on {which}, which is no finite number")
+        room[:] = size * array
+
+    def _called(self, what: str, function: Callable, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except (Exception, SystemExit) as error:  # whatever a stranger's function raises
+            trace = error.__traceback__
+            while trace is not None and trace.tb_next is not None:
+                trace = trace.tb_next
+            line = f", line {trace.tb_lineno} of {trace.tb_frame.f_code.co_filename}" if trace is not None else ""
+            raise OwnError(f"{what} of the force {self.name} raised {told(error)}{line}") from error
+
+
+def _numbers(given: Any) -> np.ndarray | None:
+    """An array of real numbers; None of what is none."""
+    try:
+        return None if np.iscomplexobj(given) else np.asarray(given, float)
+    except (TypeError, ValueError):
+        return None
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def changes_momentum(term: Any) -> np.ndarray:
+    """Components (3,) of the total momentum that a force from outside may change. Raises ValueError."""
+    said = getattr(term, "changes_momentum", EVERY)
+    each = said if isinstance(said, tuple | list | np.ndarray) else (said,)
+    if len(each) not in (1, 3) or not all(isinstance(one, bool | np.bool_) for one in each):
+        raise ValueError(f"changes_momentum is {said!r:.60}, must be three truth values, for x, y, z")
+    return np.array(np.broadcast_to(said, 3), bool)

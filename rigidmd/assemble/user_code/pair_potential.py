@@ -1,0 +1,389 @@
+"""Laws between pairs of sites that users give: which sites they act on, with which parameters, and how they end."""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, isfinite, sqrt
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
+from rigidmd.forces.neighbors.sites import groups, sites_of
+from rigidmd.forces.potentials.custom import OwnLaw, tail_of
+from rigidmd.forces.potentials.formulas import DISTANCE, Formula, FormulaError, of_function, of_table, of_text
+from rigidmd.forces.potentials.lennard_jones import Tail
+from rigidmd.forces.potentials.truncation import NAMES, Name, ending, shape_of
+from rigidmd.scene.forces import ROUNDED, short_cutoff, usual_start
+from rigidmd.scene.models import Molecule, named_sites, of_each
+from rigidmd.scene.validation import meant
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
+
+Rule = Literal["geometric", "arithmetic", "harmonic"]
+RULES: tuple[str, ...] = get_args(Rule)
+Parameters = Mapping[str, float]
+#: Cutoffs within which a minimum is looked for.
+REACH = 20.0
+#: A table of a single law: distances (Å) and energies (kJ/mol).
+Columns = tuple[Sequence[float], Sequence[float]]
+
+
+class LawError(ValueError):
+    """What is wrong with a pair law in a scene, as sentences."""
+
+    def __init__(self, *faults: str):
+        self.faults = list(faults)
+        super().__init__("; ".join(faults))
+
+
+@dataclass(frozen=True)
+class PairLaw:
+    """A law between pairs of sites, for `Simulation(scene, forces=[...])`; see `pair_law`, which makes it."""
+
+    energy: "str | Callable | None"
+    table: Columns | None
+    constants: Parameters
+    of_sites: Mapping[str, Parameters] | None  # None: from the models
+    sites: tuple[str, ...]
+    pairs: Mapping[tuple[str, str], Parameters]
+    mixing: Mapping[str, Rule]
+    truncation: Name | None
+    cutoff_A: float | None
+    switch_start_A: float | None
+    name: str
+    of_function: Formula | None = field(default=None, repr=False)
+
+    def formula(self, cutoff: float) -> Formula:
+        """The formula that it is compiled from. Raises LawError."""
+        try:
+            if self.table is not None:
+                return of_table(*self.table, cutoff)
+            if isinstance(self.energy, str):
+                return of_text(self.energy, self.constants)
+            assert self.of_function is not None  # a law has a text, a function or a table
+            return self.of_function
+        except FormulaError as error:
+            raise LawError(str(error)) from None
+
+    def bind(self, system: "System") -> "BoundLaw":
+        """The law between the sites of a system. Raises LawError with every fault."""
+        forces = system.scene.forces
+        cutoff = self.cutoff_A or system.cutoff
+        check_reach(cutoff, system)
+        name: Name = self.truncation or forces.truncation
+        given = self.switch_start_A or (forces.switch_start_A if cutoff == system.cutoff else None)
+        if self.switch_start_A is not None and "switch" not in name:
+            raise LawError(f"switch_start_A would do nothing with truncation = {name!r}")
+        start = (given or usual_start(name, cutoff)) if "switch" in name else cutoff
+        if not start <= cutoff:
+            raise LawError(f"switch_start_A = {start:g} is beyond the cut-off of {cutoff:g} Å")
+        formula = self.formula(cutoff)
+        kinds = _Kinds(self, formula, system.species)
+        chosen = [np.flatnonzero([entry is not None for entry in of]) for of in kinds.of_species]
+        if not any(len(own) for own in chosen):
+            raise LawError("no site of the scene takes part in it")
+        index = system.model.species
+        offsets = [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)]
+        sites = sites_of(index, offsets, system.model.inverse_inertia)
+        numbers_of = [[kinds.number[entry] for entry in of if entry is not None] for of in kinds.of_species]
+        kind = of_each([np.array(own, int) for own in numbers_of], index)
+        shape = shape_of(name, cutoff, start)
+        count = len(kinds.all)
+        numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
+        ends, acts = np.zeros((4, count, count)), np.zeros((count, count))
+        members, beyond = np.bincount(kind, minlength=count), Tail(0.0, 0.0)
+        faults: list[str] = []
+        short: list[tuple[float, str]] = []
+        for i, j, of_pair in kinds.pairs(faults):
+            try:
+                numbers[:, i, j], radial = formula.numbers(of_pair), formula.radial(of_pair)
+                ends[:, i, j] = ending(name, shape, radial)
+                values = [] if cutoff == inf else [*radial(cutoff), *radial(0.9 * cutoff)]
+                if forces.tail_correction and formula.shared:
+                    raise FormulaError("a table ends, and says nothing for forces.tail_correction")
+                if forces.tail_correction:
+                    part, pairs = tail_of(radial, ends[:, i, j], shape), float(members[i] * members[j])
+                    pairs *= 1.0 if i == j else 2.0
+                    beyond = Tail(beyond[0] + pairs * part[0], beyond[1] + pairs * part[1])
+                if not np.isfinite([*values, *numbers[:, i, j], *ends[:, i, j]]).all():
+                    raise FormulaError("it has no finite value at the cut-off")
+            except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
+                faults.append(f"between {kinds.words(i)} and {kinds.words(j)}: {error}")
+            else:
+                if minimum := _minimum_beyond(cutoff, radial):
+                    short.append((minimum, f"{kinds.words(i)} and {kinds.words(j)}"))
+            numbers[:, j, i], ends[:, j, i] = numbers[:, i, j], ends[:, i, j]
+            acts[i, j] = acts[j, i] = 1.0
+        if faults:
+            raise LawError(*dict.fromkeys(faults))
+        if not acts.any():
+            raise LawError("no pair of sites of the scene has parameters")
+        first = np.argwhere(acts)[0]
+        law = OwnLaw(
+            cutoff,
+            shape,
+            formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])),
+            formula.shared,
+            kind.astype(np.int32),
+            np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]),
+            ends,
+            acts,
+        )
+        frozen = (system.model.inverse_mass == 0)[index]
+        return BoundLaw(
+            pair_forces(law, sites, groups(sites, frozen)),
+            formula,
+            beyond if forces.tail_correction else None,
+            [short_cutoff(cutoff, max(short)[1], max(short)[0])] if short else [],
+        )
+
+
+def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
+    """The distance (Å) of the minimum of an energy, if it lies beyond the cutoff, within which sites only repel."""
+    if cutoff == inf:
+        return None
+
+    def attracts(r: float) -> bool:
+        try:
+            return radial(r)[1] < 0
+        except (FormulaError, ArithmeticError, ValueError):
+            return False
+
+    if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - ROUNDED, 32)):
+        return None
+    return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
+
+
+def check_reach(cutoff: float, system: "System") -> None:
+    """Raise LawError unless the box is large enough for a law's cut-off (Å)."""
+    half = min(system.space.edges) / 2
+    if cutoff == inf and system.space.volume < inf:
+        raise LawError("it has no cut-off, and the box is periodic: a law in a box needs one (cutoff_A)")
+    if not cutoff <= half:
+        raise LawError(f"its cut-off of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
+
+
+class BoundLaw(NamedTuple):
+    """A law in a system."""
+
+    term: PairForces
+    formula: Formula
+    tail: Tail | None  # what the cut-off takes away, where the scene asks for it
+    notes: list[str]
+
+
+class _Kinds:
+    """Kinds of sites that a law tells apart: their parameters, and the entries of `pairs` that mean them."""
+
+    def __init__(self, law: PairLaw, formula: Formula, species: list[Molecule]):
+        self._law, self._formula = law, formula
+        known = dict.fromkeys(name for m in species for own in m.site_names for name in (own, f"{m.name}.{own}"))
+        known |= dict.fromkeys(e for m in species for e in m.elements)
+        listed = [*(law.of_sites or {}), *law.sites, *(name for pair in law.pairs for name in pair)]
+        there = f"; there are {', '.join(known)}"
+        self._meant = {name: named_sites(species, name) for name in listed}
+        faults = [
+            f"no site is {name!r}{meant(name, list(known)) or there}"
+            for name, of in self._meant.items()
+            if not any(own.any() for own in of)
+        ]
+        self._needed = [name for name in formula.parameters if name not in law.constants and not formula.shared]
+        for where, own in [*(law.of_sites or {}).items(), *(("-".join(k), v) for k, v in law.pairs.items())]:
+            faults += [f"{where}: there is no {name}" for name in self._needed if name not in own]
+            faults += [f"{where}: {self._unknown(name)}" for name in own if name not in formula.parameters]
+        if law.of_sites == {} and not law.pairs:
+            faults += [f"there is no {name} among its parameters" for name in self._needed]
+        faults += [self._unknown(name) for name in law.constants if not _has(law.energy, formula, name)]
+        faults += [f"mixing: {self._unknown(name)}" for name in law.mixing if name not in formula.parameters]
+        faults += [
+            f"pairs: {'-'.join(pair)} is there twice"
+            for pair in law.pairs
+            if pair[0] < pair[1] and pair[::-1] in law.pairs
+        ]
+        if faults:
+            raise LawError(*faults)
+        self.of_species = [[self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)]
+        self.all = sorted({entry for of in self.of_species for entry in of if entry is not None}, key=repr)
+        self.number = {entry: k for k, entry in enumerate(self.all)}
+        self._first = {
+            entry: f"{m.name}.{m.site_names[i]}"
+            for m, of in reversed(list(zip(species, self.of_species, strict=True)))
+            for i, entry in reversed(list(enumerate(of)))
+            if entry is not None
+        }
+
+    def _unknown(self, name: str) -> str:
+        known = ", ".join(self._formula.parameters) or "none"
+        return f"{name} is no parameter of {self._formula.text!r}; there are {known}"
+
+    def words(self, k: int) -> str:
+        """A site of a kind."""
+        return self._first[self.all[k]]
+
+    def _kind(self, k: int, m: Molecule, i: int) -> tuple | None:
+        """Parameters of a site and the sides of `pairs` that it is on; None if it takes no part."""
+        law = self._law
+        own = self._parameters(k, m, i)
+        sides = tuple(bool(self._meant[name][k][i]) for pair in law.pairs for name in pair)
+        if own is None and not any(sides):
+            return None
+        return (None if own is None else tuple(sorted(own.items()))), sides
+
+    def _parameters(self, k: int, m: Molecule, i: int) -> Parameters | None:
+        law = self._law
+        if law.sites and not any(self._meant[name][k][i] for name in law.sites):
+            return None
+        if law.of_sites is None:
+            if self._formula.shared:
+                return {"scale": 1.0} if not law.pairs else None
+            own = m.parameters[i]
+            return {name: own[name] for name in self._needed} if all(name in own for name in self._needed) else None
+        if not law.of_sites:
+            return {} if not law.pairs else None
+        named = [name for name in law.of_sites if self._meant[name][k][i]]
+        ranked = (f"{m.name}.{m.site_names[i]}", f"{m.name}.{m.elements[i]}", m.site_names[i], m.elements[i])
+        return next((law.of_sites[name] for name in ranked if name in named), None)
+
+    def pairs(self, faults: list[str]) -> Iterator[tuple[int, int, dict[str, float]]]:
+        """Numbers i <= j of two kinds, and the parameters between them, of those that interact."""
+        for i, (own, sides) in enumerate(self.all):
+            for j, (other, others) in enumerate(self.all[i:], i):
+                found = None
+                for n, values in enumerate(self._law.pairs.values()):
+                    if (sides[2 * n] and others[2 * n + 1]) or (sides[2 * n + 1] and others[2 * n]):
+                        found = {"scale": 1.0} | dict(values) if self._formula.shared else dict(values)
+                if found is None and own is not None and other is not None:
+                    found = self._mixed(dict(own), dict(other), i, j, faults)
+                if found is not None:
+                    yield i, j, dict(self._law.constants) | found
+
+    def _mixed(self, own: dict, other: dict, i: int, j: int, faults: list[str]) -> dict[str, float] | None:
+        found = {}
+        for name, a in own.items():
+            b = other[name]
+            rule = self._law.mixing.get(name) or ("arithmetic" if name.lower().startswith("sig") else "geometric")
+            if a == b:
+                found[name] = a
+            elif rule == "arithmetic":
+                found[name] = (a + b) / 2
+            elif rule == "geometric" and a * b >= 0:
+                found[name] = sqrt(a * b) * (-1.0 if a < 0 or b < 0 else 1.0)
+            elif rule == "harmonic" and a + b != 0:
+                found[name] = 2 * a * b / (a + b)
+            else:
+                faults.append(
+                    f"{name} of {self.words(i)} and {self.words(j)}, {a:g} and {b:g}, have no {rule} mean: "
+                    f"give {name} of that pair in pairs, or another rule in mixing"
+                )
+                return None
+        return found
+
+
+def _has(energy: Any, formula: Formula, name: str) -> bool:
+    """Whether a formula has a parameter, which may have become a number of it."""
+    return name in formula.parameters or (isinstance(energy, str) and name in re.findall(r"[^\W\d]\w*", energy))
+
+
+def pair_law(
+    energy: "str | Callable | None" = None,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    table: Columns | None = None,
+    sites: Sequence[str] = (),
+    pairs: Mapping[tuple[str, str], Any] | None = None,
+    mixing: Mapping[str, Rule] | None = None,
+    truncation: Name | None = None,
+    cutoff_A: float | None = None,
+    switch_start_A: float | None = None,
+    name: str = "",
+) -> PairLaw:
+    """A law between pairs of sites of different molecules, for `Simulation(scene, forces=[...])`.
+
+    rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
+
+    energy : the energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * / ** and exp, log,
+        sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that gives (energy, -dE/dr), where p has
+        the parameters; it may also have the arguments r2 (r²) and inverse (1/r), and is compiled for vectors
+    parameters : site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a dictionary, or the
+        NamedTuple that a function expects. Or plain numbers, the same for all sites. Default: `parameters` of the sites
+        in the models' files
+    table : instead of an energy, distances in Å and energies in kJ/mol, through which a spline is laid
+    sites : the only sites that it acts on
+    pairs : (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts on them only
+    mixing : parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites; default: arithmetic for
+        names that begin with sig, else geometric
+    truncation, switch_start_A, cutoff_A : as in [forces] of the scene, which are the defaults
+    name : in the log and in messages
+
+    Raises ValueError.
+    """
+    if (energy is None) == (table is None):
+        raise ValueError("a pair law needs an energy or a table")
+    if truncation is not None and truncation not in NAMES:
+        raise ValueError(f"truncation is {truncation!r}{meant(truncation, NAMES) or ''}; there are {', '.join(NAMES)}")
+    for what, given in (("mixing", mixing), ("pairs", pairs)):
+        if given is not None and not isinstance(given, Mapping):
+            raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
+    if table is not None and not (isinstance(table, tuple | list) and len(table) == 2):
+        raise ValueError("table must be two lists: distances in Å, energies in kJ/mol")
+    if not isinstance(name, str):
+        raise ValueError(f"name is {name!r:.60}, must be a text")
+    for own, rule in (mixing or {}).items():
+        if rule not in RULES:
+            raise ValueError(f"mixing of {own} is {rule!r}; there are {', '.join(RULES)}")
+    kind, constants, of_sites = None, {}, None
+    if parameters is not None:
+        kind = type(parameters) if hasattr(parameters, "_asdict") else None
+        parameters = _mapping("parameters", parameters)
+        flat = [key for key, value in parameters.items() if isinstance(value, int | float | np.number)]
+        if flat and len(flat) < len(parameters):
+            others = ", ".join(str(key) for key in parameters if key not in flat)
+            raise ValueError(
+                f"parameters are either numbers, the same for all sites, or tables of numbers by site; {flat[0]} is a "
+                f"number, and {others} is not"
+            )
+        if flat:
+            constants, of_sites = _numbers("parameters", parameters), {}
+        else:
+            of_sites = {}
+            for key, value in parameters.items():
+                kind = type(value) if hasattr(value, "_asdict") else kind
+                of_sites[key] = _numbers(f"parameters of {key}", value)
+    elif pairs:
+        of_sites = {}
+    of_pairs = {}
+    for key, value in (pairs or {}).items():
+        if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(one, str) for one in key)):
+            raise ValueError(f"pairs: {key!r} is not a pair of names of sites")
+        kind = type(value) if hasattr(value, "_asdict") else kind
+        of_pairs[key] = _numbers(f"parameters of {'-'.join(key)}", value)
+    for key, value in (("cutoff_A", cutoff_A), ("switch_start_A", switch_start_A)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value > 0):
+            raise ValueError(f"{key} is {value!r}, must be a number above 0")
+    usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
+    formula = of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
+    return PairLaw(
+        energy, table, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
+        switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,
+    )  # fmt: skip
+
+
+def _mapping(where: str, given: Any) -> Mapping[str, Any]:
+    """A dictionary, or the fields of a NamedTuple. Raises ValueError."""
+    given = given._asdict() if hasattr(given, "_asdict") else given
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{where}: {given!r:.60} is not a table of numbers")
+    return given
+
+
+def _numbers(where: str, given: Any) -> dict[str, float]:
+    """Parameters as a dictionary of finite numbers. Raises ValueError."""
+    given = _mapping(where, given)
+    for key, value in given.items():
+        if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not isfinite(value):
+            raise ValueError(f"{where}: {key} is {value!r}, must be a finite number")
+    if taken := [key for key in given if key in (DISTANCE, "pi")]:
+        raise ValueError(f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'}; rename it")
+    return {str(key): float(value) for key, value in given.items()}

@@ -1,0 +1,62 @@
+"""Python files of users, which run only where a user says so: forces of a scene, and analyses."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+
+from rigidmd.core.files import file_fault
+from rigidmd.core.user_modules import OF_FILE, digest_of, module_of
+from rigidmd.errors import SceneError, told
+from rigidmd.scene import Scene
+
+#: Digests of the files that may run.
+_TRUSTED: set[str] = set()
+
+
+def trust(path: str | Path) -> None:
+    """Let scenes run a Python file: one with these contents, wherever it lies. Raises SceneError.
+
+    A file is code: it can do whatever you can. Read it before. On the command line, --trust FILE does the same.
+    """
+    _TRUSTED.add(digest_of(_source(Path(path), "--trust")))
+
+
+def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
+    """Raise SceneError for a trusted file that is none of those that a scene runs: nothing of it would be run."""
+    named = [path for key, path in scene.inputs.items() if key.endswith(".module")]
+    contents = [_source(path, "forces.custom") for path in named]
+    for path in paths:
+        if _source(Path(path), "--trust") not in contents:
+            files = f"it names {', '.join(map(str, named))}" if named else "it names none"
+            raise SceneError(
+                "--trust", [f"{path} is not a file that [[forces.custom]] of {scene.source} names by module: {files}"]
+            )
+
+
+def trusted_module(path: Path, key: str) -> ModuleType:
+    """The module of a file that a scene names by `key`, if it is trusted. Raises SceneError."""
+    source = _source(path, key)
+    if digest_of(source) not in _TRUSTED:
+        raise SceneError(
+            key,
+            [
+                f"{path} is Python code, which can do whatever you can: read it, and if you trust it, add "
+                f"--trust {path} (in Python: rigidmd.trust({str(path)!r}))"
+            ],
+        )
+    try:
+        return module_of(source, str(path), OF_FILE)
+    except SceneError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever a stranger's file raises
+        line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+        raise SceneError(key, [f"{path}{line} raised {told(error)}"]) from error
+
+
+def _source(path: Path, key: str) -> bytes:
+    if fault := file_fault(path):
+        raise SceneError(key, [f"{fault}: {path}"])
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SceneError(key, [f"{path} cannot be read: {error.strerror}"]) from None

@@ -1,0 +1,1 @@
+"""The command line. Commands print and never compute."""

@@ -1,0 +1,263 @@
+"""The command `sweep`. It prints and never computes."""
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigidmd.commands.arguments import (
+    BY_SIGNAL,
+    FAILED,
+    INTERRUPTED,
+    OUT_OF_TIME,
+    add_trust,
+    number,
+    say,
+    seconds,
+    warn,
+)
+from rigidmd.errors import visible
+
+if TYPE_CHECKING:
+    from rigidmd.io.progress import Bar
+    from rigidmd.studies.sweep.folder import Manifest
+    from rigidmd.studies.sweep.sweeping import Opened
+    from rigidmd.studies.sweep.table import Table
+
+
+def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add it with `add(name, function, about, example)`."""
+    sweep = add(
+        "sweep",
+        _sweep,
+        "run a scene at many points, a folder each, with a table and a figure of means and errors",
+        "rigidmd sweep water.toml --set stages.0.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
+        "  rigidmd sweep water.toml --replicas 8\n"
+        "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
+    )
+    count = number(int, 1, 4096, "a number from 1 to 4096")
+    seeds = number(int, 2, 10000, "a number of replicas from 2 on")
+    index = number(int, 0, inf, "the number of a point, from 0 on")
+    sweep.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
+    sweep.add_argument(
+        "--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
+        help="values of a key of the scene, one after another; KEY=1..8 for whole numbers; KEY=VALUE the same for all; "
+        "KEY,KEY=A,B for keys that go together; may be repeated: all combinations run",
+    )  # fmt: skip
+    sweep.add_argument(
+        "--replicas", type=seeds, metavar="N", help="N seeds, from that of the scene on: errors from their scatter"
+    )
+    sweep.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-sweep)")
+    sweep.add_argument("--force", action="store_true", help="remove an earlier sweep in that folder and begin anew")
+    sweep.add_argument(
+        "--jobs", type=count, metavar="N", help="points at a time (default: so many that cores are full)"
+    )
+    sweep.add_argument("--threads", type=count, metavar="N", help="threads of each point (default: cores over jobs)")
+    sweep.add_argument(
+        "--walltime", type=seconds, metavar="H:MM:SS",
+        help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job",
+    )  # fmt: skip
+    sweep.add_argument(
+        "--scheduler", metavar="ADDRESS",
+        help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here",
+    )  # fmt: skip
+    sweep.add_argument(
+        "--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"
+    )
+    sweep.add_argument(
+        "--collect", action="store_true", help="run nothing, and write table and figure of what is there"
+    )
+    sweep.add_argument("--point", type=index, metavar="K", help="run point K of a sweep that is there, from 0 on")
+    add_trust(sweep)
+    sweep.set_defaults(overrides=[], writes=True)
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from contextlib import ExitStack
+
+    from rigidmd.errors import OutputError
+    from rigidmd.studies.sweep.axes import parse_axes
+    from rigidmd.studies.sweep.sweeping import Wanted, opened, opened_again
+
+    _check(options)
+    folder = Path(options.output) if options.output else None
+    with ExitStack() as stack:
+        if options.point is not None:
+            return _one_point(options)
+        if options.collect and not options.sets and options.replicas is None:
+            if folder is None:
+                raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
+            return _collect(opened_again(folder, stack))
+        axes = parse_axes(options.sets)
+        wanted = Wanted(Path(options.scene), axes, folder, options.replicas, options.trust, options.force)
+        sweep = opened(wanted, stack)
+        if options.collect:
+            return _collect(sweep)
+        if options.to is not None:
+            return _to_slurm(options, sweep)
+        return _run(options, sweep)
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Raise OutputError for options that do not go together."""
+    from rigidmd.errors import OutputError
+
+    if options.to is not None and options.walltime is None:
+        raise OutputError("--to slurm needs --walltime, the time of each job: --walltime 4:00:00")
+    if options.point is not None and not options.output:
+        raise OutputError("--point needs -o, the folder of the sweep")
+    alone = [name for name in ("to", "collect", "point", "scheduler") if getattr(options, name) not in (None, False)]
+    if len(alone) > 1:
+        raise OutputError(f"--{alone[0]} and --{alone[1]} do not go together")
+    if options.point is not None and (options.sets or options.replicas or options.force):
+        raise OutputError("--point runs what the folder says; leave out --set, --replicas and --force")
+    if options.collect and options.force:
+        raise OutputError("--collect writes of what is there; leave out --force, which removes it")
+
+
+def _run(options: argparse.Namespace, sweep: "Opened") -> int:
+    """Run what has not finished, and tell what came out."""
+    from rigidmd.io.progress import progress_of
+    from rigidmd.studies.sweep.running import run_points
+    from rigidmd.studies.sweep.sweeping import collected, runner_of, shares
+
+    folder, manifest = sweep.folder, sweep.manifest
+    jobs, threads = shares(sweep.left, options.jobs, options.threads, sweep.is_body)
+    if options.scheduler not in (None, "local"):
+        threads = options.threads or 1  # a thread of a worker of dask for each point
+    count = len(manifest.points)
+    print(f"{manifest.name}: {count} points in {folder}, {count - sweep.left} of them finished before", flush=True)
+    if sweep.left:
+        runner = runner_of(folder, options.scheduler, jobs, threads)
+        if options.scheduler is None:
+            at_a_time = f"{jobs} at a time, " if jobs > 1 else "one at a time, "
+            print(f"  {at_a_time}{threads} thread{'s' if threads > 1 else ''} each", flush=True)
+        else:
+            print(
+                f"  on the cluster {options.scheduler}, {threads} thread{'s' if threads > 1 else ''} each", flush=True
+            )
+        with progress_of(sweep.left, "points", True) as bar:
+            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(bar).hear)
+    else:
+        from rigidmd.studies.sweep.running import Outcome
+
+        outcome = Outcome(skipped=[point.folder for point in manifest.points])
+    _told(*collected(folder, manifest), manifest)
+    again = shlex.join(["rigidmd", *sys.argv[1:]]).replace(" --force", "")
+    print(
+        f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {len(outcome.skipped)} skipped, "
+        f"{len(outcome.left)} left; {outcome.seconds:.3g} s"
+    )
+    for point in manifest.points:
+        if point.folder in outcome.failed:
+            print(f"  failed: {point.folder}: {visible(point.message or '')}")
+    if outcome.failed or outcome.left:
+        print(f"  the same command goes on with what is left, and repeats what failed: {again}")
+    if outcome.signal is not None:
+        return BY_SIGNAL + outcome.signal
+    if outcome.out_of_time:
+        return OUT_OF_TIME
+    return FAILED if outcome.failed or outcome.left else 0
+
+
+class _Listener:
+    """Shows what points say: shares as progress, warnings once each, failures at once."""
+
+    def __init__(self, bar: "Bar"):
+        self._bar = bar
+        self._shares: dict[str, float] = {}
+        self._told: set[str] = set()
+
+    def hear(self, name: str, kind: str, value: Any) -> None:
+        """A message of a point."""
+        from tqdm import tqdm
+
+        if kind in ("share", "ended", "died"):
+            before, begins = self._shares.get(name, 0.0), kind == "share" and name not in self._shares
+            ended = kind != "share"
+            now = value if not ended else (1.0 if kind == "ended" and value["state"] == "finished" else before)
+            if begins and not self._shares:
+                self._bar.unpause()  # this is when the first steps begin
+            self._shares[name] = max(before, now)
+            # what a resumed point had before
+            (self._bar.skip if begins else self._bar.update)(max(0.0, now - before))
+            why = value if kind == "died" else value["message"] if ended else None
+            if why:
+                tqdm.write(f"  {name}: {visible(why)}", file=sys.stderr)
+        elif kind == "said" and value.startswith("compiling") and value not in self._told:
+            self._told.add(value)
+            tqdm.write(f"  {name}: {value} ...", file=sys.stderr)
+        elif kind == "warned" and value not in self._told:
+            self._told.add(value)
+            tqdm.write(f"rigidmd: warning: {name}: {visible(value)}", file=sys.stderr)
+
+
+def _told(table: "Table", files: list[Path], manifest: "Manifest") -> None:
+    """Print a table, and where it is."""
+    from rigidmd.studies.sweep.table import table_text
+
+    if files:
+        print(table_text(table))
+    for name, why in table.failed.items():
+        print(f"  {name} is not in the table: {why}")
+    names = ["sweep.json", *(path.name for path in files)]
+    print(f"\n  files in {table.folder}: {', '.join(names)}, and a folder for each of {len(manifest.points)} points")
+    if any(row.runs for row in table.rows):
+        print(f"  `rigidmd analyse {shlex.quote(str(table.folder))}` measures all of them")
+
+
+def _collect(sweep: "Opened") -> int:
+    """`--collect`."""
+    from rigidmd.studies.sweep.sweeping import collected
+
+    count = len(sweep.manifest.points)
+    left = sum(point.state != "finished" for point in sweep.manifest.points)
+    print(f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - left} of them finished")
+    _told(*collected(sweep.folder, sweep.manifest), sweep.manifest)
+    return FAILED if left else 0
+
+
+def _to_slurm(options: argparse.Namespace, sweep: "Opened") -> int:
+    """`--to slurm`."""
+    from rigidmd.studies.sweep.slurm import write_script
+
+    if not sweep.left:
+        print(f"all {len(sweep.manifest.points)} points in {sweep.folder} have finished")
+        return _collect(sweep)
+    path, count = write_script(
+        sweep.folder, sweep.manifest, options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
+    )
+    print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")
+    folder = shlex.quote(str(sweep.folder))
+    print(f"  when all have ended: rigidmd sweep {shlex.quote(options.scene)} -o {folder} --collect")
+    return 0
+
+
+def _one_point(options: argparse.Namespace) -> int:
+    """`--point`: the one that a scheduler started."""
+    if options.threads is not None:
+        import os
+
+        os.environ["NUMBA_NUM_THREADS"] = str(options.threads)  # before Numba is imported
+    from rigidmd.studies.sweep.sweeping import run_point
+
+    def tell(kind: str, value: Any) -> None:
+        if kind == "warned":
+            warn(value)
+        elif kind == "said":
+            say(value)
+
+    name, ended = run_point(
+        Path(options.output), options.point, Path(options.scene), options.walltime, options.trust, tell
+    )
+    print(f"{name}: {ended['state']}, {ended['seconds']:.3g} s")
+    if ended["message"]:
+        print(f"rigidmd: {name}: {visible(ended['message'])}", file=sys.stderr)
+    if ended["out_of_time"]:
+        return OUT_OF_TIME
+    if ended["state"] == "finished":
+        return 0
+    return FAILED if ended["state"] == "failed" else INTERRUPTED

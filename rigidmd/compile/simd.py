@@ -1,0 +1,732 @@
+"""SIMD vectors for compiled code: a Numba type whose values are LLVM vectors.
+
+Lanes of float32 or float64 support `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
+from and stored to contiguous arrays. The number of lanes follows from the machine (machine.SIMD_BITS): 16 float32 with
+AVX-512, 8 with AVX2, otherwise 4; half as many float64. `lane_types` has the types and operators, this file the
+functions.
+
+Functions that appear in formulas also take scalars, so that one formula serves pair loops and single numbers; so do
+those of Python's `math`, see `lane_math`.
+"""
+
+from math import prod, sqrt
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from rigidmd.compile import SIMD_BITS, implements
+from rigidmd.compile.machine import IS_X86
+from rigidmd.compile.simd_types import COUNT, Lanes, Mask, filled, multiply_add
+
+#: Whether this machine has the instruction that `picked` uses and estimates to 14 bits.
+HAS_AVX512 = SIMD_BITS == 512
+
+
+def lane_count(dtype) -> int:
+    """Number of lanes in a vector of a NumPy dtype on this machine."""
+    return SIMD_BITS // (8 * np.dtype(dtype).itemsize)
+
+
+def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
+    """Like np.zeros, aligned so that no vector lies across two cache lines.
+
+    NumPy aligns to 16 bytes, so a vector of 64 bytes would lie across two lines; that costs the pair loop 3 to 4 %.
+    """
+    shape = (shape,) if isinstance(shape, int) else shape
+    size = prod(shape) * np.dtype(dtype).itemsize
+    vector = SIMD_BITS // 8
+    memory = np.zeros(size + vector, np.uint8)
+    start = -memory.ctypes.data % vector
+    return memory[start : start + size].view(dtype).reshape(shape)
+
+
+# --- memory ----------------------------------------------------------------------------------------------------------
+
+
+def _address(context, builder, array_type, array, index, lanes):
+    """Pointer to the vector that starts at array[index]."""
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
+
+
+def _is_contiguous(array) -> bool:
+    return isinstance(array, types.Array) and array.layout == "C"
+
+
+def _is_row(array) -> bool:
+    return _is_contiguous(array) and array.ndim == 1
+
+
+def _load(lanes, array):
+    def emit(context, builder, signature, arguments):
+        address = _address(context, builder, array, *arguments, lanes)
+        return builder.load(address, align=array.dtype.bitwidth // 8)
+
+    return lanes(array, types.intp), emit
+
+
+@intrinsic
+def load(typing, array, index):
+    """The vector array[index], array[index + 1], ... of a contiguous array; of several axes the last counts first."""
+    return _load(Lanes(array.dtype, COUNT[array.dtype]), array) if _is_contiguous(array) else None
+
+
+@intrinsic
+def item(typing, array, index):
+    """array[index] for an index that is not negative. Numba tests others at each access, inside the pair loop."""
+    if not _is_row(array):
+        return None
+
+    def emit(context, builder, signature, arguments):
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        return builder.load(builder.gep(data, [arguments[1]]))
+
+    return array.dtype(array, types.intp), emit
+
+
+@intrinsic
+def load_beside(typing, array, index, other):
+    """`load` with the number of lanes that vectors of another array have."""
+    signature, emit = _load(Lanes(array.dtype, COUNT[other.dtype]), array)
+    return signature.return_type(array, types.intp, other), lambda c, b, s, a: emit(c, b, s, a[:2])
+
+
+@intrinsic
+def load_four(typing, array, index):
+    """Four numbers from array[index] on."""
+    return _load(Lanes(array.dtype, 4), array) if _is_row(array) else None
+
+
+@intrinsic
+def load_eight(typing, array, index):
+    """Eight numbers from array[index] on."""
+    return _load(Lanes(array.dtype, 8), array) if _is_row(array) else None
+
+
+@intrinsic
+def spread(typing, array, index):
+    """A vector with array[index] in every lane."""
+    if not _is_row(array):
+        return None
+    lanes = Lanes(array.dtype, COUNT[array.dtype])
+
+    def emit(context, builder, signature, arguments):
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        return filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
+
+    return lanes(array, types.intp), emit
+
+
+@intrinsic
+def store(typing, array, index, lanes):
+    """Write a vector to array[index], array[index + 1], ..."""
+
+    def emit(context, builder, signature, arguments):
+        target, index, value = arguments
+        address = _address(context, builder, array, target, index, lanes)
+        builder.store(value, address, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes), emit
+
+
+@intrinsic
+def align_stack(typing):
+    """Align the stack of the calling function to vectors: what registers cannot hold must not lie across cache lines.
+
+    LLVM decides whether to align it before it knows that registers will not suffice. Then chance decided, at each start
+    of a process: forces of PME in double precision took between 1.3 and 2.2 ns a lane.
+    """
+
+    def emit(context, builder, signature, arguments):
+        slot = cgutils.alloca_once(builder, ir.VectorType(ir.IntType(8), SIMD_BITS // 8))
+        slot.align = SIMD_BITS // 8
+        kind = ir.FunctionType(ir.VoidType(), [slot.type])
+        builder.asm(kind, "", "r", [slot], side_effect=True)
+        return context.get_dummy_value()
+
+    return types.void(), emit
+
+
+# --- functions of lanes ----------------------------------------------------------------------------------------------
+
+
+#: What LLVM needs to be told before it replaces a division or a root by the hardware's estimate and a step of Newton's.
+ESTIMATED = ("afn", "arcp", "contract", "nsz", "reassoc")
+
+
+def _call(builder, name, result, *arguments, flags=()):
+    """Call an LLVM intrinsic."""
+    kind = ir.FunctionType(result, [a.type for a in arguments])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments, fastmath=flags)
+
+
+def _suffix(kind) -> str:
+    """The name of a vector type in names of LLVM intrinsics."""
+    element = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}.get(kind.element) or f"i{kind.element.width}"
+    return f"v{kind.count}{element}"
+
+
+def _square_root(builder, value):
+    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=ESTIMATED)
+
+
+def _inverted(builder, value):
+    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=ESTIMATED)
+
+
+@intrinsic
+def root(typing, x):
+    """Square roots of a vector, accurate to about the last digit."""
+    return x(x), lambda context, builder, signature, arguments: _square_root(builder, *arguments)
+
+
+@intrinsic
+def _quick_inverse(typing, x):
+    """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of 2e-7."""
+    return x(x), lambda context, builder, signature, arguments: _inverted(builder, _square_root(builder, *arguments))
+
+
+@intrinsic
+def _quick_quotient(typing, x):
+    """1/x in float32, in the same way."""
+    return x(x), lambda context, builder, signature, arguments: _inverted(builder, *arguments)
+
+
+def _converted(dtype):
+    def converted(typing, x):
+        lanes = Lanes(dtype, x.count)
+
+        def emit(context, builder, signature, arguments):
+            target = context.get_value_type(lanes)
+            if x.dtype == dtype:
+                return arguments[0]
+            change = builder.fptrunc if dtype.bitwidth < x.dtype.bitwidth else builder.fpext
+            return change(arguments[0], target)
+
+        return lanes(x), emit
+
+    return converted
+
+
+single = intrinsic(_converted(types.float32))
+double = intrinsic(_converted(types.float64))
+
+
+#: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³ (p = 3/2).
+QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2, 15 / 8, 35 / 16, 315 / 128)
+
+
+def _terms(x) -> int:
+    """How many terms of a series correct the estimates of a type; 0 if it has none.
+
+    The next term is below half the last digit: e is at most 1.2e-4 with AVX-512, 7.4e-4 with older instructions.
+    """
+    if not IS_X86 or x.count not in (2, 4, 8, 16):
+        return 0
+    return (1 if x.dtype == types.float32 else 3) + (not _is_whole(x))
+
+
+def _is_whole(x) -> bool:
+    """Whether a type of vectors fills the registers of AVX-512."""
+    return HAS_AVX512 and x.count == COUNT.get(x.dtype)
+
+
+def _estimated(name):
+    def estimated(typing, x):
+        def emit(context, builder, signature, arguments):
+            value = arguments[0]
+            if _is_whole(x):
+                everywhere = ir.Constant(ir.IntType(max(8, x.count)), -1)
+                kind = {types.float32: "ps", types.float64: "pd"}[x.dtype]
+                return _call(builder, f"llvm.x86.avx512.{name}14.{kind}.512", value.type, value, value, everywhere)
+            if x.dtype == types.float64:
+                value = builder.fptrunc(value, ir.VectorType(ir.FloatType(), x.count))
+            if x.count == 2:
+                value = _shuffled(builder, value, value, (0, 1, 0, 1))
+            kind = "avx.{}.ps.256" if x.count == 8 else "sse.{}.ps"
+            value = _call(builder, f"llvm.x86.{kind.format(name)}", value.type, value)
+            if x.count == 2:
+                value = _shuffled(builder, value, value, (0, 1))
+            return value if x.dtype == types.float32 else builder.fpext(value, context.get_value_type(x))
+
+        return x(x), emit
+
+    return estimated
+
+
+#: 1/sqrt(x) and 1/x of a vector by the machine's estimates: relative errors up to 2^-14 with AVX-512, else 1.5 2^-12.
+#: That of 1/x is used with AVX-512 only.
+_root_estimate = intrinsic(_estimated("rsqrt"))
+_quotient_estimate = intrinsic(_estimated("rcp"))
+
+
+@intrinsic
+def _nested(typing, coefficients, x):
+    """Sum of coefficients[k] x^k, by as few operations as there are."""
+
+    def emit(context, builder, signature, arguments):
+        kinds = signature.args[0].types
+        found = None
+        for k in reversed(range(len(kinds))):
+            own = filled(context, builder, builder.extract_value(arguments[0], k), kinds[k], x)
+            found = own if found is None else multiply_add(builder, found, arguments[1], own)
+        return found
+
+    return x(coefficients, x), emit
+
+
+def inverse_root(x):
+    """1/sqrt(x), accurate to about the last digit."""
+    raise TypeError("compiled code only")
+
+
+# The series are written out, since LLVM's own choice depends on the processor: for some it computes a root and divides,
+# for others it corrects an estimate of float32 by one step, and the cube is off by up to 5.8e-7 instead of 1.9e-7.
+@implements(inverse_root, inline=True)
+def _inverse_root(x):
+    if not isinstance(x, Lanes):
+        return lambda x: 1 / sqrt(x)
+    if terms := _terms(x):
+        series = ROOT[:terms]
+
+        def from_estimate(x):
+            y = _root_estimate(x)
+            e = 1.0 - x * y * y
+            return y + y * (e * _nested(series, e))
+
+        return from_estimate
+
+    if x.dtype == types.float32:
+        return lambda x: _quick_inverse(x)
+
+    def refined(x):
+        # One step of third order takes the float32 result from 24 bits to 53; a float64 root and division are slower.
+        y = double(_quick_inverse(single(x)))
+        e = 1.0 - x * y * y
+        return y + y * e * (0.5 + 0.375 * e)
+
+    return refined
+
+
+def root_and_cube(x):
+    """1/sqrt(x), and two numbers whose product is 1/sqrt(x)³, each accurate to about the last digit.
+
+    The caller multiplies the two in one multiply-add with what is added to the cube. The root costs nothing where it is
+    not used.
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(root_and_cube, inline=True)
+def _root_and_cube(x):
+    if isinstance(x, Lanes) and _terms(x):
+        series, of_root = (1.0, *CUBE[: _terms(x)]), ROOT[: _terms(x)]
+
+        def from_estimate(x):
+            # A corrected root and its cube would take one multiplication more; pairs with a reaction field then take
+            # 5 % longer (AVX-512). The root from the cube would have two rounding errors more, which energies show.
+            y = _root_estimate(x)
+            y2 = y * y
+            e = 1.0 - x * y2
+            return y + y * (e * _nested(of_root, e)), y * y2, _nested(series, e)
+
+        return from_estimate
+
+    def cubed(x):
+        y = inverse_root(x)
+        return y, y, y * y
+
+    return cubed
+
+
+@intrinsic
+def smaller_of_two(typing, x):
+    """The smaller of lanes 2 k and 2 k + 1, in both lanes."""
+
+    def emit(context, builder, signature, arguments):
+        value, count = arguments[0], x.count
+        order = ir.Constant(ir.VectorType(ir.IntType(32), count), [k ^ 1 for k in range(count)])
+        beside = builder.shuffle_vector(value, value, order)
+        return builder.select(builder.fcmp_ordered("<", value, beside), value, beside)
+
+    return x(x), emit
+
+
+@intrinsic
+def store_whole_alternate(typing, array, index, x):
+    """Write the whole parts of lanes 0, 2, 4, ... of a vector, from 0 to 127, to an array of bytes from an index on.
+
+    Lane 1 must equal lane 0, lane 3 lane 2, and so on.
+    """
+    if not _is_row(array) or array.dtype != types.uint8:
+        return None
+    count = x.count // 2
+
+    def emit(context, builder, signature, arguments):
+        target, index, value = arguments
+        whole = builder.fptosi(value, ir.VectorType(ir.IntType(32), x.count))
+        # two equal lanes are one number of 64 bits, of which the lowest byte is wanted: no lanes are moved
+        half = builder.trunc(
+            builder.bitcast(whole, ir.VectorType(ir.IntType(64), count)), ir.VectorType(ir.IntType(8), count)
+        )
+        data = context.make_array(array)(context, builder, target).data
+        builder.store(half, builder.bitcast(builder.gep(data, [index]), half.type.as_pointer()), align=1)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, x), emit
+
+
+def inverse(x):
+    """1/x, accurate to about the last digit."""
+    raise TypeError("compiled code only")
+
+
+@implements(inverse, inline=True)
+def _inverse(x):
+    if not isinstance(x, Lanes):
+        return lambda x: 1 / x
+    if _is_whole(x):  # without AVX-512 a division in single precision is faster
+        series = QUOTIENT[: _terms(x)]
+
+        def from_estimate(x):
+            y = _quotient_estimate(x)
+            e = 1.0 - x * y
+            return y + y * (e * _nested(series, e))
+
+        return from_estimate
+
+    if x.dtype == types.float32:
+        return lambda x: _quick_quotient(x)
+
+    def refined(x):
+        y = double(_quick_quotient(single(x)))
+        e = 1.0 - x * y
+        return y + y * e * (1.0 + e)
+
+    return refined
+
+
+def _chosen(sign):
+    def chosen(typing, x, y):
+        def emit(context, builder, signature, arguments):
+            a, b = (filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
+            return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+
+        return x(x, y), emit
+
+    return chosen
+
+
+_larger = intrinsic(_chosen(">"))
+_smaller = intrinsic(_chosen("<"))
+
+
+def larger(x, y):
+    """The larger of x and y in each lane, y where x is NaN; y may be a scalar."""
+    raise TypeError("compiled code only")
+
+
+@implements(larger, inline=True)
+def _larger_of_both(x, y):
+    if isinstance(x, Lanes):
+        return lambda x, y: _larger(x, y)
+    return lambda x, y: max(x, y)
+
+
+def smaller(x, y):
+    """The smaller of x and y in each lane, y where x is NaN; y may be a scalar."""
+    raise TypeError("compiled code only")
+
+
+@implements(smaller, inline=True)
+def _smaller_of_both(x, y):
+    if isinstance(x, Lanes):
+        return lambda x, y: _smaller(x, y)
+    return lambda x, y: min(x, y)
+
+
+@intrinsic
+def select(typing, mask, x, y):
+    """x where the mask is set, y elsewhere; y may be a scalar."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.select(arguments[0], arguments[1], filled(context, builder, arguments[2], signature.args[2], x))
+
+    return x(mask, x, y), emit
+
+
+@intrinsic
+def bits(typing, mask):
+    """The mask as an integer, bit k for lane k."""
+
+    def emit(context, builder, signature, arguments):
+        word = builder.bitcast(arguments[0], ir.IntType(mask.count))
+        return builder.zext(word, ir.IntType(64)) if mask.count < 64 else word
+
+    return types.int64(mask), emit
+
+
+@intrinsic
+def lowest_bit(typing, word):
+    """Index of the lowest set bit of a word that is not 0."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.cttz(arguments[0], ir.IntType(1)(1))
+
+    return types.int64(types.int64), emit
+
+
+@intrinsic
+def mask_of(typing, word, lanes):
+    """The mask for lanes of this type, with lane k from bit k of an integer."""
+    mask = Mask(lanes.count)
+
+    def emit(context, builder, signature, arguments):
+        return builder.bitcast(builder.trunc(arguments[0], ir.IntType(mask.count)), context.get_value_type(mask))
+
+    return mask(types.int64, lanes), emit
+
+
+@intrinsic
+def total(typing, x):
+    """The sum of all lanes as a float64, added pairwise in a fixed order."""
+
+    def emit(context, builder, signature, arguments):
+        value = arguments[0]
+        if x.dtype == types.float32:
+            value = builder.fpext(value, ir.VectorType(ir.DoubleType(), x.count))
+        return builder.extract_element(_in_halves(builder, value, 1), ir.IntType(32)(0))
+
+    return types.float64(x), emit
+
+
+def _shuffled(builder, a, b, lanes):
+    """A vector of these lanes of two others; those of b have the numbers after those of a."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
+
+
+def _in_halves(builder, value, count):
+    """The halves of a vector added, again and again until so many lanes are left."""
+    while value.type.count > count:
+        half = value.type.count // 2
+        value = builder.fadd(*(_shuffled(builder, value, value, range(k, k + half)) for k in (0, half)))
+    return value
+
+
+@intrinsic
+def add_totals(typing, array, index, step, x, y):
+    """Add the sums of all lanes of vectors x[k] and y[k] to array[index + k step] and array[index + k step + 1].
+
+    x, y : tuples of three vectors. All six are summed together, in the precision of the array, which takes fewer
+    instructions than six times `total`.
+    """
+    if not _is_row(array):
+        return None
+    lanes = Lanes(array.dtype, COUNT[array.dtype])
+    three = types.UniTuple(lanes, 3)
+    width, part = lanes.count, 128 // array.dtype.bitwidth  # part: lanes within which a processor shuffles fastest
+
+    def merged(builder, a, b, first, second):
+        """The sum of two choices of lanes of a and b, the same in each part."""
+        both = [[start + k for start in range(0, width, part) for k in lanes] for lanes in (first, second)]
+        return builder.fadd(*(_shuffled(builder, a, b, lanes) for lanes in both))
+
+    def emit(context, builder, signature, arguments):
+        into, index, step, *both = arguments
+        found = [[builder.extract_value(of, k) for of in both] for k in range(3)]
+        if part == 2:
+            sums = [_in_halves(builder, merged(builder, *of, (0, width), (1, width + 1)), 2) for of in found]
+        else:
+            halves = (0, width, 1, width + 1), (2, width + 2, 3, width + 3)
+            on_x, on_y, on_z = (merged(builder, *of, *halves) for of in found)
+            halves = (0, 1, width, width + 1), (2, 3, width + 2, width + 3)
+            fours = [_in_halves(builder, merged(builder, *of, *halves), 4) for of in ((on_x, on_y), (on_z, on_z))]
+            sums = [_shuffled(builder, four, four, lanes) for four in fours for lanes in ((0, 1), (2, 3))][:3]
+        data = context.make_array(array)(context, builder, into).data
+        for own in sums:
+            there = builder.bitcast(builder.gep(data, [index]), own.type.as_pointer())
+            align = array.dtype.bitwidth // 8
+            builder.store(builder.fadd(builder.load(there, align=align), own), there, align=align)
+            index = builder.add(index, step)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, three, three), emit
+
+
+@intrinsic
+def largest(typing, x):
+    """The largest of all lanes; undefined if a lane is NaN."""
+
+    def emit(context, builder, signature, arguments):
+        kind, flags = arguments[0].type, ("nnan",)
+        return _call(builder, f"llvm.vector.reduce.fmax.{_suffix(kind)}", kind.element, *arguments, flags=flags)
+
+    return x.dtype(x), emit
+
+
+@intrinsic
+def lane(typing, x, k):
+    """The number in lane k."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.extract_element(arguments[0], arguments[1])
+
+    return x.dtype(x, types.intp), emit
+
+
+@intrinsic
+def polynomial(typing, coefficients, x):
+    """Sum of coefficients[k] x^k for a tuple of floats in ascending order; x is a scalar or a vector.
+
+    Even and odd powers are summed separately: two independent chains of multiply-adds, each half as long, overlap.
+    """
+    if not isinstance(coefficients, types.BaseTuple) or not isinstance(x, Lanes | types.Float):
+        return None
+
+    def emit(context, builder, signature, arguments):
+        values, x_value = arguments
+        kinds = signature.args[0].types
+
+        def constant(k):
+            number = builder.extract_value(values, k)
+            if isinstance(x, Lanes):
+                return filled(context, builder, number, kinds[k], x)
+            return context.cast(builder, number, kinds[k], x)
+
+        def chain(powers, y):
+            total = constant(powers[-1])
+            for k in powers[-2::-1]:
+                total = multiply_add(builder, total, y, constant(k))
+            return total
+
+        square = builder.fmul(x_value, x_value)
+        even, odd = range(0, len(kinds), 2), range(1, len(kinds), 2)
+        found = chain(even, square)
+        if len(odd):
+            found = multiply_add(builder, chain(odd, square), x_value, found)
+        return found
+
+    return x(coefficients, x), emit
+
+
+@intrinsic
+def cubic_at(typing, coefficients, t):
+    """(value, derivative) at t of cubic polynomials, number k of which is valid from t = k to k + 1.
+
+    coefficients (4 n,) : four for each, of x = t - k in ascending order. Before 0 the first goes on in a straight line,
+    beyond the end the last one goes on. t is a float64 or a vector
+    """
+    lanes = t if isinstance(t, Lanes) else Lanes(types.float64, 1)
+    pair = types.UniTuple(t, 2)
+
+    def emit(context, builder, signature, arguments):
+        there = context.make_array(coefficients)(context, builder, arguments[0])
+        vector, whole = context.get_value_type(lanes), ir.VectorType(ir.IntType(64), lanes.count)
+        value = arguments[1] if isinstance(t, Lanes) else builder.bitcast(arguments[1], vector)
+        last = builder.sub(builder.sdiv(builder.extract_value(there.shape, 0), ir.IntType(64)(4)), ir.IntType(64)(1))
+        zero = ir.Constant(vector, [0.0] * lanes.count)
+        begins = builder.fcmp_ordered("<", value, zero)
+        step = builder.fptosi(builder.select(begins, zero, value), whole)
+        parts = [ir.Constant(vector, ir.Undefined)] * 4
+        starts = zero
+        for k in range(lanes.count):
+            place = ir.IntType(32)(k)
+            index = builder.extract_element(step, place)
+            index = builder.select(builder.icmp_signed("<", index, last), index, last)
+            index = builder.select(builder.icmp_signed(">", index, ir.IntType(64)(0)), index, ir.IntType(64)(0))
+            starts = builder.insert_element(starts, builder.sitofp(index, vector.element), place)
+            address = builder.gep(there.data, [builder.mul(index, ir.IntType(64)(4))])
+            for c in range(4):
+                number = builder.load(builder.gep(address, [ir.IntType(64)(c)]))
+                if number.type != vector.element:
+                    number = builder.fptrunc(number, vector.element)
+                parts[c] = builder.insert_element(parts[c], number, place)
+        x = builder.fsub(value, starts)
+        curved = [builder.select(begins, zero, part) for part in parts[2:]]
+
+        def sum_of(*terms):
+            total = terms[-1]
+            for term in terms[-2::-1]:
+                total = multiply_add(builder, total, x, term)
+            return total
+
+        def times(k, part):
+            return builder.fmul(ir.Constant(vector, [float(k)] * lanes.count), part)
+
+        found = sum_of(*parts[:2], *curved), sum_of(parts[1], times(2, curved[0]), times(3, curved[1]))
+        if not isinstance(t, Lanes):
+            found = [builder.extract_element(own, ir.IntType(32)(0)) for own in found]
+        return context.make_tuple(builder, pair, found)
+
+    return pair(coefficients, t), emit
+
+
+@intrinsic
+def fill(typing, number, array):
+    """A vector of an array's type with the same number in every lane."""
+    lanes = Lanes(array.dtype, COUNT[array.dtype])
+
+    def emit(context, builder, signature, arguments):
+        return filled(context, builder, arguments[0], number, lanes)
+
+    return lanes(number, array), emit
+
+
+def width_of(array):
+    """Number of lanes in the vectors of an array, a constant at compile time."""
+    raise TypeError("compiled code only")
+
+
+@implements(width_of, inline=True)
+def _width_of(array):
+    count = COUNT[array.dtype]
+    return lambda array: count
+
+
+def narrowed(x, array):
+    """A vector converted to the precision of an array."""
+    raise TypeError("compiled code only")
+
+
+@implements(narrowed, inline=True)
+def _narrowed(x, array):
+    if array.dtype == types.float32:
+        return lambda x, array: single(x)
+    return lambda x, array: x
+
+
+@intrinsic
+def parted(typing, x):
+    """(whole, rest) of float32 lanes: integers, rounded towards 0, and x less these; undefined from 2^31 on."""
+    if not isinstance(x, Lanes) or x.dtype != types.float32:
+        return None
+    whole = Lanes(types.int32, x.count)
+    pair = types.Tuple((whole, x))
+
+    def emit(context, builder, signature, arguments):
+        step = builder.fptosi(arguments[0], context.get_value_type(whole))
+        rest = builder.fsub(arguments[0], builder.sitofp(step, arguments[0].type))
+        return context.make_tuple(builder, pair, (step, rest))
+
+    return pair(x), emit
+
+
+@intrinsic
+def picked(typing, low, high, index):
+    """In each lane, one of 32 numbers: 0 to 15 are the lanes of `low`, 16 to 31 those of `high`, all float32.
+
+    Only the last five bits of an index count. This is one instruction of AVX-512, see HAS_AVX512: a table in registers.
+    """
+    if (low, high, index) != (Lanes(types.float32, 16), Lanes(types.float32, 16), Lanes(types.int32, 16)):
+        return None
+
+    def emit(context, builder, signature, arguments):
+        first, second, place = arguments
+        name = "llvm.x86.avx512.vpermi2var.ps.512"
+        return _call(builder, name, first.type, first, place, second, flags=())
+
+    return low(low, high, index), emit

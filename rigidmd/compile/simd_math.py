@@ -1,0 +1,294 @@
+"""Functions of mathematics for vectors: math.exp, log, pow, sin, cos, sqrt, fabs, and -x, x**y, abs(x).
+
+A formula written with Python's `math` serves single numbers and vectors alike. In double precision the results are
+accurate to about the last digit, in single precision to 2e-7; x**n with a constant whole n is a product, with the
+rounding error of each factor.
+
+Sums of two parts, one of them the rounding error of the other, must not be reassociated: no kernel has fast-math flags.
+
+Methods: reduction of the argument by parts of ln 2 and pi/2 (Cody & Waite 1980), the logarithm with s = f/(2 + f) as in
+fdlibm, powers from a logarithm in two doubles (Dekker 1971); polynomials are truncated series.
+"""
+
+import math
+import operator
+from math import factorial
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import lower_builtin, type_callable
+
+from rigidmd.compile.simd_types import Lanes, filled
+
+#: ln 2 in two parts, by the bits of a number; the first ends in zero bits, so that whole multiples of it are exact.
+LN2 = {64: (0.693147180369123816490, 1.90821492927058770002e-10), 32: (0.693359375, -2.12194440e-4)}
+#: pi/2 in three doubles.
+HALF_PI = (1.5707963267948966, 6.123233995736766e-17, -1.4973849048591833e-33)
+#: Arguments of sin and cos beyond this give NaN: the distance between two numbers is a good part of a period.
+LONGEST_ANGLE = 1e13
+
+
+class Vector:
+    """Operations on vectors of one type, each rounded as written."""
+
+    def __init__(self, builder, lanes: Lanes):
+        self.builder = builder
+        self.bits, self.count = lanes.dtype.bitwidth, lanes.count
+        self.is_double = self.bits == 64
+        self.type = ir.VectorType(ir.DoubleType() if self.is_double else ir.FloatType(), self.count)
+        self.whole = ir.VectorType(ir.IntType(self.bits), self.count)
+        self.fraction_bits = 52 if self.is_double else 23
+        self.bias = 1023 if self.is_double else 127
+        self.magic = 1.5 * 2.0**self.fraction_bits  # added to a number, it leaves the nearest integer in the last bits
+
+    def number(self, x: float):
+        return ir.Constant(self.type, [x] * self.count)
+
+    def integer(self, k: int):
+        return ir.Constant(self.whole, [k] * self.count)
+
+    def call(self, name: str, *arguments):
+        suffix = f"v{self.count}{'f64' if self.is_double else 'f32'}"
+        kind = ir.FunctionType(self.type, [self.type] * len(arguments))
+        function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.{suffix}")
+        return self.builder.call(function, arguments)
+
+    def fma(self, a, b, c):
+        """a b + c, rounded once."""
+        return self.call("fma", a, b, c)
+
+    def add(self, a, b):
+        return self.builder.fadd(a, b)
+
+    def sub(self, a, b):
+        return self.builder.fsub(a, b)
+
+    def mul(self, a, b):
+        return self.builder.fmul(a, b)
+
+    def div(self, a, b):
+        return self.builder.fdiv(a, b)
+
+    def negative(self, a):
+        return self.builder.fneg(a)
+
+    def choose(self, mask, a, b):
+        return self.builder.select(mask, a, b)
+
+    def compare(self, sign: str, a, b):
+        return self.builder.fcmp_ordered(sign, a, b)
+
+    def as_bits(self, a):
+        return self.builder.bitcast(a, self.whole)
+
+    def as_number(self, k):
+        return self.builder.bitcast(k, self.type)
+
+    def nearest(self, a):
+        """The nearest integers of small numbers: as numbers, and as integers."""
+        moved = self.add(a, self.number(self.magic))
+        origin = self.builder.bitcast(self.number(self.magic), self.whole)
+        return self.sub(moved, self.number(self.magic)), self.builder.sub(self.as_bits(moved), origin)
+
+    def of_integer(self, k):
+        """Small integers as numbers."""
+        origin = self.builder.bitcast(self.number(self.magic), self.whole)
+        return self.sub(self.as_number(self.builder.add(k, origin)), self.number(self.magic))
+
+    def polynomial(self, coefficients: list[float], x):
+        """Sum of coefficients[k] x^k."""
+        total = self.number(coefficients[-1])
+        for c in coefficients[-2::-1]:
+            total = self.fma(total, x, self.number(c))
+        return total
+
+
+def exponential(v: Vector, x, low=None):
+    """exp(x + low), with low a small correction."""
+    least, most = (-746.0, 710.0) if v.is_double else (-104.0, 89.0)
+    x = v.choose(v.compare("<", x, v.number(least)), v.number(least), x)
+    x = v.choose(v.compare(">", x, v.number(most)), v.number(most), x)
+    n, k = v.nearest(v.mul(x, v.number(1 / math.log(2))))
+    high, rest = LN2[v.bits]
+    r = v.fma(v.negative(n), v.number(high), x)
+    r = v.fma(v.negative(n), v.number(rest), r)
+    if low is not None:
+        r = v.add(r, low)
+    series = v.polynomial([1 / factorial(j) for j in range(2, 14 if v.is_double else 9)], r)
+    result = v.add(v.number(1.0), v.fma(v.mul(r, r), series, r))
+    half = v.builder.ashr(k, v.integer(1))  # in two factors, for results near the ends of the range
+    for power in (half, v.builder.sub(k, half)):
+        biased = v.builder.add(power, v.integer(v.bias))
+        result = v.mul(result, v.as_number(v.builder.shl(biased, v.integer(v.fraction_bits))))
+    return result
+
+
+def _mantissa(v: Vector, x):
+    """(e, f) with x = 2^e (1 + f), 1 + f from sqrt(1/2) to sqrt(2); for x > 0."""
+    b = v.builder
+    least = 2.0 ** (1 - v.bias)
+    tiny = v.compare("<", x, v.number(least))
+    x = v.choose(tiny, v.mul(x, v.number(2.0**54)), x)
+    origin = v.as_bits(v.number(math.sqrt(0.5)))
+    e = b.ashr(b.sub(v.as_bits(x), origin), v.integer(v.fraction_bits))
+    m = v.as_number(b.sub(v.as_bits(x), b.shl(e, v.integer(v.fraction_bits))))
+    e = v.choose(tiny, b.sub(e, v.integer(54)), e)
+    return v.of_integer(e), v.sub(m, v.number(1.0))
+
+
+def _odd_series(v: Vector, s2):
+    """(log((1 + s)/(1 - s)) - 2 s)/s³ from s²."""
+    return v.polynomial([2 / (2 * j + 3) for j in range(11 if v.is_double else 5)], s2)
+
+
+def _special(v: Vector, x, result):
+    """The logarithm at infinity, at zero and below."""
+    result = v.choose(v.compare("==", x, v.number(math.inf)), v.number(math.inf), result)
+    below = v.choose(v.compare("==", x, v.number(0.0)), v.number(-math.inf), v.number(math.nan))
+    return v.choose(v.compare(">", x, v.number(0.0)), result, below)
+
+
+def logarithm(v: Vector, x):
+    """log(x)."""
+    e, f = _mantissa(v, x)
+    s = v.div(f, v.add(v.number(2.0), f))
+    s2 = v.mul(s, s)
+    half = v.mul(v.number(0.5), v.mul(f, f))
+    high, low = LN2[v.bits]
+    inner = v.fma(e, v.number(low), v.mul(s, v.fma(s2, _odd_series(v, s2), half)))
+    return _special(v, x, v.fma(e, v.number(high), v.sub(f, v.sub(half, inner))))
+
+
+def raised(v: Vector, x, y):
+    """x^y in double precision, for x >= 0; NaN for x < 0."""
+    e, f = _mantissa(v, x)
+    g = v.add(v.number(2.0), f)
+    lost = v.sub(f, v.sub(g, v.number(2.0)))
+    s = v.div(f, g)
+    rest = v.fma(v.negative(s), lost, v.fma(v.negative(s), g, f))
+    s2, twice = v.mul(s, s), v.mul(v.number(2.0), s)
+    ln2_high, ln2_low = LN2[64]
+    high = v.mul(e, v.number(ln2_high))  # exact
+    log_high = v.add(high, twice)
+    log_low = v.sub(twice, v.sub(log_high, high))
+    log_low = v.fma(e, v.number(ln2_low), log_low)
+    log_low = v.fma(v.number(2.0), v.div(rest, g), log_low)
+    log_low = v.fma(v.mul(s, s2), _odd_series(v, s2), log_low)
+    log_high = _special(v, x, log_high)
+    product = v.mul(y, log_high)
+    low = v.fma(y, log_low, v.fma(y, log_high, v.negative(product)))
+    low = v.choose(v.compare("<", v.call("fabs", product), v.number(750.0)), low, v.number(0.0))
+    result = exponential(v, product, low)
+    return v.choose(v.compare("==", y, v.number(0.0)), v.number(1.0), result)
+
+
+def _circular(v: Vector, x, quarter: int):
+    """sin(x + quarter pi/2)."""
+    b = v.builder
+    n, k = v.nearest(v.mul(x, v.number(2 / math.pi)))
+    r = x
+    for part in HALF_PI:
+        r = v.fma(v.negative(n), v.number(part), r)
+    r2 = v.mul(r, r)
+    sine = v.polynomial([(-1) ** (j + 1) / factorial(2 * j + 3) for j in range(8)], r2)
+    sine = v.fma(v.mul(r, r2), sine, r)
+    cosine = v.polynomial([(-1) ** j / factorial(2 * j + 4) for j in range(8)], r2)
+    half = v.mul(v.number(0.5), r2)
+    one = v.sub(v.number(1.0), half)
+    cosine = v.add(one, v.fma(v.mul(r2, r2), cosine, v.sub(v.sub(v.number(1.0), one), half)))
+    k = b.add(k, v.integer(quarter))
+    is_odd = b.icmp_signed("!=", b.and_(k, v.integer(1)), v.integer(0))
+    is_negative = b.icmp_signed("!=", b.and_(k, v.integer(2)), v.integer(0))
+    result = v.choose(is_odd, cosine, sine)
+    result = v.choose(is_negative, v.negative(result), result)
+    near = v.compare("<", v.call("fabs", x), v.number(LONGEST_ANGLE))
+    return v.choose(near, result, v.number(math.nan))
+
+
+def _in_double(builder, lanes: Lanes, emit, *values):
+    """A function of vectors that is computed in double precision whatever their type."""
+    wide = Vector(builder, Lanes(types.float64, lanes.count))
+    if wide.bits == lanes.dtype.bitwidth:
+        return emit(wide, *values)
+    narrow = values[0].type
+    return builder.fptrunc(emit(wide, *(builder.fpext(value, wide.type) for value in values)), narrow)
+
+
+def _root(builder, lanes, x):
+    return Vector(builder, lanes).call("sqrt", x)
+
+
+def _absolute(builder, lanes, x):
+    return Vector(builder, lanes).call("fabs", x)
+
+
+#: What Python's functions are for vectors: emit(builder, type, value).
+FUNCTIONS = {
+    math.exp: lambda builder, lanes, x: exponential(Vector(builder, lanes), x),
+    math.log: lambda builder, lanes, x: logarithm(Vector(builder, lanes), x),
+    math.sin: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _circular(v, x, 0), x),
+    math.cos: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _circular(v, x, 1), x),
+    math.sqrt: _root,
+    math.fabs: _absolute,
+    abs: _absolute,
+    operator.neg: lambda builder, lanes, x: builder.fneg(x),
+    operator.pos: lambda builder, lanes, x: x,
+}
+
+
+def _define(function, emit):
+    @type_callable(function)
+    def of_type(context):
+        return lambda x: x if isinstance(x, Lanes) else None
+
+    def lower(context, builder, signature, arguments):
+        return emit(builder, signature.args[0], arguments[0])
+
+    lower_builtin(function, Lanes)(lower)
+
+
+for _function, _emit in FUNCTIONS.items():
+    _define(_function, _emit)
+
+
+def _whole_power(v: Vector, x, n: int):
+    """x^n by squaring, for a constant integer."""
+    if n == 0:
+        return v.number(1.0)
+    size, square, result = abs(n), x, None
+    while size:
+        if size & 1:
+            result = square if result is None else v.mul(result, square)
+        size >>= 1
+        if size:
+            square = v.mul(square, square)
+    return v.div(v.number(1.0), result) if n < 0 else result
+
+
+class _PowerType(AbstractTemplate):
+    """Types of powers. The constant exponent of x**n keeps its value in its type: whole powers are products."""
+
+    def generic(self, args, kws):
+        x, y = args
+        if isinstance(x, Lanes) and (x == y or isinstance(y, types.Number | types.IntegerLiteral)):
+            return signature(x, x, y)
+        if isinstance(y, Lanes) and isinstance(x, types.Number):
+            return signature(y, x, y)
+        return None
+
+
+def _power(context, builder, signature, arguments):
+    lanes, (of_x, of_y) = signature.return_type, signature.args
+    x = filled(context, builder, arguments[0], of_x, lanes)
+    if isinstance(of_y, types.IntegerLiteral):
+        return _whole_power(Vector(builder, lanes), x, of_y.literal_value)
+    return _in_double(builder, lanes, raised, x, filled(context, builder, arguments[1], of_y, lanes))
+
+
+for _function in (operator.pow, operator.ipow, math.pow):
+    _kind = {"key": _function, "prefer_literal": _function is not math.pow}
+    infer_global(_function)(type(f"{_function.__name__}_of_lanes", (_PowerType,), _kind))
+    for _kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes), (Lanes, types.IntegerLiteral)):
+        lower_builtin(_function, *_kinds)(_power)

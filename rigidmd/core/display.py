@@ -1,0 +1,24 @@
+"""Display of values in notebooks. Packages above register functions for values of packages below.
+
+A module in `PROVIDERS` is imported when a value is first displayed; `rigidmd` names `rigidmd.view.notebook`.
+"""
+
+from functools import singledispatch
+from importlib import import_module
+
+PROVIDERS: list[str] = []
+
+
+@singledispatch
+def html(value: object) -> str | None:
+    """HTML of a value, registered for its type; None where nothing is registered."""
+    return None
+
+
+class Displayed:
+    """Base of classes that notebooks display by `html`."""
+
+    def _repr_html_(self) -> str | None:
+        while PROVIDERS:
+            import_module(PROVIDERS.pop())
+        return html(self)

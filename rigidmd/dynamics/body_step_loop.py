@@ -1,0 +1,115 @@
+"""The flows of a single body. Each part is chosen by its type, so what a scene does not have is not compiled."""
+
+from typing import NamedTuple
+
+from rigidmd.compile import implements, is_a, kernel
+from rigidmd.core.state import NOW, WORK
+from rigidmd.dynamics.force_gradient import add_gyration, displace
+from rigidmd.dynamics.step_loop import drift, kick, pay
+from rigidmd.forces.body.frame import Inertial, Turning, follow, frame_rate
+from rigidmd.forces.body.resistance import NoResistance, Resistance, push
+from rigidmd.forces.terms import total_power
+from rigidmd.mechanics.free_rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, turn_along
+from rigidmd.mechanics.translation import Free, Immersed, Pinned, along, carry, inertial_mass
+
+
+class Body(NamedTuple):
+    """What never changes during a run of a single body, in SI units; the counterpart of `Model` for molecules."""
+
+    flight: Free | Pinned | Immersed
+    rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
+    frame: Inertial | Turning = Inertial()
+    resistance: NoResistance | Resistance = NoResistance()
+
+
+@implements(kick, Body, inline=True)
+def _kick_body(model, code, state, load, waiting, h):
+    push(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
+    return waiting
+
+
+@implements(drift, Body, inline=True)
+def _drift_body(model, code, state, load, waiting, h):
+    time = state.time[NOW]
+    carry(model.flight, model.rotor, state, time, h)
+    follow(model.frame, state, time, h)
+
+
+@implements(displace, Body, inline=True)
+def _displace_body(model, state, load, tau):
+    for k in range(len(load.force)):
+        for i in range(3):
+            state.position[k, i] += tau / model.flight.mass * load.force[k, i]
+    for k in range(len(load.torque_body)):
+        n, time = load.torque_body[k], state.time[NOW]
+        turn_along(
+            state.rotation[k],
+            tau * moments(model.rotor, time, 0)[0] * n[0],
+            tau * moments(model.rotor, time, 1)[0] * n[1],
+            tau * moments(model.rotor, time, 2)[0] * n[2],
+        )
+
+
+@implements(add_gyration, Body, inline=True)
+def _add_gyration_of_body(model, load, tau, gain):
+    for b in range(len(load.torque_body)):
+        n = load.torque_body[b]
+        i0 = moments(model.rotor, 0.0, 0)[0]
+        i1 = moments(model.rotor, 0.0, 1)[0]
+        i2 = moments(model.rotor, 0.0, 2)[0]
+        gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
+        gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
+        gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
+
+
+@implements(pay, inline=True)
+def _pay_body(model, terms, state, h):
+    if not is_a(model, Body):
+        return None
+    if not any(getattr(term.instance_class, "drives", False) for term in terms.types):
+        return lambda model, terms, state, h: None
+
+    def pay_body(model, terms, state, h):
+        velocity, omega = relative_motion(model, state)
+        state.books[WORK] += h * total_power(terms, state, velocity, omega)
+
+    return pay_body
+
+
+@kernel
+def relative_motion(model, state):
+    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples; 0 where the body has none."""
+    W = frame_rate(model.frame, state.time[NOW])
+    velocity = (0.0, 0.0, 0.0)
+    omega = (0.0, 0.0, 0.0)
+    if len(state.position):
+        V = state.velocity[0]
+        velocity = (V[0], V[1], V[2])
+        if len(state.rotation):
+            q = state.rotation[0]
+            a = along(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
+            b = along(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
+            c = along(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
+            velocity = (
+                q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
+                q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,
+                q[2, 0] * a + q[2, 1] * b + q[2, 2] * c,
+            )
+        x = state.position[0]
+        velocity = (
+            velocity[0] - W[1] * x[2] + W[2] * x[1],
+            velocity[1] - W[2] * x[0] + W[0] * x[2],
+            velocity[2] - W[0] * x[1] + W[1] * x[0],
+        )
+    if len(state.rotation):
+        q = state.rotation[0]
+        L = state.angular_momentum_body[0]
+        i0, h0 = moments(model.rotor, state.time[NOW], 0)
+        i1, h1 = moments(model.rotor, state.time[NOW], 1)
+        i2, h2 = moments(model.rotor, state.time[NOW], 2)
+        omega = (
+            (L[0] - h0) * i0 - along(q, W, 0),
+            (L[1] - h1) * i1 - along(q, W, 1),
+            (L[2] - h2) * i2 - along(q, W, 2),
+        )
+    return velocity, omega

@@ -1,0 +1,84 @@
+"""Momenta at a temperature, and degrees of freedom."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import State
+from rigidmd.dynamics.step_loop import Model
+from rigidmd.units import BOLTZMANN
+
+#: A total momentum below this fraction of the sum of |m v| is rounding.
+AT_REST = 1e-9
+
+
+class Freedom(NamedTuple):
+    """Degrees of freedom. Conserved components of the total momentum are zero and not counted."""
+
+    translation: int
+    rotation: int
+
+    @property
+    def total(self) -> int:
+        """Of translation and rotation."""
+        return self.translation + self.rotation
+
+
+def freedom_of(model: Model) -> Freedom:
+    """Degrees of freedom of all molecules together."""
+    turning = (model.inertia > 0).sum(axis=1)
+    free = 3 * int(mobile(model).sum()) - int(model.keeps_momentum.sum())
+    return Freedom(free, int(turning[model.species].sum()))
+
+
+def kept_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
+    """Which components (3,) of the total momentum are conserved: none among frozen molecules, which hold the others;
+    else those that no term says to change (`changes_momentum`).
+
+    `Model.keeps_momentum` is this, and what counts degrees of freedom and takes momentum out goes by it.
+    """
+    kept = np.full(3, bool(mobile(model).all()))
+    for term in terms.values():
+        kept &= ~getattr(term, "changes_momentum", np.zeros(3, bool))
+    return kept
+
+
+def mobile(model: Model) -> np.ndarray:
+    """Whether each molecule (n,) can move, that is, is not frozen."""
+    return model.inverse_mass[model.species] > 0
+
+
+def remove_momentum(model: Model, velocity: np.ndarray) -> float:
+    """Give every molecule the same push so that what is conserved of the total momentum is zero, in place.
+
+    Returns the kinetic energy that this takes, u Å²/ps²; 0 if the momentum was zero already.
+    """
+    mass = model.mass[model.species]
+    each = mass[:, None] * velocity
+    momentum = np.where(model.keeps_momentum, each.sum(axis=0), 0.0)
+    if np.abs(momentum).max() <= AT_REST * np.abs(each).sum():
+        return 0.0
+    velocity -= momentum / mass.sum()
+    return float(momentum @ momentum / (2 * mass.sum()))
+
+
+def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:
+    """Maxwell-Boltzmann momenta, in place: zero total momentum as far as it is conserved; T_trans and T_rot exactly
+    `temperature` (K)."""
+    thermal = BOLTZMANN * temperature
+    mass = model.mass[model.species]
+    freedom = freedom_of(model)
+    spread = np.sqrt(thermal * model.inverse_mass[model.species])
+    state.velocity[:] = rng.standard_normal(state.velocity.shape) * spread[:, None]
+    remove_momentum(model, state.velocity)
+    kinetic = 0.5 * mass @ (state.velocity**2).sum(axis=1)
+    state.velocity[:] *= (
+        np.sqrt(0.5 * freedom.translation * thermal / kinetic) if kinetic > 0 and freedom.translation else 0.0
+    )
+    if len(state.angular_momentum_body):
+        spread = np.sqrt(thermal * model.inertia[model.species])
+        state.angular_momentum_body[:] = rng.standard_normal(spread.shape) * spread
+        kinetic = 0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum()
+        if kinetic > 0:
+            state.angular_momentum_body[:] *= np.sqrt(0.5 * freedom.rotation * thermal / kinetic)

@@ -1,0 +1,126 @@
+"""Sums over the molecules of a state and its largest numbers, for a look at a run: one pass over each array, where
+NumPy takes a dozen with arrays between."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import kernel
+from rigidmd.core.state import EXAMPLE, Load, State
+
+if TYPE_CHECKING:
+    from rigidmd.dynamics.step_loop import Model
+
+
+class Sums(NamedTuple):
+    """In u, Å, ps."""
+
+    translation: float  # sum m V²
+    rotation: float  # sum L . I^-1 L
+    force: float  # sum F²/m
+    torque: float  # sum n . I^-1 n
+    momentum: np.ndarray  # (3,) sum m V
+    flow: np.ndarray  # (3, 3) sum m V (x) V
+    orthogonality: float  # largest entry of |Q^T Q - 1|; NaN if one is
+
+
+#: How many numbers there are in `Sums`.
+SUMS = 17
+
+
+class Extent(NamedTuple):
+    """The largest size of a number in each array of a state and a load; NaN if one is, 0 of an empty array."""
+
+    position: float
+    velocity: float
+    rotation: float
+    angular_momentum: float
+    force: float
+    torque: float
+
+
+#: All bits of a float64 but its sign. As integers the rest are in the order of sizes, NaN after infinity.
+SIZE = np.int64(2**63 - 1)
+
+
+def extent_of(state: State, load: Load = EXAMPLE[1]) -> Extent:
+    """The extent of a state and of the load on it."""
+    found = np.empty(len(Extent._fields))
+    arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
+    find_largest(*(array.ravel() for array in arrays), found)
+    return Extent(*found.tolist())
+
+
+@kernel(outer=True)
+def find_largest(position, velocity, rotation, angular, force, torque, found):
+    """Fill in the numbers (6,) of an `Extent` of arrays as rows of numbers."""
+    bits = found.view(np.int64)
+    bits[0], bits[1], bits[2] = _largest(position), _largest(velocity), _largest(rotation)
+    bits[3], bits[4], bits[5] = _largest(angular), _largest(force), _largest(torque)
+
+
+@kernel
+def _largest(values):
+    """The bits of the largest size. Integers are compared several at a time; floats, of which NaN has no order, one by
+    one."""
+    bits = values.view(np.int64)
+    most = np.int64(0)
+    for k in range(len(bits)):
+        most = max(most, bits[k] & SIZE)
+    return most
+
+
+def sums_over(model: "Model", state: State, load: Load = EXAMPLE[1]) -> Sums:
+    """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
+    found = np.zeros(SUMS)
+    add_up(
+        model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
+        state.angular_momentum_body, load.force, load.torque_body, found,
+    )  # fmt: skip
+    return sums_of(found)
+
+
+def sums_of(found: np.ndarray) -> Sums:
+    """The sums in the numbers that `add_up` has filled in."""
+    translation, rotation, force, torque, orthogonality = found[:5].tolist()
+    vectors = found[5:].copy()
+    return Sums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality)
+
+
+@kernel(outer=True)
+def add_up(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found):
+    """Fill in the numbers (SUMS,) of `Sums`: orthogonality is the fifth, then come momentum and flow."""
+    px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
+    for m in range(len(velocity)):
+        own = mass[species[m]]
+        x, y, z = velocity[m, 0], velocity[m, 1], velocity[m, 2]
+        px += own * x
+        py += own * y
+        pz += own * z
+        xx += own * x * x
+        yy += own * y * y
+        zz += own * z * z
+        xy += own * x * y
+        xz += own * x * z
+        yz += own * y * z
+    for m in range(len(force)):
+        pushed += inverse_mass[species[m]] * (force[m, 0] ** 2 + force[m, 1] ** 2 + force[m, 2] ** 2)
+    for m in range(len(angular)):
+        for k in range(3):
+            turning += inverse_inertia[species[m], k] * angular[m, k] ** 2
+    for m in range(len(torque)):
+        for k in range(3):
+            twisted += inverse_inertia[species[m], k] * torque[m, k] ** 2
+    for m in range(len(rotation)):
+        for j in range(3):
+            for k in range(j, 3):
+                entry = -1.0 if j == k else 0.0
+                for i in range(3):
+                    entry += rotation[m, i, j] * rotation[m, i, k]
+                if not abs(entry) <= worst and worst == worst:  # NaN is kept
+                    worst = abs(entry)
+    found[0], found[1], found[2], found[3], found[4] = xx + yy + zz, turning, pushed, twisted, worst
+    found[5], found[6], found[7] = px, py, pz
+    found[8], found[9], found[10] = xx, xy, xz
+    found[11], found[12], found[13] = xy, yy, yz
+    found[14], found[15], found[16] = xz, yz, zz

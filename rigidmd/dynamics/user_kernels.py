@@ -1,0 +1,95 @@
+"""Forces and thermostats of users that are compiled into the loop."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from rigidmd.compile import implements, is_a
+from rigidmd.compile.own import foreign
+from rigidmd.dynamics.thermostats import apply
+from rigidmd.forces.terms import add_forces
+
+#: The classes that are forces and thermostats.
+FORCES: set[type] = set()
+THERMOSTATS: set[type] = set()
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled_force(kind: type) -> Callable[[Function], Function]:
+    """Make a NamedTuple class a force that is compiled into the loop.
+
+    class Trap(NamedTuple):
+        stiffness: float  # u/ps²
+
+    @rigidmd.compiled_force(Trap)
+    def trap(term, state, load, tally):
+        for m in range(len(state.position)):
+            for k in range(3):
+                load.force[m, k] -= term.stiffness * state.position[m, k]
+                if tally is not None:
+                    tally[0] += 0.5 * term.stiffness * state.position[m, k] ** 2
+
+    The function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to `load` and, unless `tally` is
+    None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and molecular virial, sum of F (x) R in rows, to `tally`.
+
+    The class may say `changes_momentum`, three truth values: by default all are true, and false is right of forces
+    between molecules; and `tied_to_places = True` where the energy depends on places in the lab, which excludes a
+    barostat. It may hold numbers, arrays and tuples of them. If its numbers come from the system, give `Simulation` an
+    object with a method `term(system)` that makes it.
+    """
+    _check_class(kind)
+
+    def register(function: Function) -> Function:
+        _check_arguments(function, ("term", "state", "load", "tally"))
+        compiled = foreign(function)
+        FORCES.add(kind)
+
+        @implements(add_forces)
+        def _add(term, state, load, tally):
+            if is_a(term, kind):
+                return lambda term, state, load, tally: compiled(term, state, load, tally)
+
+        return function
+
+    return register
+
+
+def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
+    """Make a NamedTuple class a thermostat: a flow on the momenta.
+
+    @rigidmd.compiled_thermostat(Berendsen)
+    def rescale(bath, model, state, h, draw): ...
+
+    The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the kinetic
+    energy that it puts in to `state.books[0]`, so that energy less heat is conserved. It acts half before and half
+    after each step (`halved = False` in the class: all of it after the step); with integrator = "baoab" in its middle.
+    `draw` is for counted random numbers (`rigidmd.dynamics.noise`). `changes_momentum = True` in the class says that it
+    changes the total momentum.
+    """
+    _check_class(kind)
+
+    def register(function: Function) -> Function:
+        _check_arguments(function, ("bath", "model", "state", "h", "draw"))
+        compiled = foreign(function)
+        THERMOSTATS.add(kind)
+
+        @implements(apply)
+        def _apply(bath, model, code, state, room, h, draw):
+            if is_a(bath, kind):
+                return lambda bath, model, code, state, room, h, draw: compiled(bath, model, state, h, draw)
+
+        return function
+
+    return register
+
+
+def _check_arguments(function: Callable, wanted: tuple[str, ...]) -> None:
+    given = list(inspect.signature(function).parameters)
+    if len(given) != len(wanted):
+        raise TypeError(f"the function has the arguments ({', '.join(given)}), must have ({', '.join(wanted)})")
+
+
+def _check_class(kind: Any) -> None:
+    if not (isinstance(kind, type) and issubclass(kind, tuple) and getattr(kind, "_fields", ())):
+        raise TypeError(f"{kind!r} is not a NamedTuple class with fields")

@@ -1,0 +1,214 @@
+"""The motion of a single body as the columns of motion.csv, with the errors of its invariants."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import WORK, State
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.columns import BODY, BODY_COLUMNS, MATRIX, Column
+from rigidmd.forces.body.applied import Drive, SteadyForce, Told, steady_energies
+from rigidmd.forces.body.frame import Inertial
+from rigidmd.forces.body.resistance import NoResistance
+from rigidmd.mechanics.free_rotor import DrivenRotor
+from rigidmd.mechanics.rotation import direction, to_euler_angles, to_quaternion
+from rigidmd.mechanics.time_functions import is_steady
+from rigidmd.mechanics.translation import Immersed, inertial_masses
+
+
+class Snapshot(NamedTuple):
+    """Time and state of a sample."""
+
+    time: float
+    state: State
+
+
+@dataclass
+class Motion:
+    """The samples of a run as columns.
+
+    columns : arrays (t,), in SI units, by the names in motion.csv; `described` explains them. Position, velocity,
+        attitude and omega are relative to the frame; L is the angular momentum relative to axes that do not turn, that
+        of wheels (h) included, along the frame's (lab) or body's axes; the kinetic energy is that of I omega, without
+        that of wheels about their axes
+    invariants : what should stay constant; column NAME_error is its error since the start, energies relative to the
+        largest kinetic energy, L to the largest |L|
+    """
+
+    columns: dict[str, np.ndarray]
+    invariants: list[str]
+
+    def __len__(self) -> int:
+        return len(self.columns.get("t", ()))
+
+    def __repr__(self) -> str:
+        return f"<Motion: {len(self)} samples of {', '.join(self.columns)}>"
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """A column as an array (t,) in SI units; "Q", of a body that turns, as matrices (t, 3, 3)."""
+        if column not in self.described:
+            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
+        if column == MATRIX:
+            return np.stack([self.columns[name] for name in BODY["rotation"].names], axis=-1).reshape(-1, 3, 3)
+        return self.columns[column]
+
+    @property
+    def described(self) -> dict[str, Column]:
+        found = {name: BODY_COLUMNS[name] for name in self.columns}
+        if BODY["rotation"].names[0] in found:
+            found[MATRIX] = Column("", "1", "the rotation matrices (n, 3, 3): lab = Q body")
+        return found
+
+
+def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
+    """All columns of the samples of a run."""
+    times = np.array([s.time for s in snapshots])
+    parts = [np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)]
+    states = State._make([*parts, np.zeros(0)])
+    position, velocity, rotation, omega = system.motion(times, states)
+    columns = {"t": times} | _columns("position", position) | _columns("velocity", velocity)
+    if system.turns:
+        columns |= _rotation_columns(system, times, states, rotation, omega)
+    columns |= energies(system, times, states)
+    errors = _errors(system, columns)
+    columns |= {f"{name}_error": error for name, error in errors.items()}
+    if system.turns:
+        gap = np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)
+        columns["orthogonality_error"] = np.abs(gap).max(axis=(1, 2))
+    return Motion(columns, list(errors))
+
+
+def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of a family, by their names, from values (t, n)."""
+    return dict(zip(BODY[family].names, values.T, strict=True))
+
+
+def _rotation_columns(
+    system: BodySystem, times: np.ndarray, states: State, rotation: np.ndarray, omega: np.ndarray
+) -> dict[str, np.ndarray]:
+    n = len(rotation)
+    momentum = states.angular_momentum_body.reshape(n, 3) @ system.axes.T
+    columns = _columns("rotation", rotation.reshape(n, 9))
+    columns |= _columns("quaternion", _continuous(to_quaternion(rotation)))
+    columns |= _columns("euler_angles", to_euler_angles(rotation))
+    if isinstance(system.body.rotor, DrivenRotor):
+        columns |= _columns("h_body", system.moments(times)[1] @ system.axes.T)
+    for name, body in (("omega", omega), ("L", momentum)):
+        columns |= _columns(f"{name}_body", body)
+        columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
+    return columns
+
+
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """The same rotations, with signs that do not change from one sample to the next."""
+    turned = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
+    return quaternions * np.concatenate([[1.0], np.cumprod(np.where(turned < 0, -1.0, 1.0))])[:, None]
+
+
+def is_balanced(system: BodySystem) -> bool:
+    """Whether the energy less the work done is conserved: if the frame does not turn, or turns uniformly."""
+    frame = system.body.frame
+    return isinstance(frame, Inertial) or is_steady(frame.angular_velocity)
+
+
+def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
+    """Kinetic energy (less Omega . J in a turning frame), potential energy, their sum, and the work of other forces."""
+    n = len(times)
+    kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
+    if system.turns:
+        rotation, momentum = states.rotation.reshape(n, 3, 3), states.angular_momentum_body.reshape(n, 3)
+        inertia, carried = system.moments(times)
+        own = np.divide((momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0)
+        kinetic += 0.5 * own.sum(axis=1)
+        about_origin += np.einsum("tij,tj->ti", rotation, momentum)
+    if system.flies:
+        position, impulse = states.position.reshape(n, 3), system.mass * states.velocity.reshape(n, 3)
+        along = np.einsum("tji,tj->ti", rotation, impulse) if system.turns else impulse
+        kinetic += 0.5 * (along**2 / inertial_masses(system.body.flight)).sum(axis=1)
+        about_origin += np.cross(position, impulse)
+    kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
+    for term in system.terms.values():
+        if isinstance(term, SteadyForce):
+            potential += steady_energies(term, states.position, states.rotation)
+    return {
+        "kinetic": kinetic,
+        "potential": potential,
+        "energy": kinetic + potential,
+        "work": states.books.reshape(n, 3)[:, WORK],
+    }
+
+
+def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Relative errors since the start of the invariants of this scene."""
+    body = system.body
+    forces = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+    driven = any(isinstance(term, Drive | Told) for term in system.terms.values())
+    lossless = isinstance(body.resistance, NoResistance)
+    inertial = isinstance(body.frame, Inertial)
+    errors = {}
+    if is_balanced(system):
+        balance = columns["energy"] - columns["work"]
+        errors["energy"] = _relative(balance - balance[0], np.abs(columns["kinetic"]).max() or np.abs(balance[0]))
+    if not system.turns:
+        return errors
+    momentum = {k: columns[f"L_lab_{k}"] for k in "xyz"}
+    size = np.sqrt(sum(part**2 for part in momentum.values()))
+    arms = [term.point for term in forces if term.force.any()]
+    if lossless and not driven and inertial and not isinstance(body.flight, Immersed):
+        if not any(arm.any() for arm in arms):
+            gap = np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values()))
+            errors["L_lab"] = _relative(gap, size.max())
+            errors["L_size"] = _relative(size - size[0], size.max())
+        else:
+            pulling = [np.flatnonzero(term.force) for term in forces if term.point.any() and term.force.any()]
+            if all(len(p) == 1 and p[0] == pulling[0][0] for p in pulling):
+                k = "xyz"[pulling[0][0]]
+                errors[f"L_{k}"] = _relative(momentum[k] - momentum[k][0], size.max())
+    axis = _kept_axis(system, arms, driven)
+    if axis is not None:
+        own = columns[f"L_body_{axis + 1}"]
+        errors[f"L_{axis + 1}"] = _relative(own - own[0], size.max())
+    return errors
+
+
+def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int | None:
+    """The symmetry axis of a body if no torque acts about it: L along it is conserved."""
+    body = system.body
+    if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.flight, Immersed):
+        return None
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        symmetric = system.inertia[i] == system.inertia[j] and system.inertia[k] > 0
+        on_axis = not any(arm[[i, j]].any() for arm in arms)
+        if isinstance(body.rotor, DrivenRotor):
+            inertia, momentum = body.rotor.inertia, body.rotor.momentum
+            symmetric &= is_steady(inertia) and not any(part[:, [i, j]].any() for part in momentum[1:])
+        if not isinstance(body.resistance, NoResistance):
+            symmetric &= not any(
+                part[k]
+                for part in (
+                    body.resistance.rotation_dry,
+                    body.resistance.rotation_linear,
+                    body.resistance.rotation_quadratic,
+                )
+            )
+        if symmetric and on_axis:
+            return k
+    return None
+
+
+def _relative(error: np.ndarray, scale: float) -> np.ndarray:
+    return error / scale if scale > 0 else error
+
+
+def drawn_axis(system: BodySystem) -> np.ndarray:
+    """The body axis (3,) whose path is drawn: that of the scene, else towards the centre of mass, of symmetry, or 3."""
+    if system.scene.output.axis is not None:
+        return direction(np.array(system.scene.output.axis))
+    if system.centre.any():
+        return direction(system.centre)
+    for k in (2, 0, 1):
+        if system.inertia[k - 1] == system.inertia[k - 2] != system.inertia[k]:
+            return system.axes[:, k]
+    return system.axes[:, 2]

@@ -1,0 +1,225 @@
+"""The system of a scene of a single body: what an engine moves."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from rigidmd.core.integrators import RK4, SCHEMES, SOLVERS, Scheme, Solver
+from rigidmd.core.state import State
+from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.engines.cpu import Engine
+from rigidmd.engines.ode import OdeEngine
+from rigidmd.engines.system import Sites
+from rigidmd.errors import SimulationError
+from rigidmd.forces.body.frame import Inertial
+from rigidmd.forces.neighbors.space import Unbounded
+from rigidmd.mechanics.free_rotor import DrivenRotor
+from rigidmd.mechanics.inertia import Kind, kind_of_body
+from rigidmd.mechanics.time_functions import Course, during, value_at
+from rigidmd.mechanics.translation import Immersed
+from rigidmd.scene import BodyScene
+from rigidmd.scene.body import FORMULATION, SAMPLES
+from rigidmd.scene.validation import settled
+
+Part = TypeVar("Part", bound=NamedTuple)
+
+
+class Pose(NamedTuple):
+    """Position, attitude and velocities of a body, relative to the frame, for Python functions that apply forces."""
+
+    time: float  # s
+    position: np.ndarray  # (3,) centre of mass, m
+    velocity: np.ndarray  # (3,) m/s
+    rotation: np.ndarray  # (3, 3) Q, body to lab
+    angular_velocity_body: np.ndarray  # (3,) rad/s
+
+
+@dataclass
+class BodySystem:
+    """The system of a single body. The engine uses its principal axes; `axes` leads back to those of the scene.
+
+    axes (3, 3): the principal axes as columns, in the body's axes. inertia (3,): principal moments at the start, kg m²,
+    about the pivot or the centre of mass, added inertia of a fluid included; centre (3,): centre of mass from there, in
+    the body's axes; points (k, 3): what the trajectory shows, in the body's axes from there.
+    """
+
+    scene: BodyScene
+    body: Body
+    state: State
+    terms: dict[str, NamedTuple]
+    mass: float
+    axes: np.ndarray
+    inertia: np.ndarray
+    centre: np.ndarray
+    points: np.ndarray
+    point_names: tuple[str, ...]
+    applied: dict[str, Callable]
+    left_out: list[str] = field(default_factory=list)
+    space = Unbounded()
+
+    def __repr__(self) -> str:
+        return f"<BodySystem of {self.scene.in_short}>"
+
+    @property
+    def notes(self) -> list[str]:
+        """A sentence for duration and interval of samples that are not whole numbers of steps."""
+        run, found = self.scene.run, []
+        interval = settled(self.scene.output.interval_s)
+        given = interval != run.duration_s / SAMPLES
+        for key, wanted in (("run.duration_s", run.duration_s), ("output.interval_s", given and interval)):
+            taken = wanted and max(1, round(wanted / run.timestep_s)) * run.timestep_s
+            if not run.is_open and wanted and abs(taken - wanted) > 1e-9 * wanted:
+                found.append(
+                    f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: it is {taken:g} s"
+                )
+        return found
+
+    @property
+    def turns(self) -> bool:
+        """Whether it has an orientation."""
+        return len(self.state.rotation) > 0
+
+    @property
+    def flies(self) -> bool:
+        """Whether it is not pinned."""
+        return len(self.state.position) > 0
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of body, about the pivot or the centre of mass."""
+        return kind_of_body(self.inertia)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Three of translation unless pinned, and those of rotation."""
+        return 3 * self.flies + int((self.inertia > 0).sum())
+
+    @property
+    def method(self) -> Scheme | Solver:
+        run = self.scene.run
+        if run.is_open:
+            return SCHEMES["velocity_verlet"]
+        if run.integrator in SCHEMES:
+            return SCHEMES[run.integrator].with_rotor(run.rotor)
+        found = Solver(run.integrator, run.formulation or FORMULATION, run.duration_s)
+        if run.integrator == RK4:
+            return found
+        return found._replace(
+            relative_tolerance=settled(run.relative_tolerance), absolute_tolerance=settled(run.absolute_tolerance)
+        )
+
+    def engine(self) -> Engine:
+        """A new engine for this body at time 0, which calls the Python functions that apply forces."""
+        kind = OdeEngine if self.scene.run.integrator in SOLVERS else Engine
+        return kind(*self.during(0.0), applied={name: self._asker(f) for name, f in self.applied.items()})
+
+    def breaks(self) -> list[float]:
+        """Times within the run at which a prescribed function of time has a jump or a kink."""
+        parts = (*self.body, *self.terms.values())
+        times = {float(t) for part in parts for value in part if isinstance(value, Course) for t in value.times}
+        run = self.scene.run
+        return sorted(t for t in times if 0 < t < run.steps * run.timestep_s)
+
+    def during(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
+        """Body and terms as they are from a time to the next break."""
+        flight, rotor, frame, resistance = self.body
+        body = Body(_at(flight, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
+        return body, {name: _at(term, time) for name, term in self.terms.items()}
+
+    def _asker(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
+        def ask(time: float, state: State) -> tuple:
+            told = function(self.pose(time, state))
+            try:
+                force, torque = (np.asarray(part, dtype=float).reshape(3) for part in told)
+            except (TypeError, ValueError):
+                raise SimulationError(
+                    f"t = {time:g} s: an applied function gave {told!r}, must give force and torque of 3 numbers each"
+                ) from None
+            if not self.flies:  # the force acts at the centre of mass, the torque is about the pivot
+                torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
+            if not (np.isfinite(force).all() and np.isfinite(torque).all()):
+                raise SimulationError(f"t = {time:g} s: an applied function gave what is no finite number: {told!r}")
+            return force, self.axes.T @ torque
+
+        return ask
+
+    def pose(self, time: float, state: State) -> Pose:
+        """The state in the body's own axes, relative to the frame."""
+        motion = self.motion(np.array([time]), State(*(np.array(array) for array in zip(state, strict=True))))
+        return Pose(time, *(part[0] for part in motion))
+
+    def motion(self, times: np.ndarray, states: State):
+        """(position, velocity, rotation, angular_velocity_body) over times (t,) of states stacked along axis 0."""
+        n = len(times)
+        frame = self.frame_rates(times)
+        if self.turns:
+            engine_rotation = states.rotation.reshape(n, 3, 3)
+            rotation = engine_rotation @ self.axes.T
+            inertia, carried = self.moments(times)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                own = np.where(inertia > 0, (states.angular_momentum_body.reshape(n, 3) - carried) / inertia, 0.0)
+            omega = own @ self.axes.T - np.einsum("tji,tj->ti", rotation, frame)
+        else:
+            engine_rotation = rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
+            omega = np.zeros((n, 3))
+        if self.flies:
+            position, velocity = states.position.reshape(n, 3), states.velocity.reshape(n, 3)
+            if isinstance(self.body.flight, Immersed):
+                share = self.mass / self.body.flight.inertial_mass
+                velocity = np.einsum("tij,j,tkj,tk->ti", engine_rotation, share, engine_rotation, velocity)
+            velocity = velocity - np.cross(frame, position)
+        else:
+            position = rotation @ self.centre
+            velocity = np.einsum("tij,tj->ti", rotation, np.cross(omega, self.centre))
+        return position, velocity, rotation, omega
+
+    def frame_rates(self, times: np.ndarray) -> np.ndarray:
+        """Angular velocity (t, 3) of the frame along its axes."""
+        if isinstance(self.body.frame, Inertial):
+            return np.zeros((len(times), 3))
+        return value_at(self.body.frame.angular_velocity, times)
+
+    def moments(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Principal moments and the momentum of rotors (t, 3) each, principal axes."""
+        rotor = self.body.rotor
+        if isinstance(rotor, DrivenRotor):
+            return value_at(rotor.inertia, times), value_at(rotor.momentum, times)
+        return np.broadcast_to(self.inertia, (len(times), 3)), np.zeros((len(times), 3))
+
+    # The interface for trajectories: points as sites, Å for metres, ps for seconds.
+
+    @property
+    def scale(self) -> float:
+        """Å in the trajectory for a metre."""
+        return settled(self.scene.output.trajectory_A_per_m)
+
+    @property
+    def sites(self) -> Sites:
+        """The points as sites of one molecule."""
+        n = len(self.points)
+        names = np.array(self.point_names, dtype=object)
+        return Sites(np.zeros(n, int), self.points, names, np.full(n, "X", dtype=object), np.full(n, self.mass / n))
+
+    @property
+    def residue_names(self) -> np.ndarray:
+        return np.array(["BODY"], dtype=object)
+
+    def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
+        """Positions (k, 3) of the points, Å of the trajectory."""
+        pose = self.pose(float(state.time[0]), state)
+        origin = pose.position if self.flies else np.zeros(3)
+        return self.scale * (origin + self.points @ pose.rotation.T)
+
+    def site_velocities(self, state: State) -> np.ndarray:
+        """Velocities (k, 3) of the points, Å/ps of the trajectory."""
+        pose = self.pose(float(state.time[0]), state)
+        origin = pose.velocity if self.flies else np.zeros(3)
+        return self.scale * (origin + np.cross(pose.angular_velocity_body, self.points) @ pose.rotation.T)
+
+
+def _at(part: Part, time: float) -> Part:
+    """A part of a body with each of its courses continued from a time."""
+    courses = {key: during(value, time) for key, value in part._asdict().items() if isinstance(value, Course)}
+    return part._replace(**courses)

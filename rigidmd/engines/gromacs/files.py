@@ -1,0 +1,341 @@
+"""Input files of GROMACS for a system: coordinates, topology, settings of each stage, and a script that runs them.
+
+GROMACS keeps distances: of two points by a constraint, and of three by SETTLE, which is analytic. So there is a way for
+linear bodies and for those whose mass is in a plane, with all other sites virtual. Its units are nm, ps, u, e, kJ/mol.
+"""
+
+from math import inf
+from pathlib import Path
+from shlex import quote
+
+import numpy as np
+from scipy.special import erfc
+
+from rigidmd.core.files import write_text
+from rigidmd.core.plain_text import as_word, distinct, in_comment
+from rigidmd.core.state import State
+from rigidmd.engines.force_field import Portrait, strange
+from rigidmd.engines.mass_points import SAME, MassPoints, mass_points
+from rigidmd.engines.rigid_bodies import Bodies, Points
+from rigidmd.forces.ewald.pme import Pme
+from rigidmd.forces.potentials.coulomb import ReactionField
+from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
+from rigidmd.scene.models import Molecule, of_each
+from rigidmd.scene.stage import Stage
+from rigidmd.units import KJ_PER_MOL
+
+NM = 0.1
+COORDINATES, TOPOLOGY, SCRIPT = "conf.gro", "topol.top", "run.sh"
+#: vdw-modifier by the ending.
+MODIFIERS = {"plain": "None", "shift": "Potential-shift", "force_switch": "Force-switch", "switch": "Potential-switch"}
+#: Decimals of coordinates in nm; a .gro allows any number of them.
+DECIMALS = 9
+#: Of PME in GROMACS.
+ORDERS = range(3, 13)
+#: A mass point that is no site.
+POINT = "MP"
+SEEDS = 2**31 - 1
+
+
+def faults(portrait: Portrait) -> list[str]:
+    """What of a scene GROMACS cannot do, in words; empty if it can do all."""
+    system = portrait.system
+    found = [f"{what} is left to rigidmd" for what in strange(system)]
+    if not portrait.boxed or system.cutoff == inf:
+        found.append("there is no box: GROMACS computes pairs within a cut-off in a periodic box")
+    if portrait.lennard_jones is not None and portrait.truncation not in MODIFIERS:
+        found.append(f"forces.truncation = {portrait.truncation!r}: GROMACS has {', '.join(MODIFIERS)}")
+    if portrait.electrostatics == "reaction_field" and portrait.truncation not in ("plain", "shift"):
+        found.append(
+            f"forces.truncation = {portrait.truncation!r} with reaction_field: GROMACS' ends as plain or shift; "
+            "take one of them, or pme"
+        )
+    if portrait.electrostatics in ("ewald", "damped_shifted_force"):
+        found.append(f"forces.electrostatics = {portrait.electrostatics!r}: GROMACS has pme and reaction_field")
+    if portrait.frozen.any():
+        found.append("frozen molecules: GROMACS would let them act on one another")
+    shapes = [_body(m) for m in system.species]
+    found += [
+        f"{m.name}: GROMACS has no rigid bodies of this shape, whose mass is neither on a line nor in a plane"
+        for m, body in zip(system.species, shapes, strict=True)
+        if len(body.mass) > 3
+    ]
+    if sum(len(body.mass) == 3 for body in shapes) > 1:
+        found.append("several kinds of planar molecules: GROMACS' SETTLE keeps one kind of triangle")
+    for k, stage in enumerate(system.scene.stages):
+        found += [f"stages.{k}.{fault}" for fault in _stage_faults(stage)]
+    return found
+
+
+def _stage_faults(stage: Stage) -> list[str]:
+    if stage.is_minimisation:
+        return []  # rigidmd itself minimises
+    found, kind = [], stage.thermostat_kind
+    if kind == "andersen":
+        found.append("thermostat = 'andersen': GROMACS has none that gives whole molecules new velocities")
+    if stage.integrator not in (("velocity_verlet", "baoab") if kind == "langevin" else ("velocity_verlet",)):
+        found.append(f"integrator = {stage.integrator!r}: GROMACS moves molecules by velocity_verlet")
+    if kind == "langevin" and len(set(stage.frictions)) > 1:
+        found.append("friction_rotation_per_ps: GROMACS has one friction for translation and rotation")
+    if stage.rotor == "exact":
+        found.append("rotor = 'exact': GROMACS turns molecules by keeping distances")
+    if stage.ensemble == "nph":
+        found.append("ensemble = 'nph': of GROMACS only npt is written")
+    if stage.barostat_kind == "monte_carlo":
+        found.append("barostat = 'monte_carlo': GROMACS has cell_rescaling")
+    if stage.has_barostat and kind == "nose_hoover":
+        found.append("thermostat = 'nose_hoover' with a barostat: GROMACS' cell_rescaling is without velocity Verlet")
+    if stage.has_barostat and stage.pressure_coupling not in ("isotropic", "semi_isotropic"):
+        found.append(f"pressure_coupling = {stage.pressure_coupling!r}: GROMACS' cell_rescaling has isotropic")
+    if stage.has_barostat and stage.pressures[0] != stage.pressures[1]:
+        found.append("pressure_bar changes over the stage: GROMACS keeps it constant")
+    return found
+
+
+def _body(molecule: Molecule) -> MassPoints:
+    """The mass points of a molecule; of three, the first is the top of an isosceles triangle and they follow on one
+    another, as SETTLE has it."""
+    body = mass_points(molecule)
+    if len(body.mass) != 3 or (body.site < 0).all():
+        return body
+    d = {(i, j): distance for i, j, distance in body.distances}
+    fits = d[0, 1] == d[0, 2] and abs(body.mass[1] - body.mass[2]) <= SAME * body.mass[1]
+    return body if fits and (np.diff(body.site) == 1).all() else mass_points(molecule, sites=False)
+
+
+def write_gromacs(folder: Path, portrait: Portrait, state: State) -> list[str]:
+    """Write the files for a system that begins at a state; their names. Raises OutputError."""
+    bodies = [_body(m) for m in portrait.system.species]
+    stages = [(k, stage) for k, stage in enumerate(portrait.system.scene.stages) if not stage.is_minimisation]
+    names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
+    text = {
+        COORDINATES: _coordinates(portrait, bodies, state),
+        TOPOLOGY: _topology(portrait, bodies),
+        **{f"{name}.mdp": _settings(portrait, k) for name, (k, _) in zip(names, stages, strict=True)},
+        SCRIPT: _script(names),
+    }
+    for name, content in text.items():
+        write_text(folder / name, content)
+    (folder / SCRIPT).chmod(0o755)
+    return list(text)
+
+
+def _script(names: list[str]) -> str:
+    lines = ["#!/bin/sh", "# Written by rigidmd: runs the stages with GROMACS, one after the other.", "set -e"]
+    before = f"-c {COORDINATES}"
+    for name in names:
+        lines += [
+            f"gmx grompp -f {quote(name)}.mdp {before} -p {TOPOLOGY} -po {quote(name)}_all.mdp -o {quote(name)}.tpr"
+        ]
+        lines += [f'gmx mdrun -deffnm {quote(name)} "$@"']
+        before = f"-c {quote(name)}.gro -t {quote(name)}.cpt"
+    return "\n".join(lines) + "\n"
+
+
+def _extra(molecule: Molecule, body: MassPoints) -> int:
+    """Mass points of a molecule that are no sites; they come after its sites."""
+    return int((body.site < 0).sum())
+
+
+def _coordinates(portrait: Portrait, bodies: list[MassPoints], state: State) -> str:
+    """The .gro file, with velocities."""
+    system = portrait.system
+    species = system.model.species
+    at, velocity = system.site_positions(state), system.site_velocities(state)
+    extra = Points(
+        np.repeat(np.arange(len(species)), [_extra(system.species[k], bodies[k]) for k in species]),
+        of_each([body.position_body[body.site < 0] for body in bodies], species),
+        of_each([body.mass[body.site < 0] for body in bodies], species),
+    )
+    more, more_velocity = _points_at(portrait, extra, state)
+    width = DECIMALS + 5
+    rows, s, e = [], 0, 0
+    for n, k in enumerate(species):
+        m = system.species[k]
+        count, added = len(m.masses), _extra(m, bodies[k])
+        names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
+        place = np.concatenate([at[s : s + count], more[e : e + added]])
+        speed = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
+        for name, x, v in zip(names, place, speed, strict=True):
+            head = f"{(n + 1) % 100000:5d}{as_word(m.residue_names[0]):<5}{name:>5}{(len(rows) + 1) % 100000:5d}"
+            where = "".join(f"{value * NM:{width}.{DECIMALS}f}" for value in x)
+            rows.append(head + where + "".join(f"{value * NM:{width}.{DECIMALS + 1}f}" for value in v))
+        s, e = s + count, e + added
+    a, b, c = state.cell * NM
+    box = [a[0], b[1], c[2]] + (
+        [a[1], a[2], b[0], b[2], c[0], c[1]] if state.cell[np.tril_indices(3, -1)].any() else []
+    )
+    last = " ".join(f"{value:.{DECIMALS}f}" for value in box)
+    return "\n".join([f"{system.scene.name}, written by rigidmd", str(len(rows)), *rows, last]) + "\n"
+
+
+def _points_at(portrait: Portrait, points: Points, state: State) -> tuple[np.ndarray, np.ndarray]:
+    if not len(points.mass):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    return Bodies(portrait.system, points).points(state)
+
+
+def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
+    """The .top file: kinds of sites, all parameters between them, molecules."""
+    system, kinds = portrait.system, portrait.kinds
+    lines = [
+        f"; {in_comment(system.scene.in_short)}",
+        "; Written by rigidmd.",
+        "",
+        "[ defaults ]",
+        "; nbfunc comb-rule gen-pairs",
+    ]
+    lines += ["1 2 no", "", "[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
+    rows = [(portrait.sigma[k, k] * NM, portrait.epsilon[k, k] / KJ_PER_MOL) for k in range(len(kinds))]
+    lines += [
+        f"K{k + 1} {kind.mass:.10g} 0 A {sigma:.12g} {epsilon:.12g} ; {in_comment(kind.name)}"
+        for k, (kind, (sigma, epsilon)) in enumerate(zip(kinds, rows, strict=True))
+    ]
+    if any(_extra(m, body) for m, body in zip(system.species, bodies, strict=True)):
+        lines += [f"{POINT} 0 0 A 0 0 ; a point with mass alone"]
+    lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
+    lines += [
+        f"K{i + 1} K{j + 1} 1 {portrait.sigma[i, j] * NM:.12g} {portrait.epsilon[i, j] / KJ_PER_MOL:.12g}"
+        for i in range(len(kinds))
+        for j in range(i, len(kinds))
+    ]
+    index, names = system.model.species, distinct([m.name for m in system.species])
+    for k in sorted(set(index.tolist())):
+        first = int(np.flatnonzero(index == k)[0])
+        start = int(np.searchsorted(system.sites.molecule, first))
+        own = portrait.kind[start : start + len(system.species[k].masses)]
+        lines += ["", *_molecule(portrait, system.species[k], bodies[k], own, names[k])]
+    lines += ["", "[ system ]", f"{system.scene.name}", "", "[ molecules ]"]
+    ends = np.flatnonzero(np.diff(index, append=-1)) + 1
+    for begin, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
+        lines.append(f"{names[index[begin]]} {end - begin}")
+    return "\n".join(lines) + "\n"
+
+
+def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
+    """A moleculetype."""
+    count, charges = len(m.masses), m.charges if portrait.coulomb is not None else np.zeros(len(m.masses))
+    extra = np.cumsum(body.site < 0) - 1
+    where = np.where(body.site >= 0, body.site, count + extra)
+    mass = np.zeros(count + _extra(m, body))
+    mass[where] = body.mass
+    types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra(m, body)]
+    names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra(m, body)))]
+    residue = as_word(m.residue_names[0])
+    lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
+    residue = as_word(m.residue_names[0])
+    lines += [
+        f"{i + 1} {types[i]} 1 {residue} {names[i]} 1 {charges[i] if i < count else 0.0:.12g} {mass[i]:.12g}"
+        for i in range(len(mass))
+    ]
+    at = [int(p) + 1 for p in where]
+    if len(at) == 3:
+        d = {(i, j): distance * NM for i, j, distance in body.distances}
+        lines += ["", "[ settles ]", f"{at[0]} 1 {d[0, 1]:.12g} {d[1, 2]:.12g}"]
+    elif len(at) == 2:
+        lines += ["", "[ constraints ]", f"{at[0]} {at[1]} 1 {body.distances[0][2] * NM:.12g}"]
+    if body.placed:
+        lines += ["", f"[ virtual_sites{len(at)} ]"]
+    points = " ".join(map(str, at))
+    for site, place in body.placed.items():
+        parts = " ".join(f"{weight:.12g}" for weight in place.weight[1:])
+        out = f"4 {parts} {place.cross / NM:.12g}" if place.cross else f"1 {parts}"
+        lines.append(f"{site + 1} {points} {out}")
+    if len(mass) > 1:
+        lines += ["", "[ exclusions ]"]
+        lines += [" ".join(str(j + 1) for j in [i, *range(i + 1, len(mass))]) for i in range(len(mass) - 1)]
+    return lines
+
+
+def _settings(portrait: Portrait, k: int) -> str:
+    """The .mdp file of stage k."""
+    system = portrait.system
+    scene, stage = system.scene, system.scene.stages[k]
+    cutoff = system.cutoff * NM
+
+    def every(interval: float) -> int:
+        return max(1, round(interval * 1e3 / stage.timestep_fs))
+
+    keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
+    interval = system.removes_momentum_every
+    found: dict[str, object] = {
+        "integrator": _integrator(stage),
+        "dt": f"{stage.timestep_fs * 1e-3:.12g}",
+        "nsteps": stage.steps,
+        "comm-mode": "Linear" if keeps else "None",
+        "nstcomm": every(interval) if interval else 100,
+        "nstlog": every(scene.output.log_interval_ps),
+        "nstenergy": every(scene.output.log_interval_ps),
+        "nstxout-compressed": every(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0,
+        "continuation": "yes",
+        "gen-vel": "no",
+        "cutoff-scheme": "Verlet",
+        "pbc": "xyz",
+        "rlist": f"{cutoff:.12g}",
+        "rvdw": f"{cutoff:.12g}",
+        "rcoulomb": f"{cutoff:.12g}",
+        "vdwtype": "Cut-off",
+        "constraint-algorithm": "lincs",
+        "lincs-order": 8,
+        "lincs-iter": 4,
+        "DispCorr": "AllEnerPres" if system.tail is not None else "no",
+        "ld-seed": (scene.seed * 1000 + k) % SEEDS,
+    }
+    if portrait.lennard_jones is not None:
+        found["vdw-modifier"] = MODIFIERS[portrait.truncation]
+        if "switch" in portrait.truncation:
+            found["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
+    return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(portrait) | _bath(stage)).items())
+
+
+def _integrator(stage: Stage) -> str:
+    """Velocity Verlet, unless a thermostat or barostat of GROMACS is without it."""
+    if stage.thermostat_kind == "langevin":
+        return "sd"
+    return "md" if stage.thermostat_kind == "velocity_rescaling" else "md-vv"
+
+
+def _coulomb(portrait: Portrait) -> dict[str, object]:
+    law, mesh = portrait.coulomb, portrait.system.terms.get("coulomb_reciprocal")
+    if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
+        return {
+            "coulombtype": "PME",
+            "coulomb-modifier": "Potential-shift" if law.shift else "None",
+            "ewald-rtol": f"{float(erfc(law.alpha * law.cutoff)):.12g}",
+            **{f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)},
+            "pme-order": mesh.order,
+        }
+    if isinstance(law, ReactionField):
+        permittivity = portrait.system.scene.forces.reaction_field_permittivity
+        return {"coulombtype": "Reaction-Field", "epsilon-rf": 0 if permittivity == inf else f"{permittivity:.12g}"}
+    return {"coulombtype": "Cut-off"}
+
+
+def _bath(stage: Stage) -> dict[str, object]:
+    """Thermostat and barostat."""
+    found: dict[str, object] = {"tcoupl": "no", "pcoupl": "no"}
+    if not stage.has_thermostat:
+        return found
+    first, last = stage.temperatures
+    coupling = {"nose_hoover": "nose-hoover", "velocity_rescaling": "v-rescale", "langevin": "no"}
+    found |= {
+        "tcoupl": coupling[stage.thermostat_kind],
+        "tc-grps": "System",
+        "ref-t": f"{first:.12g}",
+        "tau-t": f"{stage.thermostat_time:.12g}",
+    }
+    if stage.thermostat_kind == "nose_hoover":
+        found["nh-chain-length"] = stage.nose_hoover_links
+    if first != last:
+        found |= {"annealing": "single", "annealing-npoints": 2, "annealing-time": f"0 {stage.duration:.12g}"}
+        found["annealing-temp"] = f"{first:.12g} {last:.12g}"
+    if stage.has_barostat:
+        pressure, count = stage.pressures[0], 1 if stage.pressure_coupling == "isotropic" else 2
+        found |= {
+            "pcoupl": "C-rescale",
+            "pcoupltype": "isotropic" if count == 1 else "semiisotropic",
+            "tau-p": f"{stage.barostat_time:.12g}",
+            "ref-p": " ".join(f"{value:.12g}" for value in (pressure[0], pressure[2])[:count]),
+            "compressibility": " ".join([f"{stage.compressibility:.12g}"] * count),
+        }
+    return found

@@ -1,0 +1,1 @@
+"""The engine LAMMPS: runs on it, and files for it."""

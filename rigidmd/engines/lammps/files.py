@@ -1,0 +1,385 @@
+"""Input files of LAMMPS, in its units real, for a system: atoms, settings, and the stages of a run."""
+
+from collections.abc import Iterable, Mapping
+from math import inf, pi
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.files import write_text
+from rigidmd.core.plain_text import in_comment
+from rigidmd.core.state import State
+from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula, table
+from rigidmd.engines.force_field import Portrait, strange
+from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
+from rigidmd.forces.potentials.truncation import Plain
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BAR, COULOMB, ENERGY_UNITS
+
+KCAL = ENERGY_UNITS["kcal/mol"]
+#: LAMMPS' own constant of Coulomb's law, kcal Å/mol.
+COULOMB_REAL = 332.06371
+ATMOSPHERE = 1.01325 * BAR
+#: Mass of a massless site, u, because LAMMPS wants one; of the mass of a molecule it is less than rounding.
+NO_MASS = 1e-18
+#: Cut-off where there is none, Å.
+FARTHEST = 1e4
+#: Entries of a table, even in r², and where it begins, Å. From 1 Å on, splines of a table up to 9 Å are good to 1e-9.
+ENTRIES, INNERMOST = 8000, 0.3
+#: One more than the largest seed of random numbers.
+SEEDS = 900_000_000
+
+DATA, SETTINGS, INPUT, TABLES = "data.lammps", "settings.lammps", "in.lammps", "tables.lammps"
+#: Groups, and the fixes that move two of them.
+BODIES, POINTS, FROZEN = "bodies", "points", "frozen"
+#: Lennard-Jones styles by the ending.
+STYLES = {
+    "plain": "lj/cut",
+    "shift": "lj/cut",
+    "force_shift": "lj/smooth/linear",
+    "force_switch": "lj/gromacs",
+    "switch": "lj/mdf",
+    "smooth_switch": "table",
+}
+
+
+class PairStyle(NamedTuple):
+    """A pair style, what it is called with, and its coefficients."""
+
+    name: str
+    arguments: str
+    coefficients: dict[tuple[int, int], str]  # kinds from 0, the smaller one first
+    formulas: Mapping[tuple[int, int], str] = MappingProxyType({})  # of tables: energy, kcal/mol
+    modify: str = ""
+
+
+def faults(portrait: Portrait) -> list[str]:
+    """What of a scene LAMMPS cannot do, in words; empty if it can do all."""
+    scene = portrait.system.scene
+    found = [f"{what} is left to rigidmd" for what in strange(portrait.system)]
+    if portrait.has_waves and scene.forces.ewald_truncation == "shift":
+        found.append("forces.ewald_truncation = 'shift': LAMMPS has no shift of the real-space energy; take 'plain'")
+    if scene.run.remove_momentum_interval_ps:
+        found.append("run.remove_momentum_interval_ps: LAMMPS takes no momentum out of rigid bodies; leave it out")
+    for k, stage in enumerate(scene.stages):
+        found += [f"stages.{k}.{fault}" for fault in _stage_faults(stage)]
+    mixed = portrait.is_body.any() and (~portrait.is_body & ~portrait.frozen).any()
+    if mixed and any(stage.has_barostat for stage in scene.stages):
+        found.append("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them")
+    return found
+
+
+def _stage_faults(stage: Stage) -> list[str]:
+    if stage.is_minimisation:
+        return []  # rigidmd itself minimises
+    found, allowed = [], ("velocity_verlet",)
+    if stage.has_thermostat and stage.thermostat_kind not in ("nose_hoover", "langevin"):
+        found.append(f"thermostat = {stage.thermostat_kind!r}: LAMMPS has nose_hoover and langevin for rigid bodies")
+    if stage.thermostat_kind == "langevin":
+        allowed = ("velocity_verlet", "baoab")
+        if len(set(stage.frictions)) > 1:
+            found.append("friction_rotation_per_ps: LAMMPS has one friction for translation and rotation")
+        if stage.has_barostat:
+            found.append("ensemble = 'npt': LAMMPS' barostat for rigid bodies goes with nose_hoover only")
+    if stage.integrator not in allowed:
+        found.append(f"integrator = {stage.integrator!r}: LAMMPS moves rigid bodies by velocity_verlet")
+    if stage.rotor == "exact":
+        found.append("rotor = 'exact': LAMMPS' rotation is split")
+    if stage.has_barostat and stage.barostat is not None:
+        found.append(f"barostat = {stage.barostat!r}: LAMMPS has its own for rigid bodies; leave barostat out")
+    if stage.has_barostat and stage.pressure_coupling == "flexible":
+        found.append("pressure_coupling = 'flexible': LAMMPS' barostat for rigid bodies keeps the angles of the box")
+    return found
+
+
+def write_data(path: Path, portrait: Portrait, state: State) -> None:
+    """The data file: box, masses, atoms with images, velocities. Site k of the system is atom k + 1."""
+    system = portrait.system
+    position, velocity = system.site_positions(state), system.site_velocities(state)
+    image = np.zeros(position.shape, int)
+    lines = [
+        f"{system.scene.name}, written by rigidmd",
+        "",
+        f"{len(position)} atoms",
+        f"{len(portrait.kinds)} atom types",
+        "",
+    ]
+    if portrait.boxed:
+        image = np.floor(position @ np.linalg.inv(state.cell)).astype(int)
+        position = position - image @ state.cell
+        low, high = np.zeros(3), state.cell.diagonal()
+        lines += _bounds(low, high)
+        tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])
+        lines += [f"{' '.join(map(_n, tilt))} xy xz yz"] if any(tilt) else []
+    else:
+        lines += _bounds(position.min(axis=0) - 1, position.max(axis=0) + 1)
+    lines += ["", "Masses", ""]
+    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(portrait.kinds)]
+    lines += ["", "Atoms # full", ""]
+    charge = portrait.charge
+    rows = zip(system.sites.molecule + 1, portrait.kind + 1, charge, position, image, strict=True)
+    lines += [
+        f"{i} {m} {k} {_n(q)} {_n(x)} {_n(y)} {_n(z)} {nx} {ny} {nz}"
+        for i, (m, k, q, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1)
+    ]
+    per_fs = velocity * 1e-3  # Å/ps to Å/fs
+    lines += ["", "Velocities", ""]
+    lines += [f"{i} {_n(x)} {_n(y)} {_n(z)}" for i, (x, y, z) in enumerate(per_fs, 1)]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _n(number: Any) -> str:
+    """The shortest digits that give a number back."""
+    return repr(float(number))
+
+
+def _bounds(low: np.ndarray, high: np.ndarray) -> list[str]:
+    return [f"{_n(a)} {_n(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
+
+
+def settings(portrait: Portrait, data: str = DATA) -> list[str]:
+    """Commands up to the system with its forces, without anything that moves it."""
+    system, forces = portrait.system, portrait.system.scene.forces
+    boundary = "p p p" if portrait.boxed else "s s s"
+    styles = pair_styles(portrait)
+    names = " ".join(f"{style.name} {style.arguments}" for style in styles) or f"zero {_cutoff(system.cutoff):g}"
+    lines = ["units real", "atom_style full", f"boundary {boundary}"]
+    lines += [f"pair_style {'hybrid/overlay ' if styles else ''}{names}", f"read_data {data}"]
+    for n, style in enumerate(styles):
+        which = called(styles, n)
+        lines += [f"pair_coeff {i + 1} {j + 1} {which} {text}" for (i, j), text in style.coefficients.items()]
+    touched = {pair for style in styles for pair in style.coefficients}
+    pairs = [(i, j) for i in range(len(portrait.kinds)) for j in range(i, len(portrait.kinds))]
+    if styles:
+        lines += [f"pair_coeff {i + 1} {j + 1} none" for i, j in pairs if (i, j) not in touched]
+    else:
+        lines += ["pair_coeff * *"]
+    lines += [style.modify for style in styles if style.modify]
+    if portrait.has_waves:
+        way = "pppm" if forces.electrostatics == "pme" else "ewald"
+        lines += [
+            f"kspace_style {way} {accuracy(portrait):.3g}",
+            f"kspace_modify gewald {_n(forces.ewald_alpha_per_A)}",
+        ]
+    lines += [f"neighbor 2.0 {'bin' if portrait.boxed else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
+    lines += ["neigh_modify exclude molecule/intra all"]
+    points = ~portrait.is_body & ~portrait.frozen
+    for name, chosen in ((BODIES, portrait.is_body), (POINTS, points), (FROZEN, portrait.frozen)):
+        if chosen.any():
+            lines += [f"group {name} molecule {_ranges(np.flatnonzero(chosen) + 1)}"]
+    if portrait.frozen.any():
+        lines += [f"neigh_modify exclude group {FROZEN} {FROZEN}"]
+    return lines
+
+
+def accuracy(portrait: Portrait) -> float:
+    """rms error of the force on a site that the Ewald sum of the scene has, in units of LAMMPS' accuracy: of the force
+    between two charges e at 1 Å."""
+    return float(portrait.system.force_error or 0.0) / COULOMB
+
+
+def _cutoff(cutoff: float) -> float:
+    return FARTHEST if cutoff == inf else cutoff
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    """Numbers as 1:5 7 9:12."""
+    found: list[list[int]] = []
+    for number in numbers:
+        if found and number == found[-1][1] + 1:
+            found[-1][1] = int(number)
+        else:
+            found.append([int(number), int(number)])
+    return " ".join(str(a) if a == b else f"{a}:{b}" for a, b in found)
+
+
+def pair_styles(portrait: Portrait) -> list[PairStyle]:
+    """The pair styles that together are the pair laws of a system."""
+    return [style for style in (_lennard_jones(portrait), _coulomb(portrait)) if style is not None]
+
+
+def _lennard_jones(portrait: Portrait) -> PairStyle | None:
+    law = portrait.lennard_jones
+    if law is None or not portrait.epsilon.any():
+        return None
+    name = STYLES[portrait.truncation] if law.cutoff < inf else "lj/cut"
+    pairs = [(i, j) for i, j in np.argwhere(portrait.epsilon > 0) if i <= j]
+    cutoff = _n(_cutoff(law.cutoff))
+    if name == "table":
+        formulas = {}
+        for i, j in pairs:
+            six = float(portrait.sigma[i, j]) ** 6
+            c6 = 4 * float(portrait.epsilon[i, j]) * six
+            formulas[(i, j)] = lennard_jones_formula(law, c6 * six, c6, KCAL)
+        return _tables("lj", formulas, cutoff)
+    arguments = cutoff
+    if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.shape, Plain):
+        arguments = f"{_n(law.shape.start)} {cutoff}"
+    coefficients = {(i, j): f"{_n(portrait.epsilon[i, j] / KCAL)} {_n(portrait.sigma[i, j])}" for i, j in pairs}
+    shifts = f"pair_modify pair {name} shift yes" if portrait.truncation == "shift" and law.cutoff < inf else ""
+    return PairStyle(name, arguments, coefficients, modify=shifts)
+
+
+def _coulomb(portrait: Portrait) -> PairStyle | None:
+    law = portrait.coulomb
+    if law is None:
+        return None
+    charge = [kind.charge for kind in portrait.kinds]
+    charged = [k for k, q in enumerate(charge) if q != 0]
+    pairs = [(i, j) for i in charged for j in charged if i <= j]
+    cutoff = _n(_cutoff(law.cutoff))
+    if isinstance(law, ScreenedCoulomb):
+        return PairStyle("coul/long", cutoff, dict.fromkeys(pairs, ""), modify="pair_modify pair coul/long table 0")
+    if law.cutoff == inf:
+        return PairStyle("coul/cut", cutoff, dict.fromkeys(pairs, ""))
+    if isinstance(law, DampedShiftedForce):
+        return PairStyle("coul/dsf", f"{_n(law.alpha)} {cutoff}", dict.fromkeys(pairs, ""))
+    of_pairs = {(i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs}
+    return _tables("coulomb", of_pairs, cutoff)
+
+
+def _tables(what: str, formulas: dict[tuple[int, int], str], cutoff: str) -> PairStyle:
+    """Tables in a file beside the settings, each under a name of its own; pairs with one formula share one."""
+    names = {formula: f"{what}_{n}" for n, formula in enumerate(dict.fromkeys(formulas.values()))}
+    coefficients = {pair: f"{TABLES} {names[formula]} {cutoff}" for pair, formula in formulas.items()}
+    return PairStyle("table", f"spline {ENTRIES}", coefficients, formulas)
+
+
+def called(styles: list[PairStyle], n: int) -> str:
+    """What LAMMPS calls style n: by its number too if there are several of its name."""
+    names = [style.name for style in styles]
+    return names[n] if names.count(names[n]) == 1 else f"{names[n]} {names[: n + 1].count(names[n])}"
+
+
+def write_tables(path: Path, portrait: Portrait) -> bool:
+    """The tables of laws that LAMMPS has no style for; whether there are any."""
+    parts = []
+    for style in pair_styles(portrait):
+        for pair, formula in style.formulas.items():
+            name, cutoff = style.coefficients[pair].split()[1:]
+            if f"\n{name}\n" not in "".join(parts):
+                parts.append(f"# {formula}\n\n{name}\n{table(formula, INNERMOST, float(cutoff), ENTRIES)}\n")
+    if parts:
+        write_text(path, "".join(parts))
+    return bool(parts)
+
+
+def movers(portrait: Portrait, k: int) -> list[str]:
+    """The fixes of stage k, from which its motion follows."""
+    stage = portrait.system.scene.stages[k]
+    seed = (portrait.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
+    lines = []
+    if portrait.is_body.any():
+        lines.append(f"fix {BODIES} {BODIES} {_of_bodies(portrait, stage, seed)}")
+    if (~portrait.is_body & ~portrait.frozen).any():
+        lines += _of_points(portrait, stage, seed, alone=not portrait.is_body.any())
+    return lines
+
+
+def _of_bodies(portrait: Portrait, stage: Stage, seed: int) -> str:
+    if stage.is_minimisation or stage.ensemble == "nve":
+        return "rigid/nve/small molecule"
+    if stage.thermostat_kind == "langevin":
+        return f"rigid/small molecule langevin {_langevin(stage, seed)}"
+    if stage.ensemble == "nph":
+        return f"rigid/nph/small molecule {_box(portrait, stage)}"
+    links = f"tparam {stage.nose_hoover_links} 1 5"
+    if stage.ensemble == "npt":
+        box = _box(portrait, stage)
+        return f"rigid/npt/small molecule {_chain(stage)} {box} {links} pchain {stage.nose_hoover_links}"
+    return f"rigid/nvt/small molecule {_chain(stage)} {links}"
+
+
+def _of_points(portrait: Portrait, stage: Stage, seed: int, alone: bool) -> list[str]:
+    if stage.is_minimisation or stage.ensemble == "nve":
+        return [f"fix {POINTS} {POINTS} nve"]
+    if stage.thermostat_kind == "langevin":
+        return [
+            f"fix {POINTS} {POINTS} nve",
+            f"fix {POINTS}_bath {POINTS} langevin {_langevin(stage, seed + 1)} tally yes",
+        ]
+    if stage.has_barostat:
+        kind = "npt" if stage.has_thermostat else "nph"
+        bath = f"{_chain(stage)} " if stage.has_thermostat else ""
+        return [f"fix {POINTS} {POINTS} {kind} {bath}{_box(portrait, stage)}"]
+    return [f"fix {POINTS} {POINTS} nvt {_chain(stage)} tchain {stage.nose_hoover_links}"]
+
+
+def _chain(stage: Stage) -> str:
+    """Temperatures and damping time, fs: LAMMPS gives the inverse of an angular frequency, a scene its period."""
+    first, last = stage.temperatures
+    return f"temp {_n(first)} {_n(last)} {_n(1e3 * stage.thermostat_time / (2 * pi))}"
+
+
+def _langevin(stage: Stage, seed: int) -> str:
+    first, last = stage.temperatures
+    return f"{_n(first)} {_n(last)} {_n(1e3 / stage.frictions[0])} {seed}"
+
+
+def _box(portrait: Portrait, stage: Stage) -> str:
+    """Pressures, atm, less that of the tail correction, which the forces lack; and damping time, fs."""
+    tail, volume = portrait.system.tail, portrait.system.state.volume
+    beyond = 0.0 if tail is None else tail.pressure(volume)
+    first, last = ([(bar * BAR - beyond) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
+    damping = 1e3 * stage.barostat_time
+    if stage.pressure_coupling == "isotropic":
+        return f"iso {_n(np.mean(first))} {_n(np.mean(last))} {_n(damping)}"
+    axes = " ".join(f"{axis} {_n(a)} {_n(b)} {_n(damping)}" for axis, a, b in zip("xyz", first, last, strict=True))
+    return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
+
+
+def _thermo(portrait: Portrait) -> list[str]:
+    """Columns of the log."""
+    columns = "step time temp pe ke etotal press vol density"
+    constant = portrait.system.constants.get("coulomb_intramolecular")
+    if constant is None:
+        return [f"thermo_style custom {columns}"]
+    return [
+        "# pe counts pairs within molecules in the sum over waves, a constant of rigid ones; this one does not",
+        f"variable potential equal pe+({_n(constant / KCAL)})",
+        f"thermo_style custom {columns} v_potential",
+    ]
+
+
+def input_script(portrait: Portrait) -> str:
+    """The whole run: settings, and every stage that is not a minimisation."""
+    system, output = portrait.system, portrait.system.scene.output
+    lines = [
+        f"# {in_comment(system.scene.in_short)}",
+        "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps",
+        "",
+        f"include {SETTINGS}",
+        "",
+        *_thermo(portrait),
+        "thermo_modify format float %.10g flush yes",
+    ]
+    for k, stage in enumerate(system.scene.stages):
+        if stage.is_minimisation:
+            continue
+        every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
+        frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
+        fixes = movers(portrait, k)
+        lines += [
+            "",
+            f"# {in_comment(stage.label)}: {stage.duration:g} ps",
+            f"timestep {_n(stage.timestep_fs)}",
+            *fixes,
+        ]
+        lines += [f"thermo {every}"]
+        if output.trajectory:
+            lines += [f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"]
+            lines += ["dump_modify frames sort id"]
+        lines += [f"run {stage.steps}"]
+        lines += [f"unfix {fix.split()[1]}" for fix in fixes] + (["undump frames"] if output.trajectory else [])
+    return "\n".join([*lines, "", "write_data final.lammps", ""])
+
+
+def write_lammps(folder: Path, portrait: Portrait, state: State) -> list[str]:
+    """All files of a run in a folder. Returns their names. Raises OutputError."""
+    write_data(folder / DATA, portrait, state)
+    for name, text in ((SETTINGS, "\n".join([*settings(portrait), ""])), (INPUT, input_script(portrait))):
+        write_text(folder / name, text)
+    tables = [TABLES] if write_tables(folder / TABLES, portrait) else []
+    return [INPUT, SETTINGS, DATA, *tables]

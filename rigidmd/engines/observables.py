@@ -1,0 +1,171 @@
+"""Energies, temperatures, pressure, momentum and the orthogonality of Q at one moment."""
+
+from math import inf, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import Load, State
+from rigidmd.dynamics.momenta import Freedom
+from rigidmd.dynamics.observables import sums_over
+from rigidmd.engines import Engine, cpu
+from rigidmd.engines.system import System
+from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
+
+UNIT = np.eye(3)
+
+
+class Reading(NamedTuple):
+    """Observables of molecules at one moment, in the units of the log. NaN if one does not exist."""
+
+    components: dict[str, float]  # potential energy by term and constant, kJ/mol
+    potential: float  # their sum, kJ/mol
+    kinetic_translation: float  # kJ/mol
+    kinetic_rotation: float
+    kinetic: float  # both
+    energy: float  # potential and kinetic
+    temperature: float  # K
+    temperature_translation: float
+    temperature_rotation: float
+    temperature_translation_unbiased: float  # see `observe`; NaN with any integrator but velocity Verlet
+    temperature_rotation_unbiased: float
+    pressure_bar: float  # molecular, tail correction included; NaN without a box
+    pressure_tensor_bar: np.ndarray  # (3, 3) the same by components, the symmetric part; NaN without a box
+    virial: np.ndarray  # (3, 3) molecular, without the tail correction, kJ/mol
+    momentum: np.ndarray  # (3,) u Å/ps
+    force: np.ndarray  # (n, 3) on each molecule, lab frame, kJ/mol/Å
+    torque_body: np.ndarray  # (n, 3) on each molecule, body frame, kJ/mol; (0, 3) of points
+    orthogonality: float  # largest entry of |QᵀQ - 1|
+
+    def __repr__(self) -> str:
+        return f"<Reading: potential {self.potential:.6g} kJ/mol, temperature {self.temperature:.6g} K>"
+
+
+class Observation(NamedTuple):
+    """Observables at one moment, in internal units (Å, ps, u, K, u Å²/ps²)."""
+
+    components: dict[str, float]  # potential energy by term and constant
+    virial: np.ndarray  # (3, 3) molecular
+    kinetic_translation: float
+    kinetic_rotation: float
+    temperature_translation: float  # K; NaN where there is no such motion
+    temperature_rotation: float
+    temperature: float
+    temperature_translation_unbiased: float  # see `observe`; NaN with any integrator but velocity Verlet
+    temperature_rotation_unbiased: float
+    pressure_tensor: np.ndarray  # (3, 3) symmetric, u/(Å ps²); NaN without a box
+    momentum: np.ndarray  # (3,)
+    orthogonality: float
+    load: Load
+
+    @property
+    def potential(self) -> float:
+        """Sum of the components."""
+        return sum(self.components.values())
+
+    @property
+    def kinetic(self) -> float:
+        """Translation and rotation."""
+        return self.kinetic_translation + self.kinetic_rotation
+
+    @property
+    def energy(self) -> float:
+        """Potential and kinetic."""
+        return self.potential + self.kinetic
+
+    @property
+    def pressure_tensor_bar(self) -> np.ndarray:
+        """Molecular pressure tensor (3, 3) in bar; NaN without a box."""
+        return self.pressure_tensor / BAR
+
+    @property
+    def pressure_bar(self) -> float:
+        """Molecular pressure in bar; NaN without a box."""
+        return float(self.pressure_tensor.trace()) / (3 * BAR)
+
+    @property
+    def reading(self) -> Reading:
+        """The same in the units of the log."""
+        of_energy = ("potential", "kinetic_translation", "kinetic_rotation", "kinetic", "energy", "virial")
+        own = {name: getattr(self, name) for name in Reading._fields if hasattr(self, name)}
+        return Reading(
+            **own
+            | {name: own[name] / KJ_PER_MOL for name in of_energy}
+            | {
+                "components": {name: energy / KJ_PER_MOL for name, energy in self.components.items()},
+                "force": self.load.force / KJ_PER_MOL,
+                "torque_body": self.load.torque_body / KJ_PER_MOL,
+            }
+        )
+
+    @property
+    def largest_force(self) -> tuple[float, int]:
+        """Largest force on a molecule (u Å/ps²), and the index of that molecule."""
+        size = np.linalg.norm(self.load.force, axis=1)
+        return float(size.max()), int(size.argmax())
+
+
+def observe(
+    system: System,
+    engine: Engine,
+    state: State,
+    verlet_step: float = nan,
+    freedom: Freedom | None = None,
+    moved: bool = False,
+) -> Observation:
+    """All observables, from one evaluation of forces and energies.
+
+    freedom : degrees of freedom that temperatures count; those of a conserved total momentum when not given
+
+    moved : whether the engine has just moved this state, so that it may know its forces and energies
+
+    verlet_step : time step (ps) if the state comes from velocity Verlet. Between its kicks the kinetic energy is higher
+    than at its steps by dt²/8 [sum F²/m + sum n . I^-1 n] on average: for a mode of frequency w the first is too high
+    by x/12 and the second too low by x/6, x = (w dt)². The weighted mean (twice the first plus once the second)/3 is
+    right to O(x²) (Eastwood et al. 2010, J. Chem. Theory Comput. 6, 2045): the unbiased temperatures.
+
+    Pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
+    tensor is the symmetric part: the rest is the rate at which orientations take angular momentum up, 0 on average.
+    """
+    load, tallies = engine.look(state) if moved else engine.evaluate(state)
+    components = {name: tally.energy for name, tally in tallies.items()} | system.constants
+    volume, beyond = state.volume, 0.0
+    if system.tail is not None:
+        components["tail" if system.own else "lennard_jones_tail"] = system.tail.energy(volume)
+        beyond = system.tail.pressure(volume)
+    virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
+    own = isinstance(engine, cpu.Engine)
+    sums = engine.sums(state, load) if own else sums_over(system.model, state, load)
+    translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
+    slant = verlet_step**2 / 12
+    translation_unbiased = translation + slant * sums.force
+    rotation_unbiased = rotation + slant * sums.torque
+    freedom = freedom or system.freedom
+    pressure = np.full((3, 3), nan)
+    if volume < inf:
+        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * UNIT
+    return Observation(
+        components=components,
+        virial=virial,
+        kinetic_translation=translation,
+        kinetic_rotation=rotation,
+        temperature_translation=_temperature(translation, freedom.translation),
+        temperature_rotation=_temperature(rotation, freedom.rotation),
+        temperature=_temperature(translation + rotation, freedom.total),
+        temperature_translation_unbiased=_temperature(translation_unbiased, freedom.translation),
+        temperature_rotation_unbiased=_temperature(rotation_unbiased, freedom.rotation),
+        pressure_tensor=pressure,
+        momentum=sums.momentum,
+        orthogonality=sums.orthogonality,
+        load=load,
+    )
+
+
+def kinetic_energies(system: System, state: State) -> tuple[float, float]:
+    """Of translation and rotation, u Å²/ps²."""
+    sums = sums_over(system.model, state)
+    return 0.5 * sums.translation, 0.5 * sums.rotation
+
+
+def _temperature(kinetic: float, freedom: int) -> float:
+    return 2 * kinetic / (freedom * BOLTZMANN) if freedom else nan

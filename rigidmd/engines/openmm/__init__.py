@@ -1,0 +1,1 @@
+"""The engine OpenMM: runs on it, and files for it."""

@@ -1,0 +1,149 @@
+"""A folder with which OpenMM runs a system by itself: system, integrators and state as XML, and a script."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigidmd.core.files import whole_file, write_text
+from rigidmd.core.plain_text import in_comment
+from rigidmd.core.state import State
+from rigidmd.engines.force_field import Portrait
+from rigidmd.engines.openmm import system as parts
+from rigidmd.engines.openmm.engine import Held, held
+from rigidmd.engines.openmm.stages import KICK, MOVES, TOLERANCES, integrator_of, movers
+
+if TYPE_CHECKING:
+    from openmm.app import Topology
+
+SYSTEM, STATE, TOPOLOGY, SCRIPT = "system.xml", "state.xml", "topology.pdb", "run.py"
+
+TEXT = '''"""{title}
+
+Written by rigidmd. It needs OpenMM alone:  python run.py [CPU|CUDA|OpenCL|HIP|Reference]
+"""
+
+import csv
+import sys
+
+import openmm as mm
+from openmm import app
+
+# name, steps, steps between lines, steps between frames, files of the integrator and of what else acts
+STAGES = [
+{stages}
+]
+
+
+def load(name):
+    with open(name) as file:
+        return mm.XmlSerializer.deserialize(file.read())
+
+
+def advance(integrator, steps):
+    """Take steps; the integrator of constant energy begins and ends with half a kick."""
+    if not isinstance(integrator, mm.CustomIntegrator):
+        return integrator.step(steps)
+    for kick, moves, count in ((0.5, 1, 1), (1.0, 1, steps - 1), (0.5, 0, 1)):
+        integrator.setGlobalVariableByName("{kick}", kick)
+        integrator.setGlobalVariableByName("{moves}", moves)
+        integrator.step(count)
+
+
+platform = mm.Platform.getPlatformByName(sys.argv[1] if len(sys.argv) > 1 else "CPU")
+topology, state = app.PDBFile("{topology}").topology, load("{state}")
+trajectory = None
+with open("log.csv", "w") as log, open("trajectory.dcd", "wb") as frames:
+    lines = csv.writer(log, lineterminator="\\n")
+    lines.writerow(["stage", "step", "potential_kJ_mol", "kinetic_kJ_mol", "volume_A3"])
+    for name, steps, every, frame, file, others in STAGES:
+        system, integrator = load("{system}"), load(file)
+        for other in others:
+            system.addForce(load(other))
+        context = mm.Context(system, integrator, platform)
+        context.setPeriodicBoxVectors(*state.getPeriodicBoxVectors())
+        context.setPositions(state.getPositions())
+        context.setVelocities(state.getVelocities())
+        trajectory = trajectory or app.DCDFile(frames, topology, integrator.getStepSize())
+        done = 0
+        while done < steps:
+            more = min(steps, (done // every + 1) * every, (done // frame + 1) * frame) - done
+            advance(integrator, more)
+            done += more
+            groups = integrator.getIntegrationForceGroups()
+            state = context.getState(positions=True, velocities=True, energy=True, groups=groups)
+            if done % every == 0:
+                energies = [e._value for e in (state.getPotentialEnergy(), state.getKineticEnergy())]
+                volume = state.getPeriodicBoxVolume()._value * 1e3
+                lines.writerow([name, done, *energies, volume])
+                log.flush()
+            if done % frame == 0:
+                trajectory.writeModel(state.getPositions(), periodicBoxVectors=state.getPeriodicBoxVectors())
+with open("final.xml", "w") as file:
+    file.write(mm.XmlSerializer.serialize(state))
+'''
+
+
+def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
+    """Write the folder for a system that begins at a state; the names of its files. Raises EngineError if OpenMM is not
+    here, and OutputError."""
+    mm = parts.library()
+    holds = held(portrait)
+    position, velocity = (values * parts.NM for values in holds.positions(state))
+    made = holds.made(state, apart=False)
+    context = mm.Context(made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
+    context.setPositions(position)
+    context.setVelocities(velocity)
+    text = {
+        SYSTEM: mm.XmlSerializer.serialize(made),
+        STATE: mm.XmlSerializer.serialize(context.getState(positions=True, velocities=True)),
+    }
+    rows = []
+    scene = portrait.system.scene
+    for k, stage in enumerate(scene.stages):
+        if stage.is_minimisation:
+            continue
+        number = f"_{len(rows) + 1}" if rows else ""
+        file = f"integrator{number}.xml"
+        text[file] = mm.XmlSerializer.serialize(integrator_of(portrait, k, TOLERANCES["mixed"]))
+        others = []
+        for n, other in enumerate(movers(portrait, k)):
+            others.append(f"besides{number}_{n + 1}.xml")
+            text[others[-1]] = mm.XmlSerializer.serialize(other)
+        every, frame = (
+            max(1, round(interval * 1e3 / stage.timestep_fs))
+            for interval in (scene.output.log_interval_ps, scene.output.trajectory_interval_ps)
+        )
+        rows.append(f"    {(stage.label, stage.steps, every, frame, file, others)!r},")
+    names = {"system": SYSTEM, "state": STATE, "topology": TOPOLOGY, "kick": KICK, "moves": MOVES}
+    values = {"title": in_comment(scene.in_short), "stages": "\n".join(rows), **names}
+    text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda found: values[found[1]], TEXT)
+    for name, content in text.items():
+        write_text(folder / name, content)
+    with whole_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        _write_pdb(file, _topology(holds), position)
+    return [*text, TOPOLOGY]
+
+
+def _topology(holds: Held) -> "Topology":
+    """Names of all particles; mass points that are no sites are called P1, P2, ..."""
+    from openmm import app
+
+    made, system = app.Topology(), holds.drawn.system
+    chain = made.addChain()
+    index = system.model.species
+    count = [*holds.particles.first, len(holds.particles.mass)]
+    for n, k in enumerate(index):
+        m = system.species[k]
+        residue = made.addResidue(str(m.residue_names[0]), chain)
+        for j in range(int(count[n + 1] - count[n])):
+            is_site = j < len(m.masses)
+            name = m.site_names[j] if is_site else f"P{j - len(m.masses) + 1}"
+            symbol = m.elements[j] if is_site else "X"
+            made.addAtom(name, None if symbol == "X" else app.Element.getBySymbol(symbol), residue)
+    return made
+
+
+def _write_pdb(file, topology: "Topology", position) -> None:
+    from openmm import Vec3, app
+
+    app.PDBFile.writeFile(topology, [Vec3(*row) for row in (position / parts.NM).tolist()], file)  # Å

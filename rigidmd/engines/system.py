@@ -1,0 +1,209 @@
+"""The system of a scene of molecules: what an engine moves."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import State
+from rigidmd.core.state_file import Saved
+from rigidmd.dynamics.momenta import Freedom, mobile
+from rigidmd.dynamics.step_loop import Model
+from rigidmd.engines.cpu import Engine, Precision
+from rigidmd.forces.ewald.errors import (
+    Charges,
+    charges_of,
+)
+from rigidmd.forces.neighbors.space import Space, space_of, wrap
+from rigidmd.forces.potentials.lennard_jones import Tail
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.models import Molecule, of_each
+from rigidmd.units import GRAM_PER_CM3
+
+
+class Sites(NamedTuple):
+    """Every site of every molecule, for output and analysis."""
+
+    molecule: np.ndarray  # (s,)
+    offset_body: np.ndarray  # (s, 3)
+    name: np.ndarray  # (s,) text
+    element: np.ndarray  # (s,) text
+    mass: np.ndarray  # (s,)
+
+    def __repr__(self) -> str:
+        return f"<Sites: {len(self.name)} of {len(np.unique(self.molecule))} molecules>"
+
+
+@dataclass(frozen=True)
+class System:
+    """The system that a scene describes. `state` is the start; nothing here changes during a run."""
+
+    scene: MolecularScene  # resolved: every default is filled in
+    species: list[Molecule]
+    model: Model
+    space: Space
+    state: State
+    terms: dict[str, NamedTuple]
+    freedom: Freedom
+    constants: dict[str, float]  # constant energies, u Å²/ps²
+    constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
+    tail: Tail | None  # the tail correction, where the scene asks for it
+    residue_number: np.ndarray  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    from_lattice: bool
+    left_out: list[str]
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    notes: list[str] = field(default_factory=list)
+    told: dict[str, Callable] = field(default_factory=dict)  # what Python computes: name of a term -> what is asked
+    thermostat: Any = None  # of the user's own, in place of that of every stage
+    own: dict[str, str] = field(default_factory=dict)  # terms of the user's own by name, in words
+
+    def __repr__(self) -> str:
+        return f"<System of {self.scene.in_short}>"
+
+    @cached_property
+    def sites(self) -> Sites:
+        """Every site, made when it is first asked for: a run needs them only to write a trajectory."""
+        owner = np.repeat(np.arange(len(self.model.species)), self.own_sites)
+        return Sites(
+            owner,
+            self.of_sites(lambda m: m.positions_body),
+            self.of_sites(lambda m: np.array(m.site_names, dtype=object)),
+            self.of_sites(lambda m: np.array(m.elements, dtype=object)),
+            self.of_sites(lambda m: m.masses),
+        )
+
+    @property
+    def site_count(self) -> int:
+        """The number of sites."""
+        return int(self.own_sites.sum())
+
+    @property
+    def own_sites(self) -> np.ndarray:
+        """The number of sites of each molecule (n,)."""
+        return np.array([len(m.masses) for m in self.species])[self.model.species]
+
+    @cached_property
+    def mass(self) -> float:
+        """Of all molecules, u."""
+        return float(self.model.mass[self.model.species].sum())
+
+    @property
+    def density(self) -> float:
+        """g/cm³; 0 without a box."""
+        return self.mass / self.space.volume / GRAM_PER_CM3
+
+    @property
+    def cutoff(self) -> float:
+        """Cut-off between sites, Å; inf for none."""
+        return self.scene.forces.cutoff_A or inf
+
+    @property
+    def external(self) -> list[str]:
+        """Names of the terms of external fields, which may change the total momentum."""
+        return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
+
+    @property
+    def tied_to_places(self) -> list[str]:
+        """Names of the terms whose energy depends on positions in the lab, which exclude a barostat. A field on
+        molecules without a net charge is not among them."""
+        return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
+
+    @property
+    def removes_momentum_every(self) -> float | None:
+        """Time between removals of the total momentum, ps; None for never."""
+        return self.scene.run.remove_momentum_interval_ps or None
+
+    def keeps_momentum_in(self, k: int) -> bool:
+        """Whether the thermostat of stage k leaves the total momentum as it is."""
+        if self.thermostat is not None:
+            return not getattr(self.thermostat, "changes_momentum", False)
+        return self.scene.stages[k].keeps_momentum
+
+    @property
+    def last_freedom(self) -> Freedom:
+        """Degrees of freedom in the last stage in which time passes."""
+        moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
+        return self.freedom_in(moving[-1]) if moving else self.freedom
+
+    def freedom_in(self, k: int) -> Freedom:
+        """Degrees of freedom in stage k: with the total momentum where its thermostat changes that."""
+        if self.keeps_momentum_in(k):
+            return self.freedom
+        return self.freedom._replace(translation=3 * int(mobile(self.model).sum()))
+
+    @property
+    def smallest_diameter(self) -> float:
+        """Smallest Lennard-Jones diameter, or the smallest radius where there is none, Å."""
+        sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
+        return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
+
+    def saved(self, state: State) -> Saved:
+        """A state with the names and numbers that its file holds, where frozen and free molecules are one species."""
+        names = list(dict.fromkeys(m.name for m in self.species))
+        index = np.array([names.index(m.name) for m in self.species])
+        first = [next(m for m in self.species if m.name == name) for name in names]
+        return Saved(state, names, index[self.model.species], self.residue_number, np.array([m.marks for m in first]))
+
+    @property
+    def residue_names(self) -> np.ndarray:
+        """Residue name of each molecule (n,) in topology files."""
+        return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
+
+    def engine(self) -> Engine:
+        """A new engine for this system, in the precision of the scene."""
+        return self.engine_of(self.terms, self.scene.precision)
+
+    def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> Engine:
+        """A new engine for some terms of this system."""
+        presses = any(stage.ensemble == "nph" for stage in self.scene.stages)
+        return Engine(self.model, terms, precision, self.scene.forces.skin_A, self.told, self.scene.threads, presses)
+
+    def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
+        """Values for all sites (s,), from `of`, which gives those of one molecule."""
+        return of_each([of(m) for m in self.species], self.model.species)
+
+    def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
+        """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
+        owner = self.sites.molecule
+        return _gathered(self.centres(state, wrapped), owner) + _arms(state, owner, self.sites.offset_body)
+
+    def positions_of(self, state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
+        """Positions (k, 3) of points fixed in molecules (k,) at offsets (k, 3), lab frame, Å, not wrapped."""
+        return _gathered(state.position, molecule) + _arms(state, molecule, offset_body)
+
+    def centres(self, state: State, wrapped: bool = False) -> np.ndarray:
+        """Centres of mass (n, 3), lab frame, Å; wrapped: inside the box."""
+        return wrap(space_of(state.cell), state.position) if wrapped else state.position
+
+    def site_velocities(self, state: State) -> np.ndarray:
+        """Velocities (s, 3) of all sites, lab frame, Å/ps."""
+        owner = self.sites.molecule
+        velocity = _gathered(state.velocity, owner)
+        if len(state.rotation) == 0:
+            return velocity
+        omega = state.angular_momentum_body * self.model.inverse_inertia[self.model.species]
+        lab = np.einsum("nij,nj->ni", state.rotation, omega)
+        return velocity + np.cross(_gathered(lab, owner), _arms(state, owner, self.sites.offset_body))
+
+
+def _arms(state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
+    """Vectors (k, 3) from the centres of molecules (k,) to points at offsets (k, 3) in the body frame, lab frame, Å."""
+    if len(state.rotation) == 0:
+        return np.zeros_like(offset_body)
+    return np.einsum("sij,sj->si", _gathered(state.rotation, molecule), offset_body)
+
+
+def _gathered(values: np.ndarray, molecule: np.ndarray) -> np.ndarray:
+    """values[molecule], in a quarter of the time."""
+    return values.take(molecule, axis=0)
+
+
+def charges_in(species: list[Molecule], counts: np.ndarray) -> Charges:
+    """The charges of so many molecules of each species, in the form that estimates of errors need."""
+    charged = [(m, m.charges != 0) for m in species]
+    return charges_of(
+        [(int(n), m.charges[own], m.positions_body[own]) for n, (m, own) in zip(counts, charged, strict=True)]
+    )

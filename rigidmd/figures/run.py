@@ -1,0 +1,175 @@
+"""The figures of a run in memory: what energy.png and the figures of a body are drawn from."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidmd.engines.body_motion import Motion, drawn_axis
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.samples import Samples, moving
+from rigidmd.engines.system import System
+from rigidmd.figures.body import motion_figures
+from rigidmd.forces.body.frame import Inertial
+from rigidmd.mechanics.free_rotor import SplitRotor
+
+if TYPE_CHECKING:
+    from rigidmd.figures.picture import Picture
+from typing import TYPE_CHECKING
+
+from rigidmd.figures.style import COOL, FAINT, INK, WARM, shown_range, thin_series
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rigidmd.figures.picture import Picture
+from math import floor, isnan, log10
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    pass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    pass
+
+
+def run_figures(
+    system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any]
+) -> "dict[str, Picture]":
+    """The figures of a run by the names of their files; those that there are samples for."""
+    if isinstance(system, BodySystem):
+        return body_figures(system, samples) if isinstance(samples, Motion) else {}
+    if isinstance(samples, Samples) and moving(system.scene.stages, samples["stage"]).sum() > 1:
+        return {"energy": energy_figure(system, samples, summary)}
+    return {}
+
+
+def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
+    """Figures of the axis, angles, omega, path and errors; none of fewer than three samples."""
+    if len(samples) <= 2:
+        return {}
+    columns = dict(samples.columns)
+    if system.turns:  # omega along the principal axes, where it lies on ellipsoids
+        omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
+        columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
+    gravity = system.scene.gravity and system.scene.gravity.acceleration_m_s2
+    return motion_figures(
+        system.scene.name,
+        columns=columns,
+        axis_body=drawn_axis(system),
+        inertia=system.inertia if _keeps_its_ellipsoids(system, samples) else None,
+        invariants=samples.invariants,
+        gravity=None if gravity is None else np.array(gravity),
+        flies=system.flies,
+    )
+
+
+def _keeps_its_ellipsoids(system: BodySystem, samples: Motion) -> bool:
+    """Whether the inertia is constant, the frame does not turn, and |L| is conserved: no torque acts."""
+    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
+    return steady and "L_size" in samples.invariants
+
+
+DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
+
+
+def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
+    """The drift of the conserved energy in each stage, on the scale of the last; energies and temperatures."""
+    from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
+
+    stages, n = system.scene.stages, len(system.model.species)
+    shown = moving(stages, samples["stage"])
+    column = {name: samples[name][shown] for name in DRAWN}
+    time, stage = column["time"], samples["stage"][shown]
+    last = stage == stage[-1]
+    known = bool(np.isfinite(column["drift"][last]).any())  # another engine may tell no conserved energy
+    figure = Picture(figsize=(8, 7), layout="constrained")
+    axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
+    *_, parts, temperature = axes
+    if known:
+        _draw_drift(axes[0], time, column["drift"] / n, stage, summary["stages"][stage[-1]])
+    for name, color in (("potential", COOL), ("kinetic", WARM)):
+        _draw(parts, time, (column[name] - column[name][-1]) / n, stage, color, name)
+    parts.set_ylabel("energies less\ntheir last values\n(kJ/mol per molecule)")
+    for name, color, label in (
+        ("temperature_translation", COOL, "translation"),
+        ("temperature_rotation", WARM, "rotation"),
+    ):
+        if np.isfinite(column[name]).all():
+            _draw(temperature, time, column[name], stage, color, label)
+    temperature.set_ylabel("temperature (K)")
+    temperature.set_xlabel("time (ps)")
+    starts = [float(time[stage == k][0]) for k in np.unique(stage)]
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.margins(x=0)
+        axis.yaxis.label.set_fontsize(9)
+        for start in starts:
+            axis.axvline(start, color=FAINT, lw=0.6, ls=":")
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    for axis in (parts, temperature):
+        _label_stages(axis, starts, [stages[k].label for k in np.unique(stage)])
+    figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
+    return figure
+
+
+def _draw(axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray, color: str, label: str) -> None:
+    """A curve, with the limits of the axis wide enough for the range of it that is shown."""
+    before = axis.get_ylim() if axis.lines else None
+    axis.plot(*thin_series(time, values), color=color, lw=0.9, label=label)
+    if (limits := shown_range(values, stage)) is not None:
+        axis.set_ylim(min(limits[0], *(before or limits)), max(limits[1], *(before or limits)))
+
+
+def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, told: dict) -> None:
+    """The conserved energy since each stage began, kJ/mol per molecule; of the last one with the line of its drift."""
+    last = stage == stage[-1]
+    for k in np.unique(stage):
+        own = stage == k
+        axis.plot(*thin_series(time[own], drift[own]), color=COOL if own[-1] else FAINT, lw=0.9)
+    low, high = np.nanmin(drift[last]), np.nanmax(drift[last])
+    if high > low:
+        axis.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+    gradient, error = told["drift_kJ_mol_ns_per_molecule"], told["drift_error_kJ_mol_ns_per_molecule"]
+    if last.sum() > 2 and gradient is not None:
+        line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
+        axis.plot(time[last], line, color=WARM, lw=1.4)
+        title = f"{told['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule"
+        axis.set_title(title, loc="left", fontsize=9, color=WARM)
+    axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
+
+
+def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:
+    """Names of stages above the curves where they begin, each in the first row that is free there."""
+    left, right = axis.get_xlim()
+    rows: list[float] = []  # where the last name of each row ends, as a fraction of the axis
+    for start, label in zip(starts, labels, strict=True):
+        at, long = (start - left) / ((right - left) or 1.0), 0.015 + LETTER * len(label)
+        at_end = at > 0.5 and at + long > 1.0
+        begin, end = (at - long, at) if at_end else (at, at + long)
+        row = next((k for k, taken in enumerate(rows) if begin >= taken), len(rows))
+        if row == MOST_ROWS:
+            continue
+        rows[row : row + 1] = [end]
+        axis.annotate(
+            label, (start, 1), xycoords=("data", "axes fraction"), xytext=(-4 if at_end else 4, -2 - 11 * row),
+            textcoords="offset points", fontsize=9, color=FAINT, va="top", ha="right" if at_end else "left",
+        )  # fmt: skip
+    low, high = axis.get_ylim()
+    axis.set_ylim(low, high + 0.09 * len(rows) * (high - low))
+
+
+#: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.
+LETTER, MOST_ROWS = 0.012, 5
+
+
+def signed(value: float, error: float | None) -> str:
+    """value ± error, rounded to two digits of the error."""
+    if error is None or isnan(error):
+        return f"{value:+.3g} ({NO_ERROR})"
+    digits = max(0, 1 - floor(log10(error))) if error > 0 else 3
+    return f"{value:+.{digits}f} ± {error:.{digits}f}"
+
+
+NO_ERROR = "too short for an error"

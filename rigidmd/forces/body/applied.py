@@ -1,0 +1,165 @@
+"""External forces on a single body: weight, buoyancy, and those that a scene or a Python function applies."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, kernel
+from rigidmd.core.state import ASK, OK, State
+from rigidmd.forces.terms import Setup, add_forces, power
+from rigidmd.mechanics.time_functions import Course, value
+from rigidmd.mechanics.translation import along
+
+
+class SteadyForce(NamedTuple):
+    """A constant force at a point of the body: weight, buoyancy. Energy -F . (X + Q point)."""
+
+    force: np.ndarray  # (3,) lab
+    point: np.ndarray  # (3,) body, from the centre of mass, or from the pivot of a pinned body
+
+
+class Drive(NamedTuple):
+    """A force at a point of the body and a torque, given functions of time, along the lab's or the body's axes."""
+
+    force: Course
+    torque: Course
+    point: np.ndarray  # (3,) body
+    follows_body: bool  # force and torque are given along the body's axes
+
+    def workspace(self, setup: Setup) -> "Driving":
+        """Room for its present values."""
+        return Driving(*self, np.zeros(3), np.zeros(3))
+
+
+class Driving(NamedTuple):
+    """Workspace of a `Drive`."""
+
+    force: Course
+    torque: Course
+    point: np.ndarray
+    follows_body: bool
+    force_lab: np.ndarray  # (3,) as last evaluated
+    torque_body: np.ndarray  # (3,) as last evaluated, including that of the force
+
+    drives = True
+
+
+class Told(NamedTuple):
+    """Force and torque from a Python function, which the engine holds."""
+
+    def workspace(self, setup: Setup) -> "Asked":
+        """Room for the values."""
+        return Asked(np.zeros(1, np.int64), np.zeros(3), np.zeros(3))
+
+
+class Asked(NamedTuple):
+    """Workspace of a `Told`; it asks for new values whenever positions have changed."""
+
+    fresh: np.ndarray  # (1,) 1 if the values are those of the present moment
+    force_lab: np.ndarray  # (3,)
+    torque_body: np.ndarray  # (3,)
+
+    drives = True
+
+    def answer(self, function: Callable[[float, State], tuple], state: State) -> None:
+        """Call a function of (time, state) for a force (3,) in the lab frame and a torque (3,) in the body frame."""
+        self.force_lab[:], self.torque_body[:] = function(float(state.time[0]), state)
+        self.fresh[0] = 1
+
+
+@implements(add_forces, SteadyForce, inline=True)
+def _add_steady_force(term, state, load, tally):
+    for k in range(len(load.force)):
+        for i in range(3):
+            load.force[k, i] += term.force[i]
+    for k in range(len(load.torque_body)):
+        add_torque(term.point, state.rotation[k], term.force, load.torque_body[k])
+    if tally is not None:
+        tally[0] += steady_energy(term, state.position, state.rotation)
+    return OK
+
+
+@kernel(inline=True)
+def steady_energy(term, position, rotation):
+    """-F . (X + Q point) of the body; position and rotation as in State, empty where the body has none."""
+    energy = 0.0
+    for i in range(3):
+        x = 0.0
+        if len(position):
+            x += position[0, i]
+        if len(rotation):
+            q = rotation[0]
+            x += q[i, 0] * term.point[0] + q[i, 1] * term.point[1] + q[i, 2] * term.point[2]
+        energy -= term.force[i] * x
+    return energy
+
+
+@kernel(outer=True)
+def steady_energies(term, position, rotation):
+    """`steady_energy` at t times, (t,); position and rotation as in State, stacked along a new axis 0."""
+    energy = np.empty(len(position))
+    for t in range(len(energy)):
+        energy[t] = steady_energy(term, position[t], rotation[t])
+    return energy
+
+
+@kernel(inline=True)
+def add_torque(point, rotation, force_lab, torque_body):
+    """Add point x Q^T F to a torque (3,), all in the body frame."""
+    a = along(rotation, force_lab, 0)
+    b = along(rotation, force_lab, 1)
+    c = along(rotation, force_lab, 2)
+    torque_body[0] += point[1] * c - point[2] * b
+    torque_body[1] += point[2] * a - point[0] * c
+    torque_body[2] += point[0] * b - point[1] * a
+
+
+@implements(add_forces, Driving)
+def _add_drive(term, state, load, tally):
+    now = state.time[0]
+    force = (value(term.force, now, 0), value(term.force, now, 1), value(term.force, now, 2))
+    torque = (value(term.torque, now, 0), value(term.torque, now, 1), value(term.torque, now, 2))
+    for k in range(3):
+        term.force_lab[k] = force[k]
+        term.torque_body[k] = torque[k]
+    if len(state.rotation):
+        q = state.rotation[0]
+        for k in range(3):
+            if term.follows_body:
+                term.force_lab[k] = q[k, 0] * force[0] + q[k, 1] * force[1] + q[k, 2] * force[2]
+            else:
+                term.torque_body[k] = along(q, torque, k)
+        add_torque(term.point, q, term.force_lab, term.torque_body)
+    return hand_over(term, load)
+
+
+@implements(add_forces, Asked)
+def _add_told(term, state, load, tally):
+    if term.fresh[0] == 0:
+        return ASK
+    term.fresh[0] = 0
+    return hand_over(term, load)
+
+
+@kernel(inline=True)
+def hand_over(term, load):
+    """Add a term's present force and torque to the load of the body."""
+    for k in range(len(load.force)):
+        for i in range(3):
+            load.force[k, i] += term.force_lab[i]
+    for k in range(len(load.torque_body)):
+        for i in range(3):
+            load.torque_body[k, i] += term.torque_body[i]
+    return OK
+
+
+@implements(power, (Driving, Asked))
+def _drive_power(term, state, velocity, omega):
+    total = 0.0
+    for k in range(3):
+        if len(state.position):
+            total += term.force_lab[k] * velocity[k]
+        if len(state.rotation):
+            total += term.torque_body[k] * omega[k]
+    return total

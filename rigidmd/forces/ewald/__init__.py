@@ -1,0 +1,1 @@
+"""Ewald sums: k-space sums, smooth particle mesh Ewald (PME), corrections, estimated errors."""

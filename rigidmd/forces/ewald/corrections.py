@@ -1,0 +1,101 @@
+"""The corrections of an Ewald sum, beside the sums over pairs and over k; `ewald` has the whole formula."""
+
+from math import pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erf
+
+from rigidmd.compile import implements
+from rigidmd.core.state import OK
+from rigidmd.forces import terms
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, load_from_sites, place_sites
+from rigidmd.forces.neighbors.space import volume_of
+from rigidmd.forces.terms import Setup
+
+
+class Background(NamedTuple):
+    """The uniform background charge that neutralises a charged box."""
+
+    strength: float  # energy times the volume, u Å⁵/ps²
+
+
+def background(square: float, alpha: float) -> Background:
+    """The term for the square of a net charge, in units where q²/r is an energy in u Å²/ps²."""
+    return Background(-pi / (2 * alpha**2) * square)
+
+
+@implements(terms.add_forces, Background)
+def _add_background(term, state, load, tally):
+    if tally is not None:
+        energy = term.strength / volume_of(state.cell)
+        for k in (0, 1, 5, 9):
+            tally[k] += energy
+    return OK
+
+
+class SurfaceDipole(NamedTuple):
+    """Response of the medium around a large sphere of boxes to its dipole: energy 2 pi/((2 eps + 1) V) |sum q r|²."""
+
+    strength: float  # 2 pi/(2 eps + 1)
+    charge: np.ndarray  # (s,)
+    sites: BodySites | CentralSites
+
+    def workspace(self, setup: Setup) -> "SurfaceWorkspace":
+        """Room for positions and forces."""
+        return SurfaceWorkspace(*self, *np.zeros((2, len(self.charge), 3)))
+
+
+class SurfaceWorkspace(NamedTuple):
+    """Workspace of a `SurfaceDipole`."""
+
+    strength: float
+    charge: np.ndarray
+    sites: BodySites | CentralSites
+    position: np.ndarray  # (s, 3)
+    site_force: np.ndarray  # (s, 3) as last evaluated, lab frame, u Å/ps²
+
+
+def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | CentralSites) -> SurfaceDipole:
+    """The term for charges (s,) that sum to 0, in units where q²/r is an energy in u Å²/ps²."""
+    return SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
+
+
+@implements(terms.add_forces, SurfaceWorkspace)
+def _add_surface_dipole(term, state, load, tally):
+    place_sites(term.sites, state, term.position)
+    share = term.strength / volume_of(state.cell)
+    energy = 0.0
+    for k in range(3):
+        dipole = 0.0
+        for i in range(len(term.charge)):
+            dipole += term.charge[i] * term.position[i, k]
+        for i in range(len(term.charge)):
+            term.site_force[i, k] = -2 * share * term.charge[i] * dipole
+        energy += share * dipole * dipole
+    if tally is not None:
+        # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to 1/V
+        for k in (0, 1, 5, 9):
+            tally[k] += energy
+        for i in range(len(term.charge)):
+            for row in range(3):
+                for k in range(3):
+                    m = term.sites.molecule[i]
+                    tally[1 + 3 * row + k] += term.site_force[i, row] * state.position[m, k]
+    load_from_sites(term.sites, state, load, term.site_force)
+    return OK
+
+
+def self_energy(charge: np.ndarray, alpha: float) -> float:
+    """Energy that removes the interaction of each charge with its own screening charge.
+
+    charge (s,) in units where q²/r is an energy in u Å²/ps²
+    """
+    return -alpha / sqrt(pi) * float(charge @ charge)
+
+
+def intramolecular_energy(charge: np.ndarray, position: np.ndarray, alpha: float) -> float:
+    """Energy that removes the pairs inside one molecule from the sum over k, a constant; position (s, 3) in Å."""
+    i, j = np.triu_indices(len(charge), 1)
+    r = np.linalg.norm(position[i] - position[j], axis=1)
+    return -float(np.sum(charge[i] * charge[j] * erf(alpha * r) / r))

@@ -1,0 +1,200 @@
+"""Errors of Ewald sums, estimated before a run, and the settings that keep them within a given accuracy.
+
+An error is the root mean square over sites of the error vector of the force on a site, for molecules with random
+positions and orientations. Its unit is COULOMB, the force between two charges e at a distance of 1 Å, like that of the
+accuracy of LAMMPS' kspace_style.
+"""
+
+from math import exp, pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from rigidmd.forces.ewald.splines import aliases
+
+FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
+PROXY = 32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
+ORDERS = (4, 5, 6, 7, 8)
+SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
+#: Along an edge: an edge of 0.1 mm has not more.
+MOST_POINTS = 2**16
+
+
+#: Distances inside molecules that agree to so many digits (Å) count as the same; with many charges all in a bin do.
+FINE, COARSE, MANY_CHARGES = 6, 0.1, 200
+
+
+class Charges(NamedTuple):
+    """What the errors depend on: the charges, and their arrangement in rigid molecules."""
+
+    count: int  # charged sites
+    square: float  # sum of q², e²
+    pairs: np.ndarray  # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
+
+    def form(self, k: np.ndarray) -> np.ndarray:
+        """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any shape."""
+        found = np.full(np.shape(k), self.square)
+        for product, distance in self.pairs:
+            found += product * np.sinc(k * distance / pi)
+        return found
+
+
+def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
+    """The `Charges` of species, each given as (number of molecules, charges (s,) in e, positions (s, 3) in Å)."""
+    square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
+    for n, charge, position in molecules:
+        count += n * len(charge)
+        square += n * float(charge @ charge)
+        i, j = np.tril_indices(len(charge), -1)
+        product, distance = 2 * n * (charge[i] * charge[j]), np.linalg.norm(position[i] - position[j], axis=1)
+        if len(charge) > MANY_CHARGES:
+            bins = np.rint(distance / COARSE).astype(int)
+            product, distance = np.bincount(bins, product), COARSE * np.arange(bins.max() + 1)
+        products.append(product)
+        distances.append(np.round(distance, FINE))
+    return Charges(count, square, _by_distance(np.concatenate(products), np.concatenate(distances)))
+
+
+def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Sums of products (p,) over pairs of one distance, and these distances (d, 2), in the order in which they come."""
+    _, first, which = np.unique(distances, return_index=True, return_inverse=True)
+    sums = np.zeros(len(first))
+    np.add.at(sums, which, products)
+    order = np.argsort(first)
+    told = [round(distance, FINE) for distance in distances[first[order]].tolist()]
+    return np.array([sums[order], told]).T.copy()
+
+
+def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
+    """Error from the pairs beyond the cut-off (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
+    return 2 * charges.square / sqrt(charges.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
+
+
+def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> float:
+    """alpha (1/Å) at which the pairs beyond the cut-off make this error."""
+    most = real_error(charges, 0.0, cutoff, volume)
+    # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
+    return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
+
+
+def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
+    """Error from the waves beyond k = radius (1/Å): an integral over all of them.
+
+    Like eq. 32 of Kolafa & Perram, but the charges inside a molecule are correlated, and the integral is not expanded
+    for large radius/alpha.
+    """
+    k = np.linspace(radius, radius + 12 * alpha, 600)
+    # k² (4 pi/k² e^(-k²/4 alpha²))² 4 pi k² / (8 pi³)
+    density = 8 * np.exp(-(k**2) / (2 * alpha**2)) * charges.form(k)
+    return sqrt(charges.square / charges.count * np.trapezoid(density, k) / volume)
+
+
+def wave_radius_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
+    """The radius of k (1/Å) at which the waves beyond it make this error."""
+    volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
+    least = np.linalg.norm(reciprocal, axis=1).min()
+    longest = 12 * alpha + least
+
+    def left(radius: float) -> float:
+        return np.log(max(wave_error(charges, alpha, radius, volume), 1e-300) / error)
+
+    radius = least if left(0.0) <= 0 else brentq(left, 0.0, longest)
+    return max(radius, least) * (1 + 1e-9)
+
+
+def radius_of(count: int, volume: float) -> float:
+    """Radius (1/Å) of a sphere in k that holds `count` waves."""
+    return (6 * pi**2 * count / volume) ** (1 / 3)
+
+
+def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
+    """Error of smooth PME with the influence function G of `mesh`, on a grid in a cell (3, 3), rows the edges.
+
+    A wave k of charge gives waves k' of potential, k and its aliases, with factors G U(k) U(k'). The error is the
+    difference of G U² from g for k' = k, and the whole wave for all other k'. They add up in the mean square, with k'²
+    each for the force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106).
+    """
+    grid = np.array(grid)
+    volume = abs(np.linalg.det(cell))
+    points = np.minimum(grid, PROXY)
+    proxy = cell * (points / grid)[:, None]
+    b = 2 * pi * np.linalg.inv(proxy).T
+    metric = b @ b.T
+    of = [aliases(int(n), order) for n in points]
+    of[2] = type(of[2])(*(part[: points[2] // 2 + 1] for part in of[2]))
+    n2, odd, own, every, first, second = (
+        [np.expand_dims(getattr(of[d], name), [e for e in range(3) if e != d]) for d in range(3)]
+        for name in ("n", "odd", "own", "all", "first", "second")
+    )
+    square = weakened = 0.0
+    for d in range(3):
+        o, e = (d + 1) % 3, (d + 2) % 3
+        square = square + metric[d, d] * n2[d] ** 2 + 2 * metric[d, o] * odd[d] * odd[o]
+        weakened = weakened + metric[d, d] * second[d] * every[o] * every[e]
+        weakened = weakened + 2 * metric[d, o] * first[d] * first[o] * every[e]
+    square = square * np.ones_like(weakened)
+    square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # the wave 0 is excluded
+    kept, whole = own[0] * own[1] * own[2], every[0] * every[1] * every[2]
+    g = 4 * pi / square * np.exp(-square / (4 * alpha**2))
+    influence = square * g * kept / (whole * weakened)
+    here = charges.form(np.sqrt(square))
+    wrong = square * (g - influence * kept) ** 2 * here
+    wrong += influence**2 * (kept * here * (weakened - kept * square) + (whole - kept) * weakened * charges.square)
+    wrong[0, 0, 0] = 0.0
+    twice = np.full(wrong.shape[2], 2.0)
+    twice[0] = 1.0
+    if points[2] % 2 == 0:
+        twice[-1] = 1.0
+    left = float((wrong * twice).sum()) / (volume * abs(np.linalg.det(proxy)))
+    beyond = wave_error(charges, alpha, radius_of(int(np.prod(grid)), volume), volume)
+    return float(np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond))  # rounding can be negative
+
+
+def smooth_size(least: float) -> int:
+    """The smallest number of points, at least `least`, without prime factors above 7: fast for FFTs."""
+    n = max(8, int(np.ceil(least - 1e-9)))
+    while True:
+        left = n
+        for factor in (2, 3, 5, 7):
+            while left % factor == 0:
+                left //= factor
+        if left == 1:
+            return n
+        n += 1
+
+
+def mesh_for(
+    charges: Charges,
+    alpha: float,
+    cell: np.ndarray,
+    error: float,
+    order: int | None = None,
+    grid: tuple[int, int, int] | None = None,
+) -> tuple[tuple[int, int, int], int] | None:
+    """The grid and order of splines with the least work for at most this error; None if there are none.
+
+    order, grid : fixed, if given
+    """
+    edges = np.linalg.norm(cell, axis=1)
+    sensible = SPACINGS[edges.max() / SPACINGS <= MOST_POINTS]
+    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
+    best = None
+    for p in ORDERS if order is None else (order,):
+        low, high = 0, len(grids)
+        while low < high:
+            middle = (low + high) // 2
+            if mesh_error(charges, alpha, cell, grids[middle], p) <= error:
+                high = middle
+            else:
+                low = middle + 1
+        if low < len(grids):
+            cost = work_of(charges.count, grids[low], p)
+            if best is None or cost < best[0]:
+                best = (cost, grids[low], p)
+    return best[1:] if best else None
+
+
+def work_of(sites: int, grid: tuple[int, int, int], order: int) -> float:
+    """Approximate time (ns) of the reciprocal part on one core; measured with 12288 sites, grids of 32³ to 48³."""
+    return sites * (20 + 2.4 * order**2) + 8.0 * float(np.prod(grid))

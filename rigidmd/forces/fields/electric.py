@@ -1,0 +1,114 @@
+"""A uniform electric field on molecules, steady or oscillating.
+
+    U = -E . M,  M = sum over molecules (q R + Q mu_body),  E(t) = E0 cos(w t + phase)
+
+with the net charge q of a molecule, its centre of mass R and its dipole mu about that. The force on it is q E, the
+torque mu x E.
+
+R is never wrapped, so a charge that travels through the images of a periodic box keeps gaining the work of the field:
+with a net charge U has no lower bound, but kinetic and potential energy together are conserved. The energy of molecules
+without a net charge does not depend on R.
+
+With an oscillating field they are conserved only together with what the field puts in, dH/dt = dU/dt at rest =
+-(dE/dt) . M. The books take that up at every kick with the kick's share of the step. This is the flow of the momentum
+that belongs to time as a coordinate, so energy less books is conserved as well as any Hamiltonian is by the scheme.
+"""
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a, kernel
+from rigidmd.core.state import NOW, OK
+from rigidmd.forces.terms import add_forces, energy_rate
+from rigidmd.mechanics.translation import along
+
+
+class ElectricField(NamedTuple):
+    """A steady uniform field."""
+
+    species: np.ndarray  # (n,) int32
+    charge: np.ndarray  # (species,) net charge, e; 0 of what is frozen
+    dipole_body: np.ndarray  # (species, 3) about the centre of mass, e Å; 0 of what is frozen
+    field: np.ndarray  # (3,) lab frame, force on a charge e, u Å/ps²
+
+    @property
+    def changes_momentum(self) -> np.ndarray:
+        """Components (3,) of the total momentum that it changes: along it, where the charges do not cancel."""
+        charge = self.charge[self.species]
+        cancels = abs(charge.sum()) <= 1e-10 * np.abs(charge).sum()
+        return np.zeros(3, bool) if cancels else self.field != 0
+
+    @property
+    def tied_to_places(self) -> bool:
+        """Whether its energy depends on where in the lab molecules are: if any has a net charge."""
+        return bool(self.charge[self.species].any())
+
+
+class OscillatingField(NamedTuple):
+    """A uniform field E0 cos(frequency t + phase), t the time of the state."""
+
+    species: np.ndarray
+    charge: np.ndarray
+    dipole_body: np.ndarray
+    field: np.ndarray  # (3,) E0
+    frequency: float  # angular, rad/ps
+    phase: float  # rad
+
+    drives = True
+    changes_momentum = ElectricField.changes_momentum
+    tied_to_places = ElectricField.tied_to_places
+
+
+@implements(add_forces)
+def _add_electric_field(term, state, load, tally):
+    if is_a(term, ElectricField):
+        return lambda term, state, load, tally: _add_field(term, state, load, tally, 1.0)
+    if not is_a(term, OscillatingField):
+        return None
+
+    def add_oscillating_field(term, state, load, tally):
+        return _add_field(term, state, load, tally, cos(term.frequency * state.time[NOW] + term.phase))
+
+    return add_oscillating_field
+
+
+@kernel
+def _add_field(term, state, load, tally, share):
+    """Forces, torques and energy of `share` times the field."""
+    for m in range(len(state.position)):
+        kind = term.species[m]
+        for k in range(3):
+            load.force[m, k] += share * term.charge[kind] * term.field[k]
+    for m in range(len(state.rotation)):
+        mu, q = term.dipole_body[term.species[m]], state.rotation[m]
+        a = share * along(q, term.field, 0)
+        b = share * along(q, term.field, 1)
+        c = share * along(q, term.field, 2)
+        load.torque_body[m, 0] += mu[1] * c - mu[2] * b
+        load.torque_body[m, 1] += mu[2] * a - mu[0] * c
+        load.torque_body[m, 2] += mu[0] * b - mu[1] * a
+    if tally is not None:
+        tally[0] -= share * _along_moment(term, state)
+    return OK
+
+
+@kernel
+def _along_moment(term, state):
+    """E0 . M."""
+    total = 0.0
+    for m in range(len(state.position)):
+        charge = term.charge[term.species[m]]
+        for k in range(3):
+            total += charge * term.field[k] * state.position[m, k]
+    for m in range(len(state.rotation)):
+        mu = term.dipole_body[term.species[m]]
+        for k in range(3):
+            total += mu[k] * along(state.rotation[m], term.field, k)
+    return total
+
+
+@implements(energy_rate, OscillatingField)
+def _rate_of_oscillating_field(term, state):
+    return term.frequency * sin(term.frequency * state.time[NOW] + term.phase) * _along_moment(term, state)

@@ -1,0 +1,152 @@
+"""Two flat walls perpendicular to an axis of the lab, or one of them. They act on sites, at unwrapped positions.
+
+    Lennard-Jones 9-3 : U = epsilon [(2/15) (sigma/d)^9 - (sigma/d)^3], less its value at the cut-off, and 0 beyond it
+    harmonic          : U = stiffness/2 d² behind the wall, 0 before it
+
+with the distance d of a site from the wall. The first is half a space of Lennard-Jones sites, integrated (Steele 1973,
+Surf. Sci. 36, 317; `fix wall/lj93` of LAMMPS has the same form and end), with a well of depth (sqrt(10)/3) epsilon at
+(2/5)^(1/6) sigma. It means nothing on the wall and behind it, and a site there ends the evaluation with BEHIND_WALL.
+The harmonic one is soft; `fix wall/harmonic` of LAMMPS has no factor 1/2.
+"""
+
+from math import isnan
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a, kernel
+from rigidmd.core.state import BEHIND_WALL, NOT_FINITE, OK, State
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, place
+from rigidmd.forces.terms import add_forces
+
+
+class LennardJonesWalls(NamedTuple):
+    """Lennard-Jones 9-3 walls, the same for all sites that they act on."""
+
+    axis: int  # 0, 1, 2 for x, y, z
+    lower: float  # Å; -inf for none
+    upper: float  # Å; inf for none
+    sigma: float  # Å
+    epsilon: float  # u Å²/ps²
+    cutoff: float  # Å; inf for none
+    sites: BodySites | CentralSites
+
+    tied_to_places = True
+
+    @property
+    def changes_momentum(self) -> np.ndarray:
+        """Components (3,) of the total momentum that they change: the one across them."""
+        return np.arange(3) == self.axis
+
+    def behind(self, state: State) -> "Behind | None":
+        """The site that is furthest behind a wall, or on it; None where all are before it."""
+        x = _across(self, state)
+        if not len(x):
+            return None
+        site, depth = max(
+            ((int(x.argmin()), self.lower - x.min()), (int(x.argmax()), x.max() - self.upper)), key=lambda end: end[1]
+        )
+        if depth < 0:
+            return None
+        wall = self.lower if x[site] <= self.lower else self.upper
+        return Behind(int(self.sites.molecule[site]), self.axis, float(x[site]), wall)
+
+
+class HarmonicWalls(NamedTuple):
+    """Harmonic walls, which act on what is behind them only."""
+
+    axis: int
+    lower: float
+    upper: float
+    stiffness: float  # u/ps²
+    sites: BodySites | CentralSites
+
+    changes_momentum = LennardJonesWalls.changes_momentum
+    tied_to_places = True
+
+
+class Behind(NamedTuple):
+    """Where a site is behind a wall."""
+
+    molecule: int
+    axis: int
+    coordinate: float  # of the site, Å
+    wall: float  # Å
+
+    def __str__(self) -> str:
+        axis = "xyz"[self.axis]
+        return f"has a site at {axis} = {self.coordinate:.6g} Å, behind the wall at {axis} = {self.wall:g} Å"
+
+
+def _across(walls: LennardJonesWalls, state: State) -> np.ndarray:
+    """Coordinates (s,) of the sites across the walls, Å."""
+    m = walls.sites.molecule
+    x = state.position[m, walls.axis]
+    if isinstance(walls.sites, CentralSites):
+        return x
+    return x + np.einsum("sj,sj->s", state.rotation[m, walls.axis], walls.sites.offsets())
+
+
+def push_site(sites, state, load, m, i, axis, force):
+    """Add a force along an axis of the lab on site i of molecule m to the molecule's force and torque."""
+    raise TypeError("compiled code only")
+
+
+@implements(push_site, inline=True)
+def _push_site(sites, state, load, m, i, axis, force):
+    if is_a(sites, CentralSites):
+
+        def push_centre(sites, state, load, m, i, axis, force):
+            load.force[m, axis] += force
+
+        return push_centre
+
+    def push_off_centre(sites, state, load, m, i, axis, force):
+        load.force[m, axis] += force
+        offset = sites.offset_body[sites.kind[m] - sites.first[m] + i]
+        row = state.rotation[m, axis]  # the lab's axis along those of the body
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            load.torque_body[m, k] += force * (offset[a] * row[b] - offset[b] * row[a])
+
+    return push_off_centre
+
+
+@implements(add_forces, LennardJonesWalls)
+def _add_lennard_jones_walls(term, state, load, tally):
+    at_cutoff = _nine_three(term.sigma / term.cutoff)[0]
+    for m in range(len(state.position)):
+        for i in range(term.sites.first[m], term.sites.first[m + 1]):
+            x = place(term.sites, state, m, i)[term.axis]
+            for outward, distance in ((1.0, x - term.lower), (-1.0, term.upper - x)):
+                if not distance > 0:
+                    return NOT_FINITE if isnan(distance) else BEHIND_WALL
+                if distance < term.cutoff:
+                    energy, slope = _nine_three(term.sigma / distance)
+                    force = outward * term.epsilon * slope / distance
+                    push_site(term.sites, state, load, m, i, term.axis, force)
+                    if tally is not None:
+                        tally[0] += term.epsilon * (energy - at_cutoff)
+    return OK
+
+
+@kernel(inline=True)
+def _nine_three(s):
+    """(2/15) s^9 - s^3 with s = sigma/d; and -d times its derivative by d."""
+    s3 = s * s * s
+    s9 = s3 * s3 * s3
+    return 2 / 15 * s9 - s3, 6 / 5 * s9 - 3 * s3
+
+
+@implements(add_forces, HarmonicWalls)
+def _add_harmonic_walls(term, state, load, tally):
+    for m in range(len(state.position)):
+        for i in range(term.sites.first[m], term.sites.first[m + 1]):
+            x = place(term.sites, state, m, i)[term.axis]
+            for outward, depth in ((1.0, term.lower - x), (-1.0, x - term.upper)):
+                if depth > 0:
+                    force = outward * term.stiffness * depth
+                    push_site(term.sites, state, load, m, i, term.axis, force)
+                    if tally is not None:
+                        tally[0] += 0.5 * term.stiffness * depth * depth
+    return OK

@@ -1,0 +1,329 @@
+"""Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
+
+A slot is a position in that order. Coordinates are stored relative to the origin of their cluster, so that float32 is
+accurate enough: 2e-7 Å for sites within reach of one another. Arrays of positions and forces hold x, y, z of a cluster
+as three consecutive vectors; slot k of cluster c has its x at `3 * width * c + k`.
+"""
+
+from math import ceil, floor, inf, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
+from rigidmd.compile.simd import bits, item, lane_count, largest, load, root, store, width_of, zeros
+from rigidmd.forces.neighbors.sites import first_of_slot, place, place_ahead
+
+SERIAL_SITES = 128  # up to this number there is one block
+
+
+class Clusters(NamedTuple):
+    """The sites of one law in clusters. The last cluster is padded with copies of the last site."""
+
+    bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
+    slot: np.ndarray  # (s,) int32 the slot of each site
+    boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is moved back into the brick
+    origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
+    local: np.ndarray  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
+    scratch: np.ndarray  # (3 slots,) the memory of the next three, which only a list that is being built needs
+    order: np.ndarray  # (slots,) int32 the site in each slot
+    group: np.ndarray  # (slots,) int32 group of the site in each slot
+    half_square: np.ndarray  # (slots,) half the squares of `reference` as vectors, Å²
+    reference: np.ndarray  # (3 slots,) the places for which the sites were sorted, as `local`
+    moved: np.ndarray  # (slots,) distance of each site from there, Å
+    farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
+    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
+
+
+def clusters_of(sites: int, dtype: type) -> Clusters:
+    """Room for the clusters of this many sites, with positions of a NumPy dtype."""
+    width = lane_count(dtype)
+    count = max(1, ceil(sites / width))
+    # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as the cut-off. So the
+    # number of blocks grows as the edge of the box: memory for the sums is then in proportion to the sites.
+    blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > SERIAL_SITES else 1
+    slots = count * width
+    scratch = zeros(3 * slots, dtype)
+    half_square, order, group = scratch.reshape(3, slots)
+    return Clusters(
+        bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
+        slot=np.zeros(sites, np.int32),
+        boxes=np.zeros((sites, 3), np.int32),
+        origin=zeros(4 * count, np.float64),
+        local=zeros(3 * slots, dtype),
+        scratch=scratch,
+        order=order.view(np.int32)[:slots],
+        group=group.view(np.int32)[:slots],
+        half_square=half_square,
+        reference=zeros(3 * slots, dtype),
+        moved=zeros(slots, dtype),
+        extent=np.zeros((blocks, 6)),
+        farthest=np.zeros(blocks),
+    )
+
+
+def order_of(clusters: Clusters) -> np.ndarray:
+    """`Clusters.order` after the build, when its memory serves something else."""
+    order = np.empty_like(clusters.order)
+    order[clusters.slot] = np.arange(len(clusters.slot))
+    order[len(clusters.slot) :] = order[len(clusters.slot) - 1]
+    return order
+
+
+@kernel(inline=True)
+def _share(sites, blocks, block):
+    """The first molecule of a block, and the first after it."""
+    n = len(sites.first) - 1
+    return n * block // blocks, n * (block + 1) // blocks
+
+
+@kernel(counted=False)
+def wrap_block(clusters, cell, sites, state, lead, farthest, block):
+    """Places in the brick of the sites of a share of the molecules, for `bin_block` into `local`, and their extent.
+
+    The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
+    places are those ahead by a time `lead`, see `place_ahead`. The extent is NaN if a coordinate is farther from the
+    origin than `farthest`, or is not finite.
+    """
+    extent, local = clusters.extent[block], clusters.local
+    for k in range(3):
+        extent[k], extent[3 + k] = inf, -inf
+    first, end = _share(sites, len(clusters.extent), block)
+    for m in range(first, end):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            at = _ahead(sites, state, m, i, lead)
+            if not abs(at[0]) + abs(at[1]) + abs(at[2]) < farthest:
+                extent[0] = nan
+                return
+            _count_boxes(clusters.boxes, cell, i, at)
+            at = _in_brick(clusters.boxes, cell, i, at)
+            for k in range(3):
+                local[3 * i + k] = at[k]
+                extent[k] = min(extent[k], local[3 * i + k])
+                extent[3 + k] = max(extent[3 + k], local[3 * i + k])
+
+
+@kernel(counted=False)
+def bin_block(clusters, sites, block):
+    """Bins of the sites of a share of the molecules, and heights within bins, into `slot` and `moved`.
+
+    Bins form columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that
+    begins in one column and ends in the next is compact too.
+    """
+    low, extent, (nx, ny, nz) = _bins(clusters)
+    local = clusters.local
+    first, end = _share(sites, len(clusters.extent), block)
+    for i in range(sites.first[first], sites.first[end]):
+        height = local[3 * i + 2]
+        x = _bin(local[3 * i] - low[0], extent[0], nx)
+        y = _bin(local[3 * i + 1] - low[1], extent[1], ny)
+        z = _bin(height - low[2], extent[2], nz)
+        column = x * ny + (y if x % 2 == 0 else ny - 1 - y)
+        up = column % 2 == 0
+        clusters.moved[i] = height if up else -height
+        clusters.slot[i] = column * nz + (z if up else nz - 1 - z)
+
+
+@kernel
+def sort_into_clusters(clusters):
+    """Sort sites by bin and height; `settle_block` must follow. False if the extent is not finite."""
+    s = len(clusters.slot)
+    _, extent, (nx, ny, nz) = _bins(clusters)
+    if not extent[0] >= 0:
+        return False
+    order, bin_of, height = clusters.order, clusters.slot, clusters.moved
+    start = np.zeros(nx * ny * nz + 1, np.int64)
+    for i in range(s):
+        start[bin_of[i] + 1] += 1
+    for p in range(1, len(start)):
+        start[p] += start[p - 1]
+    for i in range(s):
+        order[start[bin_of[i]]] = i
+        start[bin_of[i]] += 1
+    # now start[p] is the end of bin p; the sites of a bin are few, and in the order of their indices
+    for a in range(1, s):
+        i = order[a]
+        b = a
+        while b > 0 and bin_of[order[b - 1]] == bin_of[i] and height[order[b - 1]] > height[i]:
+            order[b] = order[b - 1]
+            b -= 1
+        order[b] = i
+    for a in range(s, len(order)):
+        order[a] = order[s - 1]
+    return True
+
+
+@kernel(inline=True)
+def _bins(clusters):
+    """Lowest corner of all sites in the brick, their extents, and the number of bins along each axis.
+
+    The first extent is NaN if there is none.
+    """
+    low, high = (inf, inf, inf), (-inf, -inf, -inf)
+    lost = False
+    for block in range(len(clusters.extent)):
+        of = clusters.extent[block]
+        low = (min(low[0], of[0]), min(low[1], of[1]), min(low[2], of[2]))
+        high = (max(high[0], of[3]), max(high[1], of[4]), max(high[2], of[5]))
+        lost |= of[0] != of[0]
+    x, y, z = nan if lost else high[0] - low[0], high[1] - low[1], high[2] - low[2]
+    s = len(clusters.slot)
+    edge = (x * y * z * width_of(clusters.local) / s) ** (1 / 3)
+    nx = max(1, min(s, round(x / edge))) if edge > 0 else 1
+    ny = max(1, min(s // nx, round(y / edge))) if edge > 0 else 1
+    return low, (x, y, z), (nx, ny, max(1, s // (nx * ny)))
+
+
+@kernel(inline=True)
+def _count_boxes(boxes, cell, i, at):
+    """Number of edges by which a site at (x, y, z) is moved back into the brick."""
+    x, y, z = at
+    c = floor(z / cell[2, 2]) if cell[2, 2] < inf else 0.0
+    if c != 0.0:
+        x, y = x - c * cell[2, 0], y - c * cell[2, 1]
+    b = floor(y / cell[1, 1]) if cell[1, 1] < inf else 0.0
+    if b != 0.0:
+        x -= b * cell[1, 0]
+    a = floor(x / cell[0, 0]) if cell[0, 0] < inf else 0.0
+    boxes[i, 0], boxes[i, 1], boxes[i, 2] = a, b, c
+
+
+@kernel(inline=True)
+def _in_brick(boxes, cell, i, at):
+    """Position of site i, at (x, y, z), after the shift that moved it into the brick when sites were sorted, Å."""
+    x, y, z = at
+    back = boxes[np.uint64(i)]
+    a, b, c = back[0], back[1], back[2]
+    if c != 0:
+        x, y, z = x - c * cell[2, 0], y - c * cell[2, 1], z - c * cell[2, 2]
+    if b != 0:
+        x, y = x - b * cell[1, 0], y - b * cell[1, 1]
+    if a != 0:
+        x -= a * cell[0, 0]
+    return x, y, z
+
+
+@kernel(inline=True)
+def _bin(x, extent, count):
+    return min(count - 1, int(x / extent * count)) if extent > 0 else 0
+
+
+@kernel(counted=False)
+def settle_block(clusters, cell, sites, state, lead, group, block):
+    """Origins and references of newly sorted clusters; the origin is the middle of the bounding box."""
+    width = width_of(clusters.local)
+    order, origin, reference = clusters.order, clusters.origin, clusters.reference
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        base = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
+        low, high = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)  # relative to the first site, so that float32 is accurate
+        for slot in range(width * c, width * (c + 1)):
+            at = _ahead_in_brick(clusters, cell, sites, state, order[slot], lead)
+            x, y, z = at[0] - base[0], at[1] - base[1], at[2] - base[2]
+            low = (min(low[0], x), min(low[1], y), min(low[2], z))
+            high = (max(high[0], x), max(high[1], y), max(high[2], z))
+            n = slot + 2 * width * c
+            reference[n], reference[n + width], reference[n + 2 * width] = x, y, z
+        _pair_up(order, reference, width, width * c, min(width * (c + 1), len(clusters.slot)))
+        for k in range(3):
+            origin[4 * c + k] = base[k] + 0.5 * (low[k] + high[k])
+        for slot in range(width * c, width * (c + 1)):
+            i = order[slot]
+            if slot < len(clusters.slot):
+                clusters.slot[i] = slot
+            clusters.group[slot] = group[i]
+            clusters.half_square[slot] = 0.0
+            for k in range(3):
+                n = slot + 2 * width * c + k * width
+                reference[n] -= 0.5 * (low[k] + high[k])
+                clusters.half_square[slot] += 0.5 * reference[n] ** 2
+
+
+@kernel(inline=True)
+def _ahead_in_brick(clusters, cell, sites, state, i, lead):
+    """The place of site i for which sites are sorted, in the brick, Å."""
+    return _in_brick(clusters.boxes, cell, i, _ahead(sites, state, sites.molecule[i], i, lead))
+
+
+@kernel(inline=True)
+def _ahead(sites, state, m, i, lead):
+    """`place_ahead`, or the present place, for which no velocity has to be a number."""
+    return place_ahead(sites, state, m, i, lead) if lead != 0.0 else place(sites, state, m, i)
+
+
+@kernel(inline=True)
+def _pair_up(order, at, width, first, end):
+    """Reorder slots first ... end - 1 of a cluster so that the two sites of each row are near one another.
+
+    `at` has their positions and is reordered with them.
+    """
+    vectors = 2 * (first // width) * width
+    for a in range(first, end - 2, 2):
+        nearest, nearest2 = a + 1, inf
+        for b in range(a + 1, end):
+            d2 = 0.0
+            for n in range(vectors, vectors + 3 * width, width):
+                d2 += (at[n + a] - at[n + b]) ** 2
+            if d2 < nearest2:
+                nearest, nearest2 = b, d2
+        order[a + 1], order[nearest] = order[nearest], order[a + 1]
+        for n in range(vectors, vectors + 3 * width, width):
+            at[n + a + 1], at[n + nearest] = at[n + nearest], at[n + a + 1]
+
+
+@kernel(counted=False)
+def settle_again(clusters):
+    """Distances as `settle_block` left them, from order, origin and reference."""
+    width = width_of(clusters.local)
+    for slot in range(len(clusters.order)):
+        clusters.half_square[slot] = 0.0
+        for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
+            clusters.half_square[slot] += 0.5 * clusters.reference[n] ** 2
+
+
+@kernel(counted=False)
+def place_block(clusters, cell, sites, state, block):
+    """Set `local` of the sites of a share of the molecules to the present positions of the molecules.
+
+    The slots without a site stay at their references.
+    """
+    width = width_of(clusters.local)
+    local, origin = clusters.local, clusters.origin
+    first, end = _share(sites, len(clusters.extent), block)
+    for m in range(first, end):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            x, y, z = _in_brick(clusters.boxes, cell, i, place(sites, state, m, i))
+            slot = item(clusters.slot, i)
+            at, c = first_of_slot(slot, width), 4 * (np.uint32(slot) // np.uint32(width))
+            local[np.uint64(at)] = x - item(origin, c)
+            local[np.uint64(at + width)] = y - item(origin, c + 1)
+            local[np.uint64(at + 2 * width)] = z - item(origin, c + 2)
+    if block == len(clusters.extent) - 1:
+        for slot in range(len(clusters.slot), len(clusters.order)):
+            at = first_of_slot(slot, width)
+            for n in range(at, at + 3 * width, width):
+                local[n] = clusters.reference[n]
+
+
+@kernel(counted=False)
+def hold(clusters):
+    """Let the present positions be the references. A skin may be smaller than the rounding between the two."""
+    for n in range(len(clusters.local)):
+        clusters.reference[n] = clusters.local[n]
+
+
+@kernel(inline=True, counted=False)
+def follow_block(clusters, limit, block):
+    """Displacements of the sites of a block: `moved`, and `farthest`, infinite if one exceeds the limit."""
+    width = width_of(clusters.local)
+    local, reference = clusters.local, clusters.reference
+    full = (1 << width) - 1
+    worst = 0.0
+    for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
+        at = 3 * width * c
+        dx = load(local, at) - load(reference, at)
+        dy = load(local, at + width) - load(reference, at + width)
+        dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
+        moved = root(dx * dx + dy * dy + dz * dz)
+        store(clusters.moved, width * c, moved)
+        worst = max(worst, largest(moved)) if bits(moved <= limit) == full else inf
+    clusters.farthest[block] = worst

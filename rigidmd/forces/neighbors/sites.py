@@ -1,0 +1,349 @@
+"""Sites of one law: their positions for a state of the bodies, and the forces and torques on the bodies from theirs.
+
+Each law has its own list of sites: those that take part in it. Sites of one molecule are consecutive.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import types
+
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
+from rigidmd.compile.simd import item, lane_count, width_of
+from rigidmd.core.state import EXAMPLE
+
+# Up to this number, loops over molecules stay on one thread: they take a few microseconds.
+SERIAL = 128
+SHARE = 4096  # molecules of a block, where there are more blocks than the fewest
+
+
+@kernel(outer=True)
+def blocks_of(molecules):
+    """Number of blocks in which molecules are moved: one, on this thread, where there are few."""
+    return max(BLOCKS, min(MOST_BLOCKS, molecules // SHARE)) if molecules > SERIAL else 1
+
+
+@kernel(inline=True)
+def share_of(molecules, block, together):
+    """The first molecule of a block, and the first that is no more in it: whole groups of so many, but for the last."""
+    blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
+    return together * (groups * block // blocks), min(molecules, together * (groups * (block + 1) // blocks))
+
+
+@kernel(inline=True)
+def _molecules_of(state, block):
+    n, blocks = len(state.position), blocks_of(len(state.position))
+    return range(n * block // blocks, n * (block + 1) // blocks)
+
+
+class BodySites(NamedTuple):
+    """Sites fixed in bodies."""
+
+    first: np.ndarray  # (n + 1,) int32 molecule m has sites first[m] ... first[m + 1] - 1
+    molecule: np.ndarray  # (s,) int32 molecule of each site
+    kind: np.ndarray  # (n,) int32 molecule m has offsets offset_body[kind[m]], offset_body[kind[m] + 1], ...
+    offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
+    inverse_inertia: np.ndarray  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 where the moment is 0
+
+    def offsets(self) -> np.ndarray:
+        """Offsets (s, 3) of all sites, body frame, Å."""
+        return self.offset_body[(self.kind - self.first[:-1])[self.molecule] + np.arange(len(self.molecule))]
+
+
+class CentralSites(NamedTuple):
+    """Sites at their molecules' centres of mass: they have no offsets and exert no torque."""
+
+    first: np.ndarray
+    molecule: np.ndarray
+
+    def offsets(self) -> np.ndarray:
+        """Offsets (s, 3) of all sites, which are 0."""
+        return np.zeros((len(self.molecule), 3))
+
+
+def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np.ndarray) -> BodySites | CentralSites:
+    """The sites of molecules whose species (n,) are given, with offsets[k] (own, 3) in species k, body frame, Å.
+
+    inverse_inertia : (species, 3) as in `Model`
+    """
+    counts = np.array([len(own) for own in offsets])
+    first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
+    molecule = np.repeat(np.arange(len(species), dtype=np.int32), counts[species])
+    if np.array_equal(molecule, first[:-1]):
+        molecule = first[:-1]  # a site of each: one array will do
+    offset = np.concatenate(offsets)
+    if not offset.any():
+        return CentralSites(first, molecule)
+    kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
+    if np.array_equal(kind, species):
+        kind = species.astype(np.int32, copy=False)  # as of one species
+    return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
+
+
+def groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
+    """Group of each site (s,); sites of one group do not interact. A molecule is one; all frozen molecules are one.
+
+    frozen (n,) : whether each molecule is
+    """
+    if not frozen.any():
+        return sites.molecule
+    return np.where(frozen[sites.molecule], len(frozen), sites.molecule).astype(np.int32)
+
+
+class InSlots(NamedTuple):
+    """Vectors (x, y, z) of sites in the order of the slots of `clusters`."""
+
+    value: np.ndarray  # (3 slots,) x, y, z of a cluster as three consecutive vectors
+    slot: np.ndarray  # (s,) slot of each site
+
+    def of_sites(self) -> np.ndarray:
+        """The vectors (s, 3) in the order of the sites, float64."""
+        width = lane_count(self.value.dtype)
+        at = self.slot + 2 * width * (self.slot // width)
+        return np.stack([self.value[at + k * width] for k in range(3)], axis=1).astype(np.float64)
+
+
+@kernel(inline=True)
+def first_of_slot(slot, width):
+    """Where arrays of x, y, z in slots have the x of a slot; `width` is a power of two."""
+    return 3 * slot - 2 * (slot & (width - 1))
+
+
+def of_site(vectors, i):
+    """(x, y, z) of site i in an array (s, 3) or `InSlots`."""
+    raise TypeError("compiled code only")
+
+
+@implements(of_site, inline=True)
+def _of_site(vectors, i):
+    if isinstance(vectors, types.Array):
+        return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
+
+    def from_slot(vectors, i):
+        width = width_of(vectors.value)
+        at = first_of_slot(item(vectors.slot, i), width)
+        return item(vectors.value, at), item(vectors.value, at + width), item(vectors.value, at + 2 * width)
+
+    return from_slot
+
+
+def place(sites, state, m, i):
+    """Position (x, y, z) of site i of molecule m, lab frame, Å."""
+    raise TypeError("compiled code only")
+
+
+@implements(place, inline=True)
+def _place(sites, state, m, i):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
+
+    def place(sites, state, m, i):
+        x, y, z = turned(sites, state, m, i)
+        centre = state.position[np.uint64(m)]
+        return centre[0] + x, centre[1] + y, centre[2] + z
+
+    return place
+
+
+def place_ahead(sites, state, m, i, lead):
+    """Where site i of molecule m will be after a time `lead` if nothing acts and it keeps its angular velocity, Å."""
+    raise TypeError("compiled code only")
+
+
+@implements(place_ahead, inline=True)
+def _place_ahead(sites, state, m, i, lead):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, m, i, lead: (
+            state.position[m, 0] + lead * state.velocity[m, 0],
+            state.position[m, 1] + lead * state.velocity[m, 1],
+            state.position[m, 2] + lead * state.velocity[m, 2],
+        )
+
+    def place_ahead(sites, state, m, i, lead):
+        q, centre, velocity, momentum = (
+            state.rotation[m], state.position[m], state.velocity[m], state.angular_momentum_body[m]
+        )  # fmt: skip
+        row = sites.kind[m] - sites.first[m] + i
+        offset, inverse = sites.offset_body[row], sites.inverse_inertia[row]
+        # Cayley's rotation: by 2 atan(|a|) about a = lead omega / 2; distances within a molecule stay what they are
+        a, b, c = (
+            0.5 * lead * inverse[0] * momentum[0],
+            0.5 * lead * inverse[1] * momentum[1],
+            0.5 * lead * inverse[2] * momentum[2],
+        )
+        x, y, z = offset[0], offset[1], offset[2]
+        share = 2 / (1 + a * a + b * b + c * c)
+        u, v, w = share * (b * z - c * y), share * (c * x - a * z), share * (a * y - b * x)
+        x, y, z = x + u + (b * w - c * v), y + v + (c * u - a * w), z + w + (a * v - b * u)
+        return (
+            centre[0] + lead * velocity[0] + q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
+            centre[1] + lead * velocity[1] + q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
+            centre[2] + lead * velocity[2] + q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
+        )
+
+    return place_ahead
+
+
+@kernel(inline=True)
+def turned(sites, state, m, i):
+    """Vector (x, y, z) from the centre of mass of molecule m to its site i, lab frame, Å."""
+    m = np.uint64(m)
+    q = state.rotation[m]
+    offset = sites.offset_body[np.uint64(sites.kind[m] - sites.first[m] + i)]
+    x, y, z = offset[0], offset[1], offset[2]
+    return (
+        q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
+        q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
+        q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
+    )
+
+
+def load_molecule(sites, state, load, m, site_force):
+    """Add the sum of molecule m's site forces, and their torque about the centre of mass, to its load."""
+    raise TypeError("compiled code only")
+
+
+@implements(load_molecule, inline=True)
+def _load_molecule(sites, state, load, m, site_force):
+    if is_a(sites, CentralSites):
+
+        def load_central(sites, state, load, m, site_force):
+            for i in range(sites.first[m], sites.first[m + 1]):
+                fx, fy, fz = of_site(site_force, i)
+                load.force[m, 0] += fx
+                load.force[m, 1] += fy
+                load.force[m, 2] += fz
+
+        return load_central
+
+    def load_body(sites, state, load, m, site_force):
+        m = np.uint64(m)  # an index without a sign is not tested for being negative
+        q, force, torque = state.rotation[m], load.force[m], load.torque_body[m]
+        begin = sites.kind[m] - sites.first[m]
+        sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = 0.0  # kept in registers until the last site
+        for i in range(sites.first[m], sites.first[np.uint64(m + 1)]):
+            fx, fy, fz = of_site(site_force, i)
+            sum_x, sum_y, sum_z = sum_x + fx, sum_y + fy, sum_z + fz
+            # n_body = d x (Q^T f), with the site's offset d in the body frame
+            bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
+            by = q[0, 1] * fx + q[1, 1] * fy + q[2, 1] * fz
+            bz = q[0, 2] * fx + q[1, 2] * fy + q[2, 2] * fz
+            offset = sites.offset_body[np.uint64(begin + i)]
+            x, y, z = offset[0], offset[1], offset[2]
+            turn_x += y * bz - z * by
+            turn_y += z * bx - x * bz
+            turn_z += x * by - y * bx
+        force[0] += sum_x
+        force[1] += sum_y
+        force[2] += sum_z
+        torque[0] += turn_x
+        torque[1] += turn_y
+        torque[2] += turn_z
+
+    return load_body
+
+
+@kernel(inline=True)
+def place_molecule(sites, state, m, site_position):
+    """Write the positions of molecule m's sites into site_position (s, 3), lab frame."""
+    for i in range(sites.first[m], sites.first[m + 1]):
+        site_position[i, 0], site_position[i, 1], site_position[i, 2] = place(sites, state, m, i)
+
+
+@kernel(outer=True)
+def place_sites(sites, state, site_position):
+    """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
+    for m in range(len(state.position)):
+        place_molecule(sites, state, m, site_position)
+
+
+@kernel
+def load_from_sites(sites, state, load, site_force):
+    """Add site forces, an array (s, 3) or `InSlots`, to the bodies' forces and torques."""
+    for m in range(len(state.position)):
+        load_molecule(sites, state, load, m, site_force)
+
+
+@task()
+def place_some(parcel, block):
+    """`place_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    sites, state, site_position = opened(parcel)
+    for m in _molecules_of(state, block):
+        place_molecule(sites, state, m, site_position)
+
+
+@task()
+def load_some(parcel, block):
+    """`load_from_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    sites, state, load, site_force = opened(parcel)
+    for m in _molecules_of(state, block):
+        load_molecule(sites, state, load, m, site_force)
+
+
+@task()
+def count_some(parcel, block):
+    """Sums of f (x) (x_site - X_molecule) over the molecules of a block (`blocks_of`), into a row (9,) of `virial`."""
+    sites, state, site_force, virial = opened(parcel)
+    own = virial[block]
+    own[:] = 0.0
+    for m in _molecules_of(state, block):
+        _count_offsets(sites, state, m, site_force, own)
+
+
+def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray, virial: np.ndarray) -> dict:
+    """The tasks "place", "load" and "count" for positions and forces (s, 3), see `Code`."""
+    state, load = EXAMPLE
+    return {
+        "place": (place_some, (sites, state, position)),
+        "load": (load_some, (sites, state, load, force)),
+        "count": (count_some, (sites, state, force, virial)),
+    }
+
+
+def room_for_virial() -> np.ndarray:
+    """Room for the sums of `count_some`: 9 of each block, which has two lines of cache to itself."""
+    return np.zeros((MOST_BLOCKS, 16))
+
+
+def virial_of_molecules(sites, code, state, site_force, virial, tally):
+    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule).
+
+    code : has `count_some` as "count"; virial : of `room_for_virial`
+    """
+    raise TypeError("compiled code only")
+
+
+@implements(virial_of_molecules)
+def _virial_of_molecules(sites, code, state, site_force, virial, tally):
+    if is_a(sites, CentralSites):
+        return lambda sites, code, state, site_force, virial, tally: None
+
+    def virial_of_molecules(sites, code, state, site_force, virial, tally):
+        blocks = blocks_of(len(state.position))
+        call_blocks(code, "count", packed((sites, state, site_force, virial)), blocks)
+        for block in range(blocks):
+            for k in range(9):
+                tally[1 + k] -= virial[block, k]
+
+    return virial_of_molecules
+
+
+def _count_offsets(sites, state, m, site_force, virial):
+    """Add f (x) (x_site - X_molecule) of a molecule's sites to nine numbers."""
+    raise TypeError("compiled code only")
+
+
+@implements(_count_offsets, inline=True)
+def _count_offsets_of(sites, state, m, site_force, virial):
+    if is_a(sites, CentralSites):
+        return lambda sites, state, m, site_force, virial: None
+
+    def count_offsets(sites, state, m, site_force, virial):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            offset = turned(sites, state, m, i)
+            force = of_site(site_force, i)
+            for row in range(3):
+                for k in range(3):
+                    virial[3 * row + k] += force[row] * offset[k]
+
+    return count_offsets

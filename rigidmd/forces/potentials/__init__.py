@@ -1,0 +1,1 @@
+"""Pair potentials, one file each, and their truncation at the cutoff."""

@@ -1,0 +1,104 @@
+"""What viewers draw as bonds: those of molecules, and the edges of a single body between its points."""
+
+from itertools import combinations
+
+import numpy as np
+
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.system import System
+from rigidmd.scene.models import Molecule
+
+#: Normals of two sides of a hull that differ by less belong to one flat side; thickness, as a share of the size, below
+#: which points lie in a plane or on a line.
+FLAT, THIN = 1e-6, 1e-9
+
+
+def connections(system: System | BodySystem, massless: bool = False) -> np.ndarray:
+    """Pairs (b, 2) of sites that are joined; of molecules also massless sites to their nearest atoms if asked for, so
+    that each molecule is in one piece."""
+    return _edges_of_body(system) if isinstance(system, BodySystem) else _bonds_of_molecules(system, massless)
+
+
+def charges(system: System | BodySystem) -> np.ndarray:
+    """Charges (s,) of all sites, e; of a single body zero."""
+    if isinstance(system, BodySystem):
+        return np.zeros(len(system.points))
+    return np.concatenate([system.species[kind].charges for kind in system.model.species])
+
+
+def _bonds_of_molecules(system: System, massless: bool) -> np.ndarray:
+    starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
+    links = [
+        np.array([b for b in bonds(m) if massless or m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species
+    ]
+    return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
+
+
+def _edges_of_body(system: BodySystem) -> np.ndarray:
+    """Edges of the hull of a solid, or the shortest links between points; a pinned body hangs on the pivot."""
+    first = 0 if system.flies else 1  # the pivot is the first point
+    own = system.points[first:]
+    found = _shortest(own) if system.scene.body.points is not None else _hull(own)
+    pairs = found + first
+    if first and len(own):
+        nearest = int(np.linalg.norm(own - system.centre, axis=1).argmin())
+        pairs = np.vstack([[0, first + nearest], pairs]) if len(pairs) else np.array([[0, first + nearest]])
+    return pairs.reshape(-1, 2).astype(int)
+
+
+def _shortest(points: np.ndarray) -> np.ndarray:
+    """The shortest links that connect points."""
+    from scipy.sparse.csgraph import minimum_spanning_tree
+    from scipy.spatial.distance import cdist
+
+    tree = minimum_spanning_tree(cdist(points, points)).tocoo()
+    return np.stack([tree.row, tree.col], axis=-1)
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """Edges of the convex hull of points, in space, in a plane or on a line; the points inside are joined to none."""
+    from scipy.spatial import ConvexHull
+
+    if len(points) < 2:
+        return np.zeros((0, 2), int)
+    _, spread, axes = np.linalg.svd(points - points.mean(axis=0))
+    dimensions = int((spread > THIN * spread[0]).sum())
+    flat = (points - points.mean(axis=0)) @ axes[:dimensions].T
+    if dimensions == 1:
+        order = flat[:, 0].argsort()
+        return np.stack([order[:-1], order[1:]], axis=-1)
+    hull = ConvexHull(flat)
+    if dimensions == 2:
+        return hull.simplices
+    normals: dict[tuple[int, int], list[np.ndarray]] = {}
+    for corners, equation in zip(hull.simplices, hull.equations, strict=True):
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            pair = tuple(sorted((int(corners[i]), int(corners[j]))))
+            normals.setdefault(pair, []).append(equation[:3])  # pyright: ignore[reportArgumentType]
+    # the diagonals of a flat side are no edges
+    return np.array([pair for pair, (one, other) in normals.items() if np.abs(one - other).max() > FLAT])
+
+
+#: Covalent radii, Å (Cordero et al. 2008, Dalton Trans. 2832), of the elements in rigid models.
+COVALENT = {"H": 0.31, "C": 0.76, "N": 0.71, "O": 0.66, "F": 0.57, "S": 1.05, "Cl": 1.02}
+#: Factor on the sum of covalent radii up to which two atoms are bonded.
+SLACK = 1.25
+
+
+def bonds(m: Molecule) -> list[tuple[int, int]]:
+    """Links between sites, heavier site first: atoms within bonding distance, the shortest links that connect separate
+    parts, and each massless site to its nearest atom."""
+    atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
+    part = {i: i for i in atoms}
+    found = []
+    for i, j in sorted(combinations(atoms, 2), key=lambda pair: round(_distance(m, *pair), 9)):
+        reach = SLACK * sum(COVALENT.get(m.elements[s], 0.0) for s in (i, j))
+        if _distance(m, i, j) <= reach or part[i] != part[j]:
+            found.append((i, j) if m.masses[i] >= m.masses[j] else (j, i))
+            part = {s: part[i] if p == part[j] else p for s, p in part.items()}
+    massless: list[int] = np.flatnonzero(m.masses == 0).tolist()
+    return sorted(found) + [(min(atoms, key=lambda i, s=s: round(_distance(m, i, s), 9)), s) for s in massless]
+
+
+def _distance(m: Molecule, i: int, j: int) -> float:
+    return float(np.linalg.norm(m.positions_body[i] - m.positions_body[j]))

@@ -1,0 +1,1 @@
+"""One module per file format, or per library that reads several."""

@@ -1,0 +1,325 @@
+"""LAMMPS' data files and text dumps: atoms have types, which labels, masses or the scene name."""
+
+import re
+from collections.abc import Callable, Iterable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.toml import whole_number
+from rigidmd.engines.lammps.dump import box_in_bounds
+from rigidmd.errors import StructureError
+from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
+from rigidmd.io.formats.text import numbers, promised_atoms, table
+from rigidmd.io.formats.through_ase import ASE_VELOCITY
+
+#: Columns of the section Atoms by atom style; three image numbers may follow. Numbers that are not used are a, b, c.
+STYLES = {
+    style: columns.split()
+    for columns, styles in {
+        "id type x y z": "atomic",
+        "id type q x y z": "charge dpd peri",
+        "id mol type x y z": "molecular angle bond",
+        "id mol type q x y z": "full",
+        "id type a b x y z": "sphere ellipsoid body",
+        "id type q a b x y z": "electron",
+        "id type q x y z a b c": "dipole",
+        "id mol type a b x y z": "line tri",
+        "id type mol a b x y z": "template",
+    }.items()
+    for style in styles.split()
+}
+#: Styles by which a section Atoms without a style is read, where only one of them fits.
+GUESSED = ("atomic", "charge", "molecular", "full")
+#: Names of columns in a comment after Atoms.
+COLUMN = {"atom-id": "id", "mol-id": "mol", "molecule-id": "mol", "molecule": "mol", "atom-type": "type", "charge": "q"}
+UNITS = re.compile(r"units\s*=?\s*(real|metal|si|cgs|electron)\b")
+#: Coordinates in a dump: as they are, unwrapped, and both in units of the edges.
+COORDINATES = (("x", "y", "z"), ("xs", "ys", "zs"), ("xu", "yu", "zu"), ("xsu", "ysu", "zsu"))
+
+
+class Row(NamedTuple):
+    """A line of a section."""
+
+    line: int
+    words: list[str]
+    comment: str
+
+
+def read_data(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
+    """The structure of a data file. The first line may name the units; real and metal differ only in velocities."""
+    head, styles, sections = _sections(lines)
+    found = [row for row in head if row.words[1:] == ["atoms"]]
+    if not found:
+        raise StructureError(str(path), ["has no line with the number of atoms before its sections, such as '3 atoms'"])
+    rows = sections.get("Atoms", [])
+    count = promised_atoms(path, found[0].line, found[0].words[0], len(rows))
+    if count != len(rows):
+        told = f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}"
+        raise StructureError(str(path), [told])
+    return [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)] if rows else []
+
+
+def _sections(lines: list[str]) -> tuple[list[Row], dict[str, str], dict[str, list[Row]]]:
+    """The rows before the first section, and the comment after the name and the rows of each section."""
+    rows = head = []
+    styles, sections = {}, {}
+    for number, line in enumerate(lines[1:], 2):
+        data, _, comment = line.partition("#")
+        words = data.split()
+        if words and all(re.fullmatch(r"[A-Z][A-Za-z]*\d*[A-Za-z]*", word) for word in words):
+            section = " ".join(words)
+            styles[section], rows = comment.strip(), sections.setdefault(section, [])
+        elif words:
+            rows.append(Row(number, words, comment.strip()))
+    return head, styles, sections
+
+
+def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, list[Row]], atom_types) -> Atoms:
+    """The atoms in order of their numbers. style: the comment after Atoms"""
+    rows = sections["Atoms"]
+    labels = {row.words[0]: row.words[1] for row in sections.get("Atom Type Labels", []) if len(row.words) == 2}
+    number_of = {label: number for number, label in labels.items()}
+    names, mass_of = dict(labels), {}
+    for row in sections.get("Masses", []):
+        kind = number_of.get(row.words[0], row.words[0])
+        [mass_of[kind]] = numbers(path, row.line, row.words[1:2] or [""], "a type and its mass")
+        if kind not in names and len(row.comment.split()) == 1:
+            names[kind] = row.comment
+    declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
+    numbered = range(1, 1 + min(whole_number(declared) or 0, len(rows)))
+    known = {*mass_of, *labels, *number_of, *map(str, numbered)}
+    column = _columns(path, style, rows, known)
+    width, whole = len(column), [column[name] for name in ("id", "mol") if name in column]
+    for line, words, _ in rows:
+        if len(words) < width or any(whole_number(words[k]) is None for k in whole):
+            told = f"line {line}: expected an atom ({' '.join(column)}), found {' '.join(words)[:60]!r}"
+            raise StructureError(str(path), [told])
+    rows = sorted(rows, key=lambda row: whole_number(row.words[column["id"]]) or 0)
+    cell = _box(path, head)
+    position = table(path, [(r.line, r.words[column["x"] : column["x"] + 3]) for r in rows], "three coordinates")
+    images = [row.words[width : width + 3] for row in rows]
+    if cell is not None and all(len(of) == 3 for of in images):
+        position += table(path, [(r.line, of) for r, of in zip(rows, images, strict=True)], "three images") @ cell
+    types = [number_of.get(word := row.words[column["type"]], word) for row in rows]
+    masses = None
+    if mass_of:
+        if lacking := sorted({kind for kind in types if kind not in mass_of}):
+            raise StructureError(str(path), [f"its section Masses has no mass of type {', '.join(lacking)}"])
+        masses = np.array([mass_of[kind] for kind in types])
+    elif atom_types is None and all(whole_number(kind) is not None and kind not in names for kind in types):
+        fault = "has no section Masses, from which its atom types could be told: name them by structure.atom_types"
+        raise StructureError(str(path), [fault])
+    elements = [element_of_mass(mass) for mass in mass_of.values()]
+    element = dict(zip(mass_of, elements, strict=True))
+    found = Atoms(
+        _names(path, types, [*mass_of], names, atom_types),
+        [element.get(kind, "") for kind in types],
+        _residues([row.words[column["mol"]] for row in rows] if "mol" in column else []) or [()] * len(rows),
+        position,
+        None,
+        cell,
+        masses,
+        [],
+    )
+    moving = {row.words[0]: (row.line, row.words[1:4]) for row in sections.get("Velocities", [])}
+    velocity = None
+    if moving:
+        none = (0, ["nan"] * 3)
+        given = [moving.get(row.words[column["id"]], none) for row in rows]
+        velocity = table(path, given, "an atom and its three velocities")
+    return _in_our_units(found, velocity, title, "its first line does not say its units ('units = real')")
+
+
+def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[str, int]:
+    """The column of what each atom has: by the style or the names of columns after Atoms, else as the only one that
+    fits. Raises StructureError."""
+    words = [COLUMN.get(word, word) for word in re.split(r"[\s,]+", style.lower())]
+    width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"]
+    if words[0] == "hybrid":
+        columns = list(dict.fromkeys([*basic, *(name for part in words[1:] for name in STYLES.get(part, ()))]))
+    elif words[0] in STYLES:
+        columns = STYLES[words[0]]
+    elif set(basic) <= set(words):
+        columns = words
+    else:
+        fitting = [STYLES[name] for name in GUESSED if _fits(STYLES[name], rows, known)]
+        if len(fitting) != 1:
+            raise StructureError(
+                str(path),
+                [
+                    f"line {line}: what the {width} columns of its atoms are is open: write the atom style after the "
+                    f"name of the section, such as 'Atoms # molecular' (known are {', '.join(STYLES)}, hybrid)"
+                ],
+            )
+        [columns] = fitting
+    if width - len(columns) not in (0, 3):
+        told = (
+            f"line {line}: an atom of style {style!r} has {len(columns)} columns ({' '.join(columns)}), found {width}"
+        )
+        raise StructureError(str(path), [told])
+    return {name: columns.index(name) for name in columns}
+
+
+def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
+    """Whether all rows may have these columns, perhaps with three image numbers after them."""
+    kind, whole = columns.index("type"), [k for k, name in enumerate(columns) if name in ("id", "mol")]
+    for row in rows:
+        words, images = row.words, [word.lstrip("+-") for word in row.words[len(columns) :]]
+        if len(words) < len(columns) or len(images) not in (0, 3):
+            return False
+        if any(whole_number(word) is None for word in (*images, *(words[k] for k in whole))):
+            return False
+        if words[kind] not in known and not words[kind][0].isalpha():
+            return False
+    return True
+
+
+def _box(path: Path, head: list[Row]) -> np.ndarray | None:
+    """The cell (3, 3); None without one."""
+    by_name = {" ".join(words[k:]): (row.line, words[:k]) for row in head for words in [row.words] for k in (2, 3, 4)}
+    if "avec" in by_name:
+        return table(
+            path, [by_name.get(name, (1, [])) for name in ("avec", "bvec", "cvec")], "three components of an edge"
+        )
+    lines = [f"{x}lo {x}hi" for x in "xyz"]
+    if lacking := [line for line in lines if line not in by_name]:
+        if any(word.endswith(("lo", "hi")) for row in head for word in row.words):
+            told = f"the bounds of its box are incomplete: before the sections there is no line 'LOW HIGH {lacking[0]}'"
+            raise StructureError(str(path), [told])
+        return None
+    low, high = table(path, [by_name[line] for line in lines], "two bounds of the box").T
+    cell = np.diag(high - low)
+    if "xy xz yz" in by_name:
+        cell[1, 0], cell[2, 0], cell[2, 1] = numbers(path, *by_name["xy xz yz"], "three tilts of the box")
+    return cell
+
+
+def _names(path: Path, types: list[str], listed: list[str], names: dict[str, str], atom_types) -> list[str]:
+    """The name of each atom: as the scene names its type, else the file, else the type. Raises StructureError."""
+    if atom_types is None:
+        return [names.get(kind, kind) for kind in types]
+    present = sorted({*types, *listed}, key=lambda kind: (whole_number(kind) or 0, kind))
+    asked = {kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None) for kind in present}
+    faults = []
+    if unknown := [key for key in atom_types if key not in asked.values()]:
+        faults.append(f"structure.atom_types: there is no type {', '.join(unknown)}; there are {', '.join(present)}")
+    if unnamed := [kind for kind, key in asked.items() if key is None]:
+        faults.append(f"structure.atom_types does not say what type {', '.join(unnamed)} is")
+    if faults:
+        raise StructureError(str(path), faults)
+    return [atom_types[asked[kind]] for kind in types]
+
+
+def _residues(numbers_of: Iterable[str]) -> list[tuple]:
+    """Residues of molecule numbers; none where all are 0, which stands for none."""
+    found = [whole_number(number) for number in numbers_of]
+    return [(number, "") for number in found] if any(found) else []
+
+
+def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
+    """Atoms in Å, ps and u. Where the title names no units, lengths are in Å, and velocities are not used."""
+    from ase.calculators.lammps import convert
+
+    if (units := UNITS.search(title)) is None:
+        more = [] if velocity is None else [f"{unknown}: its velocities are not used"]
+        return found._replace(notes=[*found.notes, *more])
+
+    def converted(values, quantity):
+        return None if values is None else convert(values, quantity, units[1], "ASE")
+
+    speed = converted(velocity, "velocity")
+    return found._replace(
+        position=converted(found.position, "distance"),
+        cell=converted(found.cell, "distance"),
+        masses=converted(found.masses, "mass"),
+        velocity=None if speed is None else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
+    )
+
+
+def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
+    """The frames of a text dump (`dump custom` or `dump atom`)."""
+    units = next((lines[k + 1].strip() for k, line in enumerate(lines[:-1]) if line.startswith("ITEM: UNITS")), "")
+    starts = [k for k, line in enumerate(lines) if line.startswith("ITEM: TIMESTEP")]
+    return [
+        partial(_dump_frame, path, lines[first:last], first, units, atom_types)
+        for first, last in pairwise([*starts, len(lines)])
+    ]
+
+
+def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types) -> Atoms:
+    """The frame in lines that follow line number `first`."""
+    at = {" ".join(line.split()[1:3]): k for k, line in enumerate(lines) if line.startswith("ITEM: ")}
+    atoms = next((k for k, line in enumerate(lines) if line.startswith("ITEM: ATOMS")), None)
+    if "NUMBER OF" not in at or "BOX BOUNDS" not in at or atoms is None or max(at.values()) + 1 >= len(lines):
+        told = "expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS after it: truncated?"
+        raise StructureError(str(path), [f"line {first + 1}: {told}"])
+    line = at["NUMBER OF"] + 1
+    count = promised_atoms(path, first + line + 1, lines[line].strip(), len(lines) - atoms - 1)
+    columns = {name: k for k, name in enumerate(lines[atoms].split()[2:])}
+    rows = [(first + k + 1, lines[k].split()) for k in range(atoms + 1, atoms + 1 + count)]
+    if short := [row for row in rows if len(row[1]) < len(columns)]:
+        line, words = short[0]
+        told = f"line {line}: expected {len(columns)} columns ({' '.join(columns)}), found {' '.join(words)[:60]!r}"
+        raise StructureError(str(path), [told])
+
+    def of(*names: str) -> np.ndarray:
+        return table(
+            path, [(number, [words[columns[name]] for name in names]) for number, words in rows], " ".join(names)
+        )
+
+    def texts(name: str) -> list[str]:
+        return [words[columns[name]] for _, words in rows]
+
+    if "id" in columns:
+        rows.sort(key=lambda row: whole_number(row[1][columns["id"]]) or 0)
+    begin = at["BOX BOUNDS"]
+    bounds = [(first + k + 1, lines[k].split()) for k in range(begin + 1, begin + 4)]
+    low, cell = _dump_box(path, lines[begin].split()[3:], bounds)
+    there = next((names for names in COORDINATES if set(names) <= set(columns)), None)
+    if there is None:
+        raise StructureError(str(path), [f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs"])
+    position = of(*there)
+    if there[0].startswith("xs"):
+        position = low + position @ cell
+    flags, notes = re.findall(r"(?<=\s)[pfsm]{2}(?=\s|$)", lines[begin]), []
+    if not all("p" in flag for flag in flags):
+        axes = ", ".join(x for x, flag in zip("abc", flags, strict=False) if "p" in flag)
+        notes = [f"its cell is periodic along {axes} only and is not used"] if axes else []
+        cell = None
+    masses = of("mass")[:, 0] if "mass" in columns else None
+    named = texts("element") if "element" in columns else []
+    elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
+    types = texts("type") if "type" in columns else named or [""] * count
+    if not elements and masses is not None:
+        element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
+        elements = [element[mass] for mass in masses.tolist()]
+    if not elements and atom_types is None and all(whole_number(kind) is not None for kind in types):
+        fault = 'has only types of atoms, no elements or masses: name the types by structure.atom_types, { 1 = "O" }'
+        raise StructureError(str(path), [fault])
+    found = Atoms(
+        named if named and atom_types is None else _names(path, types, [], {}, atom_types),
+        elements if elements and atom_types is None else [""] * count,
+        _residues(texts("mol") if "mol" in columns else []) or [()] * count,
+        position,
+        None,
+        cell,
+        masses,
+        notes,
+    )
+    velocity = of("vx", "vy", "vz") if {"vx", "vy", "vz"} <= set(columns) else None
+    return _in_our_units(found, velocity, f"units {units}", "it does not say its units (dump_modify units yes)")
+
+
+def _dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
+    """The origin (3,) and the cell (3, 3) of a dump."""
+    bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
+    if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
+        told = f"line {rows[0][0]}: expected the bounds of the box along x, found {' '.join(rows[0][1])!r}"
+        raise StructureError(str(path), [told])
+    if general:
+        return bounds[:, 3], bounds[:, :3]
+    return box_in_bounds(bounds[:, 0], bounds[:, 1], *(bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)))

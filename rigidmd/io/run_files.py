@@ -1,0 +1,145 @@
+"""Reading back what runs write. Folders of runs are data of strangers: files are read within bounds, and validated."""
+
+import csv
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from rigidmd.core.files import file_fault
+from rigidmd.core.toml import shortened
+from rigidmd.errors import OutputError
+from rigidmd.scene.validation import Flag, Number, faults_of
+
+#: Bytes of a file of JSON or CSV; characters of a line of CSV; absolute value of a number.
+LARGEST_JSON, LARGEST_TABLE, LONGEST_LINE, LARGEST_NUMBER = 5e7, 4e9, 100_000, 1e100
+
+T = TypeVar("T")
+Bounded = Annotated[Number, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+
+
+class StageSummary(BaseModel):
+    """A stage in summary.json, as far as it is read."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str
+    integrator: str | None = None
+    timestep_fs: Bounded | None = None
+    stable_timestep_fs: Bounded | None = None
+    drift_kJ_mol_ns_per_molecule: Bounded | None = None
+    drift_error_kJ_mol_ns_per_molecule: Bounded | None = None
+    drift_kT_ns_per_degree_of_freedom: Bounded | None = None
+    drift_error_kT_ns_per_degree_of_freedom: Bounded | None = None
+    energy_rms_kJ_mol_per_molecule: Bounded | None = None
+    ns_per_day: Bounded | None = None
+
+
+class Summary(BaseModel):
+    """summary.json, as far as it is read; of molecules and of bodies, by any version."""
+
+    model_config = ConfigDict(extra="allow")
+
+    interrupted: Flag = False
+    notes: list[str] = []
+    stages: list[StageSummary] = []
+    scene_sha256: str | None = None
+    input_sha256: dict[str, str] = {}
+    processor_features: list[str] = []
+    threads: int | None = None
+    vector_bits: int | None = None
+    seed: int | None = None
+    precision: str | None = None
+    machine: str | None = None
+    processor: str | None = None
+    rigidmd_version: str | None = None
+    numba_version: str | None = None
+    llvmlite_version: str | None = None
+    numpy_version: str | None = None
+    python_version: str | None = None
+    preparing_s: Bounded | None = None
+    computing_s: Bounded | None = None
+    wall_s: Bounded | None = None
+    timestep_s: Bounded | None = None
+    stable_timestep_s: Bounded | None = None
+
+
+def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
+    """The contents of a file of JSON, validated; None without one. Raises OutputError with file and field.
+
+    remedy : what to do if it is damaged
+    """
+    if not _is_there(path, LARGEST_JSON):
+        return None
+    try:
+        return _adapter(kind).validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        if first["type"] == "json_invalid":
+            raise OutputError(f"{path} cannot be read: {first['msg']}{remedy}") from None
+        fault = faults_of(error, BaseModel)[0] if first["loc"] else f"is {shortened(first['input'])}, must be a table"
+        raise OutputError(f"{path}: {fault}{remedy}") from None
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from None
+
+
+@lru_cache
+def _adapter(kind: Any) -> TypeAdapter:
+    return TypeAdapter(kind)
+
+
+def _is_there(path: Path, largest: float) -> bool:
+    """Whether there is a file. Raises OutputError for what is no file, or larger."""
+    if not path.exists() and not path.is_symlink():
+        return False
+    if fault := file_fault(path, largest):
+        raise OutputError(
+            f"{path} cannot be read: it {fault}" if fault.startswith(("is", "has")) else f"{path}: {fault}"
+        )
+    return True
+
+
+class Columns(NamedTuple):
+    """A file of CSV: header -> cells of all whole lines."""
+
+    path: Path
+    cells: dict[str, list[str]]
+
+    def numbers(self, header: str, finite: bool = False) -> np.ndarray:
+        """A column as numbers; what is empty is NaN, unless all must be finite. Raises OutputError."""
+        try:
+            found = np.array([float(cell or "nan") for cell in self.cells[header]])
+        except ValueError:
+            raise OutputError(f"{self.path}: column {header!r} holds what is no number") from None
+        empty = np.array([not cell for cell in self.cells[header]], bool)
+        if not ((np.abs(found) <= LARGEST_NUMBER) | (empty & (not finite))).all():
+            raise OutputError(f"{self.path}: column {header!r} holds what is no finite number below 1e100")
+        return found
+
+
+def read_columns(path: Path) -> Columns | None:
+    """A file of CSV; None without one. A last line that is cut off is left out. Raises OutputError."""
+    if not _is_there(path, LARGEST_TABLE):
+        return None
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = csv.reader(_lines(file))
+            head = next(rows, [])
+            lines = [line for line in rows if len(line) == len(head)]
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from None
+    return Columns(path, {header: [line[k] for line in lines] for k, header in enumerate(head)})
+
+
+def _lines(file: Any) -> Iterator[str]:
+    """The whole lines of a file. Raises csv.Error for one without end."""
+    while line := file.readline(LONGEST_LINE):
+        if line.endswith("\n"):
+            yield line
+        elif len(line) == LONGEST_LINE:
+            raise csv.Error(f"a line has more than {LONGEST_LINE} characters")

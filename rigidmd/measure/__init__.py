@@ -1,1 +1,0 @@
-"""Measurements on states: observables, drift, limits. Nothing here changes a state."""

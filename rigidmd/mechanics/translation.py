@@ -1,0 +1,102 @@
+"""The translation of a single body: free, none, or through an ideal fluid with added mass.
+
+A flight is a term: `carry(flight, ...)` is chosen by its type at compile time, so that a pinned body compiles no
+translation.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, is_a, kernel
+from rigidmd.mechanics.free_rotor import turn_alone
+
+
+class Free(NamedTuple):
+    """The centre of mass moves freely."""
+
+    mass: float
+
+
+class Pinned(NamedTuple):
+    """One point of the body is fixed at the origin; position and velocity are not stored."""
+
+    mass: float
+
+
+class Immersed(NamedTuple):
+    """A body in an ideal fluid: Kirchhoff's equations P' = P x omega, L' = L x omega + P x v with v = M^-1 P.
+
+    `state.velocity` is the impulse of body and fluid over the body's mass, lab frame. The principal axes of M are those
+    of I, and the centre of mass is the centre of the fluid's inertia (Lamb, Hydrodynamics, art. 124). The moments of
+    inertia of the rotor include the added ones.
+    """
+
+    mass: float
+    inertial_mass: np.ndarray  # (3,) mass and added mass along the body's axes
+
+
+def carry(flight, rotor, state, time, h):
+    """Flow of the kinetic energy of a single body, from `time` to time + h, in place."""
+    raise TypeError("compiled code only")
+
+
+@implements(carry, inline=True)
+def _carry(flight, rotor, state, time, h):
+    if is_a(flight, Pinned):
+        return lambda flight, rotor, state, time, h: turn_alone(rotor, state, time, h)
+    if is_a(flight, Free):
+
+        def fly(flight, rotor, state, time, h):
+            for k in range(3):
+                state.position[0, k] += h * state.velocity[0, k]
+            turn_alone(rotor, state, time, h)
+
+        return fly
+
+    def swim(flight, rotor, state, time, h):
+        glide(flight, state, 0.5 * h)
+        turn_alone(rotor, state, time, h)
+        glide(flight, state, 0.5 * h)
+
+    return swim
+
+
+@kernel(inline=True)
+def glide(flight, state, h):
+    """Exact flow of sum P_k²/(2 M_k): P and Q are constant, X += h Q v, L += h P x v."""
+    q = state.rotation[0]
+    p0 = flight.mass * along(q, state.velocity[0], 0)
+    p1 = flight.mass * along(q, state.velocity[0], 1)
+    p2 = flight.mass * along(q, state.velocity[0], 2)
+    v0 = p0 / flight.inertial_mass[0]
+    v1 = p1 / flight.inertial_mass[1]
+    v2 = p2 / flight.inertial_mass[2]
+    for k in range(3):
+        state.position[0, k] += h * (q[k, 0] * v0 + q[k, 1] * v1 + q[k, 2] * v2)
+    state.angular_momentum_body[0, 0] += h * (p1 * v2 - p2 * v1)
+    state.angular_momentum_body[0, 1] += h * (p2 * v0 - p0 * v2)
+    state.angular_momentum_body[0, 2] += h * (p0 * v1 - p1 * v0)
+
+
+@kernel(inline=True)
+def along(rotation, vector_lab, k):
+    """Component of a lab vector (3,) along body axis k."""
+    return rotation[0, k] * vector_lab[0] + rotation[1, k] * vector_lab[1] + rotation[2, k] * vector_lab[2]
+
+
+def inertial_mass(flight, k):
+    """Mass, with added mass, for motion along body axis k."""
+    raise TypeError("compiled code only")
+
+
+@implements(inertial_mass, inline=True)
+def _inertial_mass(flight, k):
+    if is_a(flight, Immersed):
+        return lambda flight, k: flight.inertial_mass[k]
+    return lambda flight, k: flight.mass
+
+
+def inertial_masses(flight: Free | Pinned | Immersed) -> np.ndarray:
+    """Mass, with added mass, along the body's axes (3,), for Python."""
+    return flight.inertial_mass if isinstance(flight, Immersed) else np.full(3, flight.mass)

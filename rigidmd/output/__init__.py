@@ -1,1 +1,0 @@
-"""Files of a run: trajectory (MDAnalysis is used only here), log, state, summary, figures, reports."""

@@ -1,0 +1,114 @@
+"""Frames of a run of molecules as `ase.Atoms`."""
+
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rigidmd.core.process import quiet
+from rigidmd.core.state import NOW
+from rigidmd.engines.system import System
+from rigidmd.io.ase_atoms import EV, atoms_of_sites, atoms_of_system
+from rigidmd.io.formats.traj import TrajReader
+from rigidmd.run.atom_forces import in_ase_units
+from rigidmd.units import KJ_PER_MOL
+
+if TYPE_CHECKING:
+    import ase
+
+    from rigidmd.run.results import Results
+
+#: Two times of a run are the same within this fraction.
+SAME_TIME = 1e-9
+
+
+def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "ase.Atoms | list[ase.Atoms]":
+    """See `Results.atoms`."""
+    system = results.system
+    if not isinstance(system, System):
+        raise ValueError("this is the run of a single body, which has no atoms")
+    if frame is None:
+        return _final(results, system)
+    count = len(results._frames)
+    if count == 0:
+        raise ValueError("this run kept no frames (output.trajectory = false); atoms() is the final state")
+    chosen = _chosen(frame, count)
+    read = _reader(results, system)
+    at_end = _same(results._frames[-1].time, float(results.state.time[NOW]))
+    found = [_final(results, system) if at_end and k == count - 1 else read(k) for k in chosen]
+    return found if isinstance(chosen, range) else found[0]
+
+
+def _chosen(frame: int | slice | str, count: int) -> range | list[int]:
+    """Indices of frames: a range for several, a list of one for an index. Raises IndexError, ValueError."""
+    asked: Any = frame
+    if isinstance(frame, str):
+        with contextlib.suppress(ValueError):
+            parts = [int(part) if part.strip() else None for part in frame.split(":")]
+            asked = parts[0] if len(parts) == 1 else slice(*parts) if len(parts) < 4 else frame
+    if isinstance(asked, slice) and asked.step != 0:
+        return range(count)[asked]
+    if not isinstance(asked, int | np.integer):
+        raise ValueError(f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'")
+    if not -count <= asked < count:
+        raise IndexError(f"there is no frame {asked}: this run has {count}")
+    return [int(asked) % count]
+
+
+def _final(results: "Results", system: System) -> "ase.Atoms":
+    """The final state, exactly, with its energy, forces and stress."""
+    from ase.calculators.singlepoint import SinglePointCalculator
+
+    found = atoms_of_system(system, results.state, _wrapped(system))
+    found.info["time_ps"] = float(results.state.time[NOW])
+    found.calc = SinglePointCalculator(found, **in_ase_units(system, system.engine(), results.state))
+    return found
+
+
+def _reader(results: "Results", system: System) -> Callable[[int], "ase.Atoms"]:
+    """A function that reads frame k."""
+    from ase.calculators.singlepoint import SinglePointCalculator
+
+    frames = results._frames
+    sites = (
+        _from_files(results) if results.files else lambda k: (frames[k].positions, frames[k].velocities, frames[k].cell)
+    )
+    times, energies = results["time"], results["potential"]
+
+    def read(k: int) -> "ase.Atoms":
+        time = frames[k].time
+        positions, velocities, cell = sites(k)
+        found = atoms_of_sites(system, positions, velocities, cell, time)
+        if len(same := np.flatnonzero(_same(times, time))):
+            energy = energies[same[-1]] * KJ_PER_MOL / EV  # after a minimisation that begins then
+            found.calc = SinglePointCalculator(found, energy=float(energy))
+        return found
+
+    return read
+
+
+def _from_files(results: "Results") -> Callable[[int], tuple]:
+    """A function that reads positions, velocities and cell of frame k from the files."""
+    path = next((path for path in results.files if path.suffix == ".traj"), None)
+    if path is not None:
+        with contextlib.closing(TrajReader(path)) as file:
+            stored = [file.read(k) for k in range(file.count)]
+            return lambda k: (*file.of_sites(stored[k]), stored[k].cell)
+    with quiet():  # frames that are not evenly spaced: each has its time
+        trajectory = cast(Any, results.universe().trajectory)
+
+    def sites(k: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+        frame = trajectory[k]
+        cell = None if frame.dimensions is None else frame.triclinic_dimensions
+        return frame.positions, frame.velocities if frame.has_velocities else None, cell
+
+    return sites
+
+
+def _wrapped(system: System) -> bool:
+    return system.scene.output.positions == "wrapped"
+
+
+def _same(time: Any, other: float) -> Any:
+    return np.abs(time - other) <= SAME_TIME * max(abs(other), 1.0)

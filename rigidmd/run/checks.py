@@ -1,0 +1,431 @@
+"""Checks that the numbers of a run are still meaningful, and messages if they are not.
+
+No check evaluates forces: states, loads and samples are those that the run has anyway. Only a finding starts a search
+for the pair of sites that causes it.
+"""
+
+from collections.abc import Iterable
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
+from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.state import Load, State
+from rigidmd.dynamics.observables import Extent, extent_of
+from rigidmd.dynamics.step_loop import Model
+from rigidmd.engines.body_motion import energies, is_balanced
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.cpu import BehindWallError, NotFiniteError
+from rigidmd.engines.samples import Sample
+from rigidmd.engines.system import System
+from rigidmd.errors import SimulationError
+from rigidmd.forces.body.applied import SteadyForce
+from rigidmd.mechanics.rotation import orthogonality_error
+from rigidmd.scene.limits import BodyWatch, Watch
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import settled
+from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+
+#: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
+#: hydrogen bond stays at half of it. For molecules without any repulsion the fraction is the second one.
+BARE, NAKED = 0.3, 1.0
+#: A moment of inertia is suspiciously small below this fraction of that of the whole mass at the outermost site (for a
+#: body: of its largest moment). For water the fraction is 0.05.
+THIN = 0.01
+#: Rounding may change a potential energy by this fraction, half of its digits.
+ROUNDING = sqrt(np.finfo(float).eps)
+#: Most moves of molecules between two checks; for a body, evaluations of its forces, and looks.
+PATIENCE, BODY_PATIENCE, LOOKS = 250_000, 1_000_000, 512
+
+
+class Finding(SimulationError):
+    """An observation that shows something wrong, as a sentence.
+
+    molecule : index of the molecule concerned; shorter : factor by which the step would have to be shorter to stay
+    within the limit, if known; unturned : whether Q is wrong
+    """
+
+    def __init__(
+        self,
+        seen: str,
+        molecule: int | None = None,
+        shorter: float | None = None,
+        unturned: bool = False,
+        boiled: bool = False,
+    ):
+        super().__init__(seen)
+        self.molecule = molecule
+        self.shorter = shorter
+        self.unturned = unturned
+        self.boiled = boiled
+
+
+class Cause(NamedTuple):
+    """The likely cause of a finding, and what to try."""
+
+    likely: str
+    advice: str
+
+
+def patience(system: System) -> int:
+    """Steps between two checks of molecules, so many that a check costs less than 1 % of them."""
+    return max(20, PATIENCE // len(system.model.species))
+
+
+def steps_between(system: System) -> int | None:
+    """Steps between two checks besides those of samples; None where samples come at least as often."""
+    interval = system.scene.output.log_interval_ps
+    steps = [
+        inf if stage.is_open else interval / (stage.timestep_fs * FEMTOSECOND)
+        for stage in system.scene.stages
+        if not stage.is_minimisation
+    ]
+    return patience(system) if max(steps, default=0.0) > patience(system) else None
+
+
+class StepCheck:
+    """Checks of the next step of a run of molecules.
+
+    They remember the scale of momenta of the last good sample.
+    """
+
+    def __init__(self, system: System, limits: Watch):
+        self._system, self._limits = system, limits
+        self.thermal = 0.0  # u Å²/ps²; 0 before the first sample
+        model = system.model
+        # Distances of sites from the axes, in radii: of a spin, what counts is the move of the sites.
+        arms = [axis_distances(m) / (m.radius or 1.0) for m in system.species]
+        self._per_momentum = model.inverse_inertia * np.array(arms)  # (species, 3)
+        self._most_per_momentum = float(self._per_momentum.max())
+        self._diameter = system.smallest_diameter
+        self._mass_root = sqrt(model.inverse_mass.max())  # of the lightest, inverse; 0 if all are frozen
+        self._inertia_root = sqrt(model.inertia[model.inertia > 0].min(initial=inf))
+        self._deepest_well = max((m.epsilon.max() for m in system.species), default=0.0)
+
+    def rescale(self, kinetic: float) -> None:
+        """Take the scale of momenta from a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
+        self.thermal = max(2 * kinetic / max(self._system.freedom.total, 1), self._deepest_well)
+
+    def finding(self, state: State, load: Load, stage: Stage, extent: Extent | None) -> Finding | None:
+        """`next_step` of a stage, if it has steps."""
+        if stage.is_minimisation:
+            return None
+        return self.next_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND, extent)
+
+    def next_step(
+        self, state: State, load: Load, scheme: Scheme, dt: float, extent: Extent | None = None
+    ) -> Finding | None:
+        """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
+
+        load : at this state or at the last kick; extent : of both, if it is known
+        """
+        largest = extent or extent_of(state, load)
+        return None if self._is_mild(largest, scheme, dt) else self._looked_at(state, load, scheme, dt)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _looked_at(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
+        """The finding of `next_step`, from every molecule."""
+        system, limits, model = self._system, self._limits, self._system.model
+        for what, values in (("force", load.force), ("torque", load.torque_body)):
+            if not np.isfinite(values).all():
+                m = int((~np.isfinite(values).all(axis=1)).argmax())
+                return Finding(f"the {what} on {named(system, m)} is not finite", m)
+        if limits.kick and self.thermal > 0:
+            size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
+            if size.max() > limits.kick:
+                m = int(size.argmax())
+                seen = f"one kick changes a momentum of {named(system, m)} by {size[m]:.3g} times its thermal size"
+                return Finding(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
+        stride = dt * max(map(abs, scheme.drifts))
+        if limits.move:
+            way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
+            m, diameter = int(way.argmax()), self._diameter
+            if way[m] > limits.move * diameter:
+                seen = f"{named(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
+                seen += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
+                return Finding(seen, m, shorter=way[m] / diameter / limits.move)
+        if limits.turn_rad and len(state.rotation):
+            omega = state.angular_momentum_body * self._per_momentum[model.species]
+            angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
+            m = int(angle.argmax())
+            if angle[m] > limits.turn_rad:
+                seen = f"{named(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
+                return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
+        return None
+
+    def _is_mild(self, largest: Extent, scheme: Scheme, dt: float) -> bool:
+        """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces, velocities and
+        so on: nearly always, and many times as fast as to look at each of them."""
+        limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
+        if not largest.force + largest.torque < inf:
+            return False
+        if limits.kick and self.thermal > 0:
+            kick = dt * max(map(abs, scheme.kicks)) / sqrt(self.thermal)
+            if not kick * max(largest.force * self._mass_root, largest.torque / self._inertia_root) <= limits.kick:
+                return False
+        if limits.move and not sqrt(3) * stride * largest.velocity <= limits.move * self._diameter:
+            return False
+        if not limits.turn_rad:
+            return True
+        return sqrt(3) * stride * largest.angular_momentum * self._most_per_momentum <= limits.turn_rad
+
+
+def axis_distances(molecule: Molecule) -> np.ndarray:
+    """Largest distances (3,) of a molecule's sites from its principal axes, Å."""
+    square = molecule.positions_body**2
+    return np.sqrt((square.sum(axis=1, keepdims=True) - square).max(axis=0))
+
+
+def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) -> Finding | None:
+    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
+
+    In a minimisation only Q is checked.
+
+    The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
+    energy at a thermostat's temperature if that is larger.
+    """
+    if limits.orthogonality and not now.orthogonality <= limits.orthogonality:
+        seen = f"|QᵀQ - 1| is {now.orthogonality:.2g} (watch.orthogonality = {limits.orthogonality:g})"
+        return Finding(f"a matrix Q is no longer a rotation: {seen}", unturned=True)
+    if system.scene.stages[now.stage].is_minimisation:
+        return None
+    grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
+    if limits.volume and grown > limits.volume:
+        seen = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
+        return Finding(f"{seen}, {now.density:.3g} g/cm³", boiled=True)
+    if not limits.energy:
+        return None
+    stage, share = system.scene.stages[now.stage], 1.0
+    kinetic = since.kinetic
+    if stage.has_thermostat:
+        kinetic = max(
+            kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom_in(now.stage).total
+        )
+        share = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
+    drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
+    if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
+        return None
+    scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
+    if abs(drift) * share <= limits.energy * scale:
+        return None
+    n = len(system.model.species)
+    return Finding(
+        f"the conserved energy changed by {drift / n:.3g} kJ/mol per molecule in {now.time - since.time:g} ps, "
+        f"{abs(drift) * share / scale if scale else inf:.3g} kinetic energies (watch.energy = {limits.energy:g})"
+    )
+
+
+def named(system: System, molecule: int) -> str:
+    """Number (from 1) and species of a molecule."""
+    return f"molecule {molecule + 1} ({system.species[system.model.species[molecule]].name})"
+
+
+class Pair(NamedTuple):
+    """Two sites whose cores overlap."""
+
+    first: int
+    second: int
+    distance: float  # Å
+    share: float  # of their diameter; of the smallest one of the scene if they have none
+    bare: bool  # opposite charges without repulsion between them
+
+
+def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | None:
+    """The pair of sites that overlaps most, preferably of this molecule; None without such a pair."""
+    if not np.abs(state.position).max() * np.finfo(float).eps < 1e-3 * system.smallest_diameter:
+        return None  # a coordinate is too large to resolve distances
+    sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
+    near = system.of_sites(lambda m: np.full(len(m.epsilon), BARE if m.epsilon.any() else NAKED))
+    acts = any(name.startswith("coulomb") for name in system.terms)
+    charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
+    found = []
+    reach = max(OVERLAP * sigma.max(), near.max() * system.smallest_diameter)
+    for i, j, distance in close_pairs(system, state, (reach, every_site)):
+        repel = sigma[i] > 0 and sigma[j] > 0
+        size = (sigma[i] + sigma[j]) / 2 if repel else system.smallest_diameter
+        bare = not repel and charge[i] * charge[j] < 0
+        if (repel or bare) and distance <= (OVERLAP if repel else max(near[i], near[j])) * size:
+            found.append(Pair(i, j, distance, distance / size, bare))
+    own = [pair for pair in found if molecule in system.sites.molecule[[pair.first, pair.second]]]
+    return min(own or found, key=lambda pair: pair.share, default=None)
+
+
+def _worst_pair(system: System, molecule: int | None, states: Iterable[tuple[str, State]]) -> tuple[str, Pair | None]:
+    """Moment and sites of the first overlap of this molecule; without one, of the first of all."""
+    first: tuple[str, Pair | None] = ("", None)
+    for where, state in states:
+        if all(np.isfinite(array).all() for array in state):
+            pair = pair_in_core(system, state, molecule)
+            if pair is not None and (molecule is None or molecule in system.sites.molecule[[pair.first, pair.second]]):
+                return where, pair
+            if first[1] is None:
+                first = where, pair
+    return first
+
+
+def explained(
+    system: System, error: SimulationError, states: Iterable[tuple[str, State]], dt: float, stable: float | None
+) -> str:
+    """The finding in full: what was seen, the likely cause, what to try.
+
+    states : states to search for overlapping sites, each with the words for its moment; dt, stable : the step and, if
+    known, the longest stable one, ps
+    """
+    if isinstance(error, NotFiniteError):
+        seen = f"{named(system, error.molecule)} is lost: {error.fault}"
+        finding = Finding(seen, error.molecule)
+    elif isinstance(error, BehindWallError):
+        finding = Finding(f"{named(system, error.molecule)} {error.fault}", error.molecule)
+    elif isinstance(error, Finding):
+        finding = error
+    else:
+        return str(error)
+    text = str(finding)
+    where, pair = ("", None) if finding.boiled else _worst_pair(system, finding.molecule, states)
+    if pair is not None:
+        a, b = (
+            f"{system.sites.name[site]} of {named(system, system.sites.molecule[site])}"
+            for site in (pair.first, pair.second)
+        )
+        whose = "the smallest" if pair.bare else "their"
+        text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.share:.2g} of {whose} diameter"
+    likely, advice = _cause(system, finding, pair, dt, stable)
+    return f"{text}. Likely cause: {likely}. Try {advice}"
+
+
+def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stable: float | None) -> Cause:
+    shorter = f"a shorter timestep_fs than {dt / FEMTOSECOND:g}"
+    if stable is not None and stable < dt:
+        shorter = f"timestep_fs below {stable / FEMTOSECOND:.2g}, where the stiffest motion is stable"
+    elif finding.shorter is not None and finding.shorter < 1 / ROUNDING:
+        shorter = f"timestep_fs = {dt / finding.shorter / FEMTOSECOND:.2g} or less"
+    if pair is not None and pair.bare:
+        a, b = system.sites.name[[pair.first, pair.second]]
+        return Cause(
+            "a charge on a site without repulsion has collapsed onto an opposite one",
+            f"giving one of these sites sigma_A and epsilon_kJ_mol, or the pair an entry [[forces.pairs]] with sites = "
+            f'["{a}", "{b}"]',
+        )
+    if pair is not None:
+        return Cause(
+            "these sites overlap: from the start, or because a step was too long",
+            f"a start without overlaps, an nvt stage with a short step first, or {shorter}",
+        )
+    if finding.molecule is not None:
+        species = system.species[system.model.species[finding.molecule]]
+        even = species.mass * axis_distances(species) ** 2
+        share = np.divide(species.inertia, even, out=np.ones(3), where=species.inertia > 0)
+        if share.min() < THIN:
+            return Cause(
+                f"bad inertia: a moment of {species.name} is {species.inertia[share.argmin()]:.2g} u Å², "
+                f"{share.min():.1g} of that of its mass at the outermost site, so torques turn it too fast",
+                f"more of its mass on the outer sites, or {shorter}",
+            )
+    if finding.boiled:
+        return Cause(
+            "at this temperature and pressure the liquid boils, or it starts far from its density under great pressure",
+            "a higher pressure_bar or a lower temperature_K, an nvt stage before the barostat, or watch.volume = false "
+            "for a gas",
+        )
+    if finding.unturned:
+        return Cause(
+            "Q was not a rotation at the start or was changed from outside: a run only multiplies rotations",
+            "the start from which the last good state came; a very long run may raise watch.orthogonality",
+        )
+    return Cause("timestep_fs is too long for this motion", f"{shorter}, or an nvt stage first")
+
+
+class BodyCheck:
+    """Checks of the run of a body.
+
+    They remember the largest energy exchanged so far, the scale of energy errors.
+    """
+
+    def __init__(self, system: BodySystem, limits: BodyWatch):
+        self.system = system
+        self.limits = limits
+        self._start = self._energies(system.state)
+        weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+        swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
+        self.moved = abs(self._start["kinetic"]) + (0.0 if system.flies else 2 * swing)
+
+    def _energies(self, state: State) -> dict[str, float]:
+        columns = energies(self.system, state.time[:1], State(*(array[None] for array in state)))
+        return {name: float(values[0]) for name, values in columns.items()}
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def finding(self, state: State, dt: float) -> Finding | None:
+        """What is wrong with a state of the run."""
+        system, limits = self.system, self.limits
+        largest = settled(limits.orthogonality)
+        if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
+            seen = f"Q is no longer a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            return Finding(seen, unturned=True)
+        if system.turns and limits.turn_rad:
+            omega = system.pose(float(state.time[0]), state).angular_velocity_body
+            angle = dt * float(np.linalg.norm(omega))
+            if angle > limits.turn_rad:
+                seen = f"the body turns by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
+                return Finding(seen, shorter=angle / limits.turn_rad)
+        if not limits.energy or not is_balanced(system):
+            return None
+        start, now = self._start, self._energies(state)
+        self.moved = max(self.moved, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
+        error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
+        scale = self.moved + ROUNDING * abs(now["energy"])
+        if error <= limits.energy * scale:
+            return None
+        return Finding(
+            f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
+            f"energy exchanged (watch.energy = {limits.energy:g})"
+        )
+
+    def explained(self, error: SimulationError, dt: float, stable: float | None) -> str:
+        """The finding in full: what was seen, the likely cause, what to try."""
+        system = self.system
+        if isinstance(error, NotFiniteError):
+            finding = Finding("position or momentum of the body is not finite")
+        elif isinstance(error, Finding):
+            finding = error
+        else:
+            return str(error)
+        shorter = f"a shorter timestep_s than {dt:g}"
+        if stable is not None and stable < dt:
+            shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
+        elif finding.shorter is not None:
+            shorter = f"timestep_s = {dt / finding.shorter:.2g} or less"
+        inertia = system.inertia
+        if finding.unturned:
+            cause = Cause(
+                f"only accuracy keeps Q a rotation under {system.method.name}"
+                if isinstance(system.method, Solver)
+                else "Q was changed from outside: a run only multiplies rotations",
+                f"integrator = 'srkn_6', which keeps Q, or {shorter}",
+            )
+        elif system.turns and inertia[inertia > 0].min() < THIN * inertia.max():
+            least = inertia[inertia > 0].min()
+            cause = Cause(
+                f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "
+                "and the body spins about that axis faster than the step can follow",
+                f"{shorter}, or a moment of 0",
+            )
+        else:
+            cause = Cause("timestep_s is too long for this motion, or a force grows without bound", shorter)
+        return f"{finding}. Likely cause: {cause.likely}. Try {cause.advice}"
+
+
+def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
+    """Largest kick of each molecule (n,) in a step, relative to the thermal size of that momentum.
+
+    A kick F dt beyond sqrt(m kT), or n dt beyond sqrt(I kT), comes from an overlap, not from a liquid. The measure is
+    relative to the scene's own masses, temperature and time step.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.abs(load.force).max(axis=1) * dt * np.sqrt(model.inverse_mass[model.species] / thermal)
+        turn = np.abs(load.torque_body) * dt / np.sqrt(model.inertia[model.species] * thermal)[: len(load.torque_body)]
+    turn = np.where((model.inertia[model.species] > 0)[: len(turn)], turn, 0.0)
+    found[: len(turn)] = np.maximum(found[: len(turn)], turn.max(axis=1, initial=0.0))
+    return found

@@ -1,0 +1,541 @@
+"""Runs of molecules: relief of overlaps, stages of all ensembles, samples."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from math import hypot, isfinite, nan
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
+
+import numpy as np
+from pydantic import Field, PositiveFloat
+
+from rigidmd.assemble.build import build
+from rigidmd.assemble.stage_flows import row as row_of_stage
+from rigidmd.assemble.user_code.binding import told_plainly
+from rigidmd.compile.cache import kept_in_words
+from rigidmd.compile.machine import threads_for
+from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
+from rigidmd.dynamics.momenta import remove_momentum
+from rigidmd.dynamics.observables import Extent, extent_of
+from rigidmd.engines.cpu import Engine
+from rigidmd.engines.observables import Observation, observe
+from rigidmd.engines.samples import COLUMNS, Sample, Samples
+from rigidmd.engines.system import System
+from rigidmd.errors import EngineError, SceneError, SimulationError
+from rigidmd.io.ase_atoms import atoms_of_system
+from rigidmd.io.cells import edges_and_angles
+from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.progress import progress_of
+from rigidmd.io.scene_file import input_names, write_scene
+from rigidmd.run import checks
+from rigidmd.run.force_errors import accuracy
+from rigidmd.run.minimise import minimise
+from rigidmd.run.minimum import Minimum, minimum_in_words
+from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
+from rigidmd.run.moment import Moment
+from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.options import Options
+from rigidmd.run.overlap_removal import Relief, relieve
+from rigidmd.run.pilot.shadow import choose_for_averages
+from rigidmd.run.pilot.stable_step import is_worth_it, stable_angle, stiffest
+from rigidmd.run.pilot.subjects import choose_for_molecules
+from rigidmd.run.provenance import plain
+from rigidmd.run.quantity_docs import meanings
+from rigidmd.run.report import summary_text
+from rigidmd.run.results import Results
+from rigidmd.run.resume import Record, check_same_scene, read_as, state_from
+from rigidmd.run.segments import Costs, Stretch
+from rigidmd.run.signals import interruptible
+from rigidmd.run.simulation import Simulation
+from rigidmd.run.summary import summarise
+from rigidmd.run.user_force_check import check_forces
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    import ase
+
+    from rigidmd.engines.external import OtherEngine
+
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class MolecularRecord(Record):
+    """What evolves in a run of molecules and is not in its state; dictionaries have the indices of stages."""
+
+    stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
+    stage: Count = 0  # the present one
+    relief: Relief | None = None
+    choices: dict[Count, str] = Field(default_factory=dict)  # what was chosen for stages that left it open, and why
+    stable: dict[Count, PositiveFloat] = Field(default_factory=dict)  # the longest stable step, ps
+    moves: dict[Count, tuple[Count, Count]] = Field(default_factory=dict)  # of the box, tried and accepted
+    minima: dict[Count, Minimum] = Field(default_factory=dict)
+
+
+#: States between the last good one and a failure that are searched for its cause.
+REPLAYED = 20
+
+
+class MolecularSimulation(Simulation):
+    """A scene of molecules, ready to run. Besides the parameters of `Simulation`:
+
+    forces : forces of your own, besides those of the scene: `rigidmd.Force`, `rigidmd.pair_law`, terms of classes with
+        `rigidmd.compiled_force`, or objects whose method term(system) makes such a term. They are checked at the start:
+        force and torque against differences of the energy, the virial against a stretched box
+    thermostat : a thermostat of your own in place of that of every stage: a NamedTuple of a class with
+        `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
+    """
+
+    time_unit = "ps"
+
+    scene: MolecularScene
+    system: System
+    engine: "Engine | OtherEngine"
+
+    def __init__(
+        self,
+        scene: MolecularScene,
+        folder: str | Path | None = None,
+        force: bool = False,
+        *,
+        forces: Any = (),
+        thermostat: Any = None,
+        **options: Unpack[Options],
+    ):
+        super().__init__(scene, folder, force, **options)
+        given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
+        self._built = build(scene.with_own(given, thermostat))
+        if clash := [name for name in self._built.own if name in COLUMNS]:
+            raise SceneError(
+                scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
+            )
+        self.threads = threads_for(scene.threads)
+        self._reset()
+
+    def start_from(self, state: State) -> None:
+        """Let runs begin at the given positions and momenta, without relief of overlaps."""
+        begun = state_of(*state[:5])
+        self._built = replace(self._built, state=begun, from_lattice=False)
+        self._reset()
+
+    def take_threads(self, count: int) -> None:
+        """Let runs compute with so many threads. Results do not depend on it."""
+        scene = self._built.scene.model_copy(update={"threads": count})
+        self._built = replace(self._built, scene=scene)
+        self.threads = threads_for(count)
+        self._reset()
+
+    def atoms(self) -> "ase.Atoms":
+        """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. An observer may call it."""
+        return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
+
+    def start(self) -> Relief | None:
+        """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
+        self._reset()
+        with interruptible():
+            self._relieve()
+        return self._record.relief
+
+    def settle(self) -> State:
+        """Go to the state from which time passes, after relief of overlaps and the minimisations that come first."""
+        self.start()
+        for k, stage in enumerate(self.scene.stages):
+            if not stage.is_minimisation:
+                break
+            self._enter_minimisation(k)
+            self._minimise(False)
+        return self.state
+
+    def _reset(self) -> None:
+        self.system = self._built  # an earlier run may have chosen an integrator
+        self.scene = self.system.scene
+        self.engine = self.system.engine()
+        self.state = self.system.state.copy()
+
+    def _prepare(self) -> None:
+        """Relieve overlaps, and compile the steps or see that another engine computes the same."""
+        if self.scene.engine.is_other:
+            from rigidmd.engines.external import other_engine
+
+            other = other_engine(self.system)  # first: one that is not here says so before anything is compiled
+            self._relieve()
+            self._check(other)
+        else:
+            self._relieve()
+            self._compile()
+        self.engine.forget()
+
+    def _relieve(self) -> None:
+        """Compile the forces, and relieve overlaps of a lattice."""
+        self._say(f"compiling ({kept_in_words()})")
+        with told_plainly(self.system):
+            _, tallies = self.engine.evaluate(self.state)
+        if not all(np.isfinite(tally.energy) for tally in tallies.values()):
+            raise SceneError(
+                self.scene.source, ["the start has no finite energy: sites of different molecules coincide"]
+            )
+        first = self.scene.stages[0]
+        relief = None
+        if self.system.from_lattice and not first.is_minimisation:
+            radius = np.array([m.radius for m in self.system.species])
+            temperature = self.scene.start.temperature_K or 0.0
+            # At 0 K the scale is the deepest well between two sites.
+            thermal = BOLTZMANN * temperature or max((m.epsilon.max() for m in self.system.species), default=0.0)
+            if thermal > 0:
+                scale = self.system.smallest_diameter
+                dt = first.timestep_fs * FEMTOSECOND
+                relief = relieve(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
+                if relief.excess > 1:
+                    raise SceneError(
+                        self.scene.source,
+                        [
+                            f"the molecules cannot be packed at {self.system.density:.3g} g/cm³ without overlap: after "
+                            f"{relief.steps} steps of relief the first time step would still change a momentum by "
+                            f"{relief.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
+                            "shorten timestep_fs of the first stage"
+                        ],
+                    )
+        check_forces(self.system, self.state)
+        self.engine.forget()
+        self._record = MolecularRecord(relief=relief)
+
+    def _compile(self) -> None:
+        """Compile the steps of every stage."""
+        with told_plainly(self.system):
+            for k, stage in enumerate(self.scene.stages):
+                if not (stage.is_open or stage.is_minimisation):
+                    row = row_of_stage(self.system, k)
+                    self.engine.advance(self._begun(row), row, 0.0, 0)
+
+    def _begun(self, row: Scheme | Solver) -> State:
+        """The present state, its arrays as they are, with the variables that a row moves besides."""
+        return self.state._replace(bath=self.engine.variables(self.state, row))
+
+    def _check(self, other: "OtherEngine") -> None:
+        """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""
+        from rigidmd.engines.comparison import compare_at, in_words
+
+        try:
+            lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
+        finally:
+            other.close()
+        if not all(line.agrees for line in lines):
+            title = self.scene.engine.name
+            raise EngineError(
+                f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{in_words(lines, title)}"
+            )
+
+    def _engine_of(self, k: int) -> "Engine | OtherEngine":
+        """The engine of stage k; rigidmd's own minimises."""
+        if not self.scene.engine.is_other or self.scene.stages[k].is_minimisation:
+            return self.system.engine()
+        from rigidmd.engines.external import other_engine
+
+        other = other_engine(self.system, k)
+        self.made_by = other.made_by
+        return other
+
+    def _memory(self) -> dict[str, Any]:
+        scene, stages = plain(self._built.scene), self.scene.stages
+        return self._record.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
+
+    def _recall(self, kept: Checkpoint) -> None:
+        record = self._record = read_as(MolecularRecord, kept.told["run"])
+        before = record.scene["stages"]
+        # the scene in the folder has decided what was open before
+        decided = [
+            then if now.is_open else plain(chosen)
+            for now, then, chosen in zip(self.scene.stages, before, record.stages, strict=False)
+        ]
+        step = int(kept.arrays["state/step"][NOW])
+        check_same_scene(self._built.scene, record.scene | {"stages": decided or before}, record.inputs, step)
+        for k, (chosen, then) in enumerate(zip(record.stages, before, strict=True)):
+            if k not in record.choices and plain(chosen) != then:
+                raise ValueError(f"its stages.{k} is not that of its scene")
+        known = (*record.choices, *record.stable, *record.moves, *record.minima)
+        if record.stage != kept.told["place"]["stretch"] or any(k > record.stage for k in known):
+            raise ValueError(f"it knows of later stages than {record.stage}, or is of another")
+        stages = list(record.stages)
+        stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
+        self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
+        self.system = replace(self.system, scene=self.scene)
+        self._warnings.extend(record.notes)
+        row = self._reenter(record.stage).row
+        self.engine = self._engine_of(record.stage)
+        like = self._built.state._replace(bath=self.engine.variables(self._built.state, row))
+        self.state = state_from(kept.of("state").arrays, like)
+        moves = any(before.has_barostat or before.is_minimisation for before in stages[: record.stage + 1])
+        if not moves and not np.array_equal(self.state.cell, self._built.state.cell):
+            raise ValueError("its box is not that of the scene")
+        self.engine.recall(self.state, kept.of("engine").arrays)
+
+    def _reenter(self, k: int) -> Stretch:
+        stage = self.scene.stages[k]
+        step = stage.timestep_fs * FEMTOSECOND
+        if stage.is_minimisation:
+            return Stretch(stage.scheme, step, 0, act=None if k in self._record.minima else self._minimise)
+        return Stretch(row_of_stage(self.system, k), step, stage.steps)
+
+    def _durations(self) -> list[float]:
+        return [stage.duration for stage in self.scene.stages]
+
+    def _enter(self, k: int) -> Stretch:
+        self._record.moves[self._record.stage] = self.engine.moves
+        self._record.stage = k
+        if self.scene.stages[k].is_minimisation:
+            return self._enter_minimisation(k)
+        if was_open := self.scene.stages[k].is_open:
+            self._choose(k)
+        self._estimate(k)
+        # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
+        # bit. Those of the start, if nothing has moved since, are what new ones would be.
+        if k or was_open or self.scene.engine.is_other or (self._record.relief and self._record.relief.steps):
+            self.engine = self._engine_of(k)
+        row, stage = row_of_stage(self.system, k), self.scene.stages[k]
+        self.state = self._begun(row)
+        self.state.begin_stretch()
+        before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
+        keeps = self.system.keeps_momentum_in
+        if before and keeps(k) and not keeps(before[-1]):
+            self.state.books[TAKEN] -= remove_momentum(self.system.model, self.state.velocity)
+        return Stretch(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
+
+    def _enter_minimisation(self, k: int) -> Stretch:
+        stage = self.scene.stages[k]
+        self.engine = self.system.engine()
+        self.state = self._begun(stage.scheme)
+        self.state.begin_stretch()
+        return Stretch(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
+
+    def _minimise(self, progress: bool | None) -> None:
+        """Minimise as the present stage says, with a warning if it does not converge."""
+        k = self._record.stage
+        stage = self.scene.stages[k]
+        with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
+            found = minimise(self.system, self.state, stage, self._must_end, bar.update)
+        self.engine.forget()
+        self._record.minima[k] = found
+        if not found.converged:
+            self.note(f"stages.{k}: {minimum_in_words(found, stage)}")
+
+    def _estimate(self, k: int) -> None:
+        """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
+        stage = self.scene.stages[k]
+        if not self.scene.watch.stable_step or not is_worth_it(
+            self.system, stage.steps * stage.scheme.force_evaluations
+        ):
+            return
+        found = stiffest(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
+        if found is None:
+            return
+        stable = self._record.stable[k] = stable_angle(stage.scheme) / found.rate
+        if stage.timestep_fs * FEMTOSECOND > stable:
+            self.note(
+                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
+                f"at its start, of {checks.named(self.system, found.molecule)}, has a period of "
+                f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
+                f"{stable / FEMTOSECOND:.3g} fs"
+            )
+
+    def _choose(self, k: int) -> None:
+        """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
+        stage = self.scene.stages[k]
+        self._say("choosing integrator and step by pilot runs")
+        choose = choose_for_averages if stage.bias_kT else choose_for_molecules
+        decided, reason = choose(self.system, self.state, k)
+        self._record.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
+        stages = list(self.scene.stages)
+        stages[k] = decided
+        self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
+        self.system = replace(self.system, scene=self.scene)
+        for sentence in self.scene.rounded_times([k]):
+            self.note(sentence)
+        if self.folder is not None:
+            self.write_scene(self.folder)
+
+    def _is_replaced(self, moment: Moment) -> bool:
+        stages, k = self.scene.stages, moment.stage
+        if stages[k].is_minimisation and k not in self._record.minima:
+            return True  # the start
+        ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
+        # an interrupted minimisation is repeated by a run that resumes, which also has another frame for it
+        ends_here = stages[k].is_minimisation and self._interrupted
+        return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
+
+    def _is_finite(self) -> bool:
+        state, extent = self.state, self.extent or extent_of(self.state)
+        return all(map(isfinite, [*extent[:4], *state.books.tolist(), *state.bath.tolist()]))
+
+    @property
+    def extent(self) -> Extent | None:
+        """The extent of the state and its load, if it is known from the last step."""
+        return self.engine.extent(self.state) if isinstance(self.engine, Engine) else None
+
+    def _look(self, moment: Moment) -> Observation:
+        stage = self.scene.stages[moment.stage]
+        is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
+        step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
+        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage), moved=True)
+
+    def sample_of(self, moment: Moment) -> Sample:
+        """A line of the log. Its drift is counted from the last sample before its stage."""
+        seen: Observation = moment._seen
+        energy, books = seen.energy / KJ_PER_MOL, self.state.books / KJ_PER_MOL
+        conserved = energy - float(books.sum())
+        volume, stage = self.state.volume, self.scene.stages[moment.stage]
+        boxed = volume < np.inf
+        a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = seen.pressure_tensor_bar.tolist()
+        # another engine may not tell what its thermostat takes out
+        known = not stage.is_minimisation and getattr(self.engine, "counts_heat", True)
+        return Sample(
+            step=moment.step,
+            time=moment.time,
+            potential=seen.potential / KJ_PER_MOL,
+            kinetic=seen.kinetic / KJ_PER_MOL,
+            energy=energy,
+            temperature=seen.temperature,
+            volume=volume * 1e-3 if boxed else nan,
+            density=self.system.mass / volume / GRAM_PER_CM3 if boxed else nan,
+            stage_name=stage.label,
+            temperature_translation=seen.temperature_translation,
+            temperature_rotation=seen.temperature_rotation,
+            temperature_translation_unbiased=seen.temperature_translation_unbiased,
+            temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
+            pressure_bar=seen.pressure_bar,
+            drift=conserved - self._sampler.origin(moment.stage, conserved) if known else nan,
+            momentum=hypot(*seen.momentum.tolist()),
+            orthogonality=seen.orthogonality,
+            a=a,
+            b=b,
+            c=c,
+            alpha=alpha,
+            beta=beta,
+            gamma=gamma,
+            heat=float(books[HEAT]),
+            work=float(books[WORK]),
+            pressure_xx=xx,
+            pressure_yy=yy,
+            pressure_zz=zz,
+            pressure_xy=xy,
+            pressure_xz=xz,
+            pressure_yz=yz,
+            conserved=conserved,
+            stage=moment.stage,
+            own=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.own),
+        )
+
+    def _own_observers(self) -> list[Observer]:
+        output = self.scene.output
+        interval = output.log_interval_ps
+        check = checks.StepCheck(self.system, self.scene.watch)
+        self._sampler = Sampler(self, interval, check)
+        observers: list[Observer] = [self._sampler]
+        if not self.scene.engine.is_other:  # others look after their own steps
+            observers.append(StepWatch(self, check))
+        files: list[Observer] = []
+        if output.trajectory:
+            velocities = bool(output.velocities)
+            wrapped = output.positions == "wrapped"
+            files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
+        if output.pressure_tensor_interval_ps:
+            files.append(PressureTensor(output.pressure_tensor_interval_ps))
+        if self.folder is not None:
+            names = input_names(self.scene)
+            files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
+            files += [EnergyFigure()] if output.figure else []
+        return [*files, *observers]
+
+    def _samples(self) -> Samples:
+        return self._sampler.samples
+
+    def _summary(self, samples: Samples, costs: Costs) -> dict[str, Any]:
+        record = self._record
+        record.moves[record.stage] = self.engine.moves
+        return summarise(
+            self.system, samples, self.state, record.relief.steps if record.relief else 0, costs.preparing, costs.wall,
+            costs.computing, self._interrupted, record.choices, record.stable, record.moves, record.minima, self.notes,
+        )  # fmt: skip
+
+    def _explain(self, error: SimulationError) -> str:
+        stable = self._record.stable.get(self._record.stage)
+        return checks.explained(self.system, error, self._suspects(), self.stretch.dt, stable)
+
+    def _suspects(self) -> Iterator[tuple[str, State]]:
+        """States of a run that failed, with the words for their moments: now; the last good one; those between, which
+        are computed again if that is soon done, because after a collapse nothing is where it was."""
+        yield "", self.state
+        if (good := self._sampler.last_good) is None:
+            return
+        yield f"at step {good.step}, ", good.state
+        steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.stretch.row
+        short = 0 < steps * len(system.model.species) <= REPLAYED * checks.PATIENCE
+        if short and isinstance(self.engine, Engine) and not (self.stretch.act or system.told):
+            state = good.state.copy()
+            if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
+                state = self.engine.begin(state, row)
+                state.begin_stretch()
+            self.engine.forget()
+            for to in sorted({good.step + steps * k // REPLAYED for k in range(1, REPLAYED)} - {good.step}):
+                try:
+                    self.engine.advance(state, row, self.stretch.dt, to)
+                except SimulationError:
+                    return
+                yield f"at step {to}, ", state
+
+    def write_scene(self, folder: Path) -> None:
+        write_scene(folder, self.scene)
+
+    def introduction(self) -> str:
+        system, asked = self.system, self.scene.threads or 0
+        more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
+        first = (
+            f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
+            f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"
+        )
+        return "\n".join([first, *(f"  {note}" for note in system.notes)])
+
+    def conclusion(self, results: Results) -> str:
+        """The summary as text, without the notes of the introduction and those that were issued as warnings."""
+        return summary_text(results.summary, [*self.system.notes, *self._issued])
+
+    def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
+        """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².
+
+        measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
+        """
+        relief = self.start()
+        moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
+        seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state)
+        force, molecule = seen.largest_force
+        found = {
+            "unit": unit,
+            "molecules": len(self.system.model.species),
+            "relief_steps": relief.steps if relief else 0,
+            "notes": list(self.system.notes),
+            "components": {name: energy / size for name, energy in seen.components.items()},
+            "potential": seen.potential / size,
+            "kinetic": seen.kinetic / size,
+            "virial": float(seen.virial.trace()) / size,
+            "virial_tensor": (seen.virial / size).tolist(),
+            "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
+            "largest_force_per_A": force / size,
+            "largest_force_molecule": molecule + 1,
+            "meaning": meanings(self.system),
+        }
+        if measure_accuracy:
+            error = accuracy(self.system, self.state)
+            found["accuracy"] = {
+                "reference": error.reference,
+                "rms_force_per_A": error.force / size,
+                "rms_error_per_A": error.measured / size,
+                "relative": error.relative,
+                "in_e2_per_A2": error.measured / COULOMB,
+                "estimated_per_A": error.estimated / size,
+                "largest_error_per_A": error.largest / size,
+                "energy_error": error.energy / size,
+            }
+        return found

@@ -1,0 +1,81 @@
+"""Relief of overlaps: molecules that are too close on a lattice are moved apart before the first step."""
+
+from collections.abc import Callable
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import State
+from rigidmd.dynamics.momenta import mobile
+from rigidmd.dynamics.step_loop import Model
+from rigidmd.engines import Engine
+from rigidmd.engines.cpu import BehindWallError
+from rigidmd.mechanics.rotation import from_vector
+from rigidmd.run.checks import kicks
+
+MOST_STEPS = 2000
+LONGEST_MOVE = 0.1  # in a step, as a fraction of `scale`
+
+
+class Relief(NamedTuple):
+    """Result of a relief."""
+
+    steps: int
+    excess: float  # largest kick of the first step over the thermal momentum; good at 1 or below
+
+
+def relieve(
+    model: Model,
+    engine: Engine,
+    state: State,
+    radius: np.ndarray,
+    scale: float,
+    thermal: float,
+    dt: float,
+    stop: Callable[[], bool] = lambda: False,
+) -> Relief:
+    """Steepest descent with bounded moves, in place, until the kicks of the first step are no longer too large.
+
+    radius (species,) : radius of each molecule (Å), which converts angles to moves; scale : the smallest Lennard-Jones
+    diameter (Å). After a move that lowers the energy the next is longer by a fifth; any other move is undone and
+    halved. stop : asked before each step; the relief ends if it is true
+    """
+    load, tallies = engine.evaluate(state)
+    left = float(kicks(model, load, thermal, dt).max())
+    if left <= 1:
+        return Relief(0, left)
+    energy = sum(tally.energy for tally in tallies.values())
+    length = LONGEST_MOVE * scale
+    arm = np.where(radius > 0, radius, 1.0)[model.species][: len(state.rotation), None]
+    free = mobile(model)
+    turning = (model.inertia > 0)[model.species][: len(state.rotation)]
+    for step in range(1, MOST_STEPS + 1):  # noqa: B007  (the count is the answer)
+        if stop():
+            break
+        # Each molecule moves along its own force by at most `length`, so overlaps do not slow down the others.
+        push = load.force * free[:, None] / np.abs(load.force[free]).max()
+        turn = load.torque_body * turning / arm / np.abs(load.force[free]).max()
+        reach = np.linalg.norm(push, axis=1)
+        reach[: len(turn)] = np.maximum(reach[: len(turn)], np.linalg.norm(turn, axis=1))
+        share = length / np.sqrt(reach.max() * np.maximum(reach, 1e-3 * reach.max()))
+        before = state.copy()
+        state.position[:] += push * share[:, None]
+        if len(turn):
+            state.rotation[:] = state.rotation @ from_vector(turn * share[: len(turn), None] / arm)
+        try:
+            new_load, tallies = engine.evaluate(state)
+            new_energy = sum(tally.energy for tally in tallies.values())
+        except BehindWallError:
+            new_load, new_energy = load, inf
+        if new_energy < energy:
+            load, energy, length = new_load, new_energy, min(1.2 * length, LONGEST_MOVE * scale)
+            left = float(kicks(model, load, thermal, dt).max())
+            if left <= 1:
+                break
+        else:
+            state.position[:], state.rotation[:] = before.position, before.rotation
+            length *= 0.5
+            if length < 1e-6 * scale:
+                break
+    return Relief(step, left)

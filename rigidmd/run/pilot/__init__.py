@@ -1,0 +1,1 @@
+"""Pilot runs: they choose an integrator and a time step, and find the longest stable step."""

@@ -1,0 +1,217 @@
+"""The cheapest integrator and time step for an accuracy, found by runs from the start.
+
+Cost is counted in force evaluations, not seconds, so a scene leads to the same choice on every machine. An error of the
+energy is to hold over the whole run: short pilots measure the regular error of each step, `measure.walk` the random
+walk of the energy by truncated forces, and a longer pilot of the best step its slow regular error.
+"""
+
+from dataclasses import replace
+from math import ceil, floor, inf, log10, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.drift import OF_ENERGY
+from rigidmd.core.integrators import Scheme
+from rigidmd.core.state import State
+from rigidmd.errors import SimulationError
+from rigidmd.run.pilot.trials import Subject, Trial, end_of, gap, look
+from rigidmd.run.pilot.walk import Walk, walk
+
+#: Tried in this order. A later one is given up at a step that is too long and costs more.
+CANDIDATES = ("srkn_4", "two_stage", "velocity_verlet", "pefrl", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
+#: Most trials of each, the part of its longest step that is short enough to give up, and the gain worth another trial.
+TRIALS, SHORTEST, GAIN = 16, 4096, 1.1
+#: Most halvings of the reference's step.
+HALVINGS = 12
+#: An interpolated step is shortened by this factor, so that its error falls below the target.
+MARGIN = 0.95
+#: Expected error over a run that is longer than its pilots, in the target: one walk in ten is 1.5 times as large.
+SAFE = 0.65
+#: Part of a run that the pilot of the best step takes; the least and the most of it, in short pilots; how often the
+#: step is corrected by it.
+PART, LEAST, MOST, CORRECTIONS = 0.05, 10.0, 100.0, 3
+#: What makes a walk of the energy smaller.
+REMEDIES = "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy smaller"
+
+
+class Choice(NamedTuple):
+    """The cheapest integrator with its step, and the expected error."""
+
+    integrator: str
+    timestep: float  # in the subject's unit
+    error: float
+    forces: float  # evaluations per unit of time of the span
+    reason: str
+
+
+class _Search:
+    """The longest steps of the candidates within a target for an error (an attribute of `Trial`) over a time."""
+
+    def __init__(self, subject: Subject, target: float, error: str, longest: dict[str, float], exact: State | None):
+        self.subject, self.target, self.error, self.longest, self.exact = subject, target, error, longest, exact
+        self.walk: Walk | None = None
+        self.time = subject.span
+        self.slow: dict[str, float] = {}  # regular errors over a longer pilot, in those of the short one
+        self.found: dict[str, Trial] = {}
+        self.measured: dict[str, Trial] = {}  # the last one of each that has an error
+        self._tried: dict[tuple[str, float], Trial] = {}
+
+    def best(self) -> Trial | None:
+        """The trial with the fewest forces; None if no step tried keeps the error."""
+        self.found = {}
+        for name in CANDIDATES:
+            if name in self.longest:
+                cheapest = min(map(self.cost, self.found.values()), default=inf)
+                if trial := self._longest_good(name, cheapest):
+                    self.found[name] = trial
+        return min(self.found.values(), key=self.cost, default=None)
+
+    def cost(self, trial: Trial) -> float:
+        """Forces per unit of time of the span."""
+        subject = self.subject
+        return subject.methods[trial.integrator].force_evaluations / (trial.timestep * subject.time_size)
+
+    def walked(self, name: str, timestep: float, time: float) -> float:
+        """Mean square of the energy's walk."""
+        scheme = self.subject.methods[name].how
+        if self.walk is None or not isinstance(scheme, Scheme):
+            return 0.0
+        return self.walk.square(scheme, timestep * self.subject.time_size, time)
+
+    def expected(self, trial: Trial, timestep: float | None = None) -> float:
+        """Error over the time; at another step by the order of the integrator."""
+        name, step = trial.integrator, timestep or trial.timestep
+        order = self.subject.methods[name].order
+        regular = self.slow.get(name, 1.0) * getattr(trial, self.error) * (step / trial.timestep) ** order
+        return sqrt(regular**2 + self.walked(name, step, self.time))
+
+    def trial(self, name: str, timestep: float, span: float | None = None) -> Trial:
+        """A trial of an integrator at a step; it ends exactly at the span if trajectories are compared."""
+        subject = self.subject if span is None else replace(self.subject, span=span)
+        n = max(1, ceil(subject.span / (timestep * subject.time_size) * (1 - 1e-12)))
+        if self.exact is not None:
+            timestep = subject.span / n / subject.time_size
+        if span is None and (name, timestep) in self._tried:
+            return self._tried[name, timestep]
+        trial = Trial(name, timestep, n, n * subject.methods[name].force_evaluations)
+        look(subject, trial, self.exact)
+        if span is None:
+            self._tried[name, timestep] = trial
+        return trial
+
+    def step_for(self, trial: Trial) -> float:
+        """The step at which the expected error is the target, by the order of the integrator."""
+        low, high = 1e-6 * trial.timestep, 1e3 * trial.timestep
+        while high > 1.01 * low:
+            middle = sqrt(low * high)
+            low, high = (middle, high) if self.expected(trial, middle) <= self.target else (low, middle)
+        return low
+
+    def _longest_good(self, name: str, cheapest: float) -> Trial | None:
+        """The longest step within the target, by the steps that trials lead to. None if none is, or all cost more."""
+        longest = step = self.longest[name]
+        good, bad = None, inf
+        for _ in range(TRIALS):
+            trial = self.trial(name, step)
+            if not trial.diverged:
+                self.measured[name] = trial
+            if not trial.diverged and self.expected(trial) <= self.target:
+                good = trial
+            elif good is None and (self.cost(trial) > cheapest or step < longest / SHORTEST):
+                return None  # a step that is too long costs more than another integrator
+            else:
+                bad = trial.timestep
+            if good is None:
+                step = step / 2 if trial.diverged else max(rounded_down(MARGIN * self.step_for(trial)), step / 4)
+                continue
+            step = min(MARGIN * self.step_for(good), longest)
+            step = rounded_down(step if step < bad else sqrt(good.timestep * bad))
+            if step < GAIN * good.timestep:
+                return good
+        return good
+
+
+def choose(
+    subject: Subject, target: float, error: str, longest: dict[str, float], duration: float | None = None
+) -> Choice:
+    """The integrator and step with the fewest forces that keep an error (an attribute of `Trial`) below a target.
+
+    longest : the longest step to try of each integrator, in the subject's unit. duration : of the run over which an
+    error of the energy is to hold, if not the span. Raises SimulationError.
+    """
+    exact = _reference(subject, target) if error == "trajectory_error" else None
+    search = _Search(subject, target, error, longest, exact)
+    first = search.best()
+    if first is None:
+        least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
+        reached = "" if least is None else (
+            f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {subject.time_unit}"
+        )  # fmt: skip
+        raise SimulationError(f"no integrator keeps its error below {target:g} with any step tried{reached}")
+    best = first
+    per = "ps" if subject.time_unit == "fs" else "s"
+    value, over, words = getattr(best, error), f"over {subject.span:.3g} {per}", ""
+    if duration is not None and duration > subject.span:
+        best, value, words = _over(search, best, duration)
+        over = f"over {duration:.4g} {per}"
+    cost, before = search.cost(best), search.cost(first)
+    kind = OF_ENERGY if error == "energy_rms" else "error of the trajectory"
+    reason = f"{kind} {value:.1e} {over} for a target of {target:g}{words}; {cost:.4g} forces per {per}"
+    common = search.measured.get("velocity_verlet")
+    if common is not None and best.integrator != "velocity_verlet":
+        step = min(search.step_for(common), longest["velocity_verlet"])
+        fewer = search.cost(common) * common.timestep / step / cost
+        reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {subject.time_unit}"
+    if value > target:
+        reason += f"; no step tried keeps the target over that time: {REMEDIES}"
+    elif cost > 1.5 * before and search.walked(best.integrator, best.timestep, search.time) > 0.1 * value**2:
+        reason += f"; {cost / before:.1f} times as many as for {subject.span:.3g} {per} only: {REMEDIES}"
+    return Choice(best.integrator, best.timestep, value, cost, reason)
+
+
+def _over(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
+    """The best trial for a run that is longer than its pilots, its expected error, and in words how it was found."""
+    span, target = search.subject.span, search.target
+    search.walk, search.time = walk(search.subject, first.timestep), duration
+    search.target = SAFE * target
+    long = min(duration, MOST * span, max(LEAST * span, PART * duration))
+    best, value, seen = first, search.expected(first), first
+    for _ in range(CORRECTIONS):
+        if (found := search.best()) is None:
+            break
+        best, seen = found, search.trial(found.integrator, found.timestep, long)
+        name, step = best.integrator, best.timestep
+        if seen.diverged:
+            search.longest[name] = step / 2
+            continue
+        there = search.walked(name, step, long)
+        square = max(seen.energy_rms**2, 2 * float(np.var(seen.energies)))  # the start may be in the midst of the error
+        value = sqrt(square + search.walked(name, step, duration) - there)
+        if value <= (1 + SAFE) / 2 * target:
+            break
+        regular = sqrt(max(square - there, best.energy_rms**2))
+        search.slow[name] = max(1.2 * search.slow.get(name, 1.0), regular / (best.energy_rms or regular or 1.0))
+    pilot = seen.steps * seen.timestep * search.subject.time_size
+    return best, value, f" (expected, from {seen.energy_rms:.1e} in a pilot of {pilot:.3g} ps)"
+
+
+def rounded_down(step: float) -> float:
+    """A step rounded down to three digits."""
+    unit = 10.0 ** (floor(log10(step)) - 2)
+    return float(f"{floor(step / unit) * unit:.3g}")
+
+
+def _reference(subject: Subject, target: float) -> State:
+    """The state at the end of the span, exact to a tenth of the target. Raises SimulationError."""
+    method = subject.methods[subject.reference]
+    steps = 16
+    before = end_of(subject, method, steps)
+    for _ in range(HALVINGS):
+        steps *= 2
+        now = end_of(subject, method, steps)
+        rotation, position = gap(now, before)
+        if (position if rotation != rotation else rotation) <= 0.1 * target:
+            return now
+        before = now
+    raise SimulationError(f"no reference is exact to a tenth of trajectory_error = {target:g}")

@@ -1,0 +1,143 @@
+"""What a time step does to averages, estimated from the mean square frequency alone.
+
+A symplectic step conserves a Hamiltonian of its own. Of kick, drift, kick it is, to O(dt²),
+
+    H' = H + dt² (p.M⁻¹ U" M⁻¹ p/12 - F.M⁻¹ F/24)
+
+(Leimkuhler & Matthews 2015, Molecular Dynamics, chapters 3 and 7), and the same with torques and moments of inertia.
+The motions of a liquid come into equilibrium with one another in H', at a temperature T' that the thermostat sets. With
+W = <F.M⁻¹ F>/kT = <tr M⁻¹ U">, the sum of w² over f degrees of freedom, exp(-H'/kT') expanded about exp(-H/kT) gives
+
+    <p.M⁻¹ p> = kT' (f - dt² W/6)                            at the ends of steps
+    <U> - <U>_exact = dt² W kT (1 - a)/24 + C (T' - T),      a = d ln W/d ln T, C = d<U>/dT
+
+A thermostat at the ends of steps holds the kinetic energy there: T'/T = 1 + dt² W/(6 f). In the middle of a drift it is
+higher by dt² W kT/8. BAOAB, which holds that one, has T'/T = 1 - dt² W/(12 f).
+
+Harmonic motions have a = 0 and C = f k/2. With x = dt² W/f, the mean of (w dt)², the bias of U per degree of freedom is
+then (x/24 + x/12) kT = x/8 kT of velocity Verlet, and (x/24 - x/24) kT = 0 of BAOAB: harmonic oscillators have none
+with it at any step. In a liquid the two parts do not cancel, and BAOAB's bias is taken to be as large as one of them.
+"""
+
+from dataclasses import replace
+from math import inf, isfinite, sqrt
+
+import numpy as np
+
+from rigidmd.assemble.stage_flows import row
+from rigidmd.core.state import State
+from rigidmd.engines import Engine
+from rigidmd.engines.system import System
+from rigidmd.errors import SimulationError
+from rigidmd.run.pilot.choice import rounded_down
+from rigidmd.run.pilot.stable_step import stable_angle, stiffest
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BOLTZMANN, FEMTOSECOND
+
+#: Bias of U in kT per degree of freedom, in x.
+BIAS = {"velocity_verlet": 1 / 8, "baoab": 1 / 24}
+#: The heat capacity of water says that C may be twice that of harmonic motions; the bias of velocity Verlet then too.
+ALLOWANCE = {"velocity_verlet": 2.0, "baoab": 1.0}
+#: The same in words.
+BASIS = {
+    "velocity_verlet": "as twice the bias of harmonic motions",
+    "baoab": "as one of two parts that cancel in harmonic motions",
+}
+#: A step of the pilot, and its length, for one radian of the mean motion of translation or rotation, the faster one.
+STEP, SPAN, LOOKS = 0.15, 50.0, 25
+#: Longest step, in the longest stable one of the start: beyond it more than dt² counts.
+LONGEST = 0.5
+
+
+def square_rate(system: System, engine: Engine, state: State, thermal: float) -> tuple[float, float]:
+    """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal` (u Å²/ps²).
+
+    By equipartition <F²/m> = kT sum w², and the same of torques. Exact in the mean over the canonical distribution.
+    """
+    load, _ = engine.evaluate(state)
+    model = system.model
+    translation = float((load.force**2).sum(axis=1) @ model.inverse_mass[model.species]) / thermal
+    if not len(load.torque_body):
+        return translation, 0.0
+    return translation, float((load.torque_body**2 * model.inverse_inertia[model.species]).sum()) / thermal
+
+
+def bias_of_potential(integrator: str, rate: float, timestep: float) -> float:
+    """Estimated size of the bias of U, kT per degree of freedom; rate : mean w² of one, 1/ps²; timestep : ps."""
+    return BIAS[integrator] * rate * timestep**2
+
+
+def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, str]:
+    """Stage k decided so that it keeps its bias_kT with the fewest forces, from a state on; and in words why.
+
+    With a thermostat that the stage names: that one, at the ends of velocity Verlet's steps, and Langevin's in BAOAB
+    too. With none: velocity Verlet with velocity rescaling, or BAOAB with Langevin's. Raises SimulationError.
+    """
+    stage = system.scene.stages[k]
+    target = stage.bias_kT
+    if target is None:
+        raise ValueError("no bias is asked for")
+    found = stiffest(system, state)
+    rate = mean_square_rate(system, state, k)
+    steps = {}
+    for integrator in BIAS:
+        if integrator == "baoab" and not _may_use_langevin(stage):
+            continue
+        decided = _decided(stage, integrator, stage.timestep_fs)
+        stable = LONGEST * stable_angle(decided.scheme) / found.rate if found else inf
+        good = sqrt(target / (ALLOWANCE[integrator] * BIAS[integrator] * rate)) if rate > 0 else inf
+        step = min(good, stable, stage.duration)
+        steps[integrator] = rounded_down(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
+    best = max(steps, key=lambda name: (steps[name], -BIAS[name]))
+    step = steps[best] * FEMTOSECOND
+    bias = ALLOWANCE[best] * bias_of_potential(best, rate, step)
+    return _decided(stage, best, steps[best]), (
+        f"bias of U below about {bias:.1e} kT per degree of freedom, where {target:g} was asked for: estimated from "
+        f"{sqrt(rate):.3g} rad/ps, the rms frequency of the motions, {BASIS[best]}, not sampled; "
+        f"{1 / step:.4g} forces per ps"
+    )
+
+
+def _may_use_langevin(stage: Stage) -> bool:
+    """Whether the stage has Langevin's thermostat, or says nothing of its thermostat."""
+    return stage.leaves_thermostat or stage.thermostat == "langevin"
+
+
+def _decided(stage: Stage, integrator: str, timestep_fs: float) -> Stage:
+    decided = stage.decided(integrator, timestep_fs)
+    if integrator == "baoab":
+        decided = decided.model_copy(update={"thermostat": "langevin"})
+    return decided.resolved
+
+
+def mean_square_rate(system: System, state: State, k: int) -> float:
+    """Mean w² of a degree of freedom (1/ps²) in stage k, over the second half of a pilot run from a state on."""
+    stage = system.scene.stages[k]
+    thermal = BOLTZMANN * max(stage.temperatures)
+    engine, freedom = system.engine(), system.freedom_in(k)
+    first = square_rate(system, engine, state, thermal)
+    fastest = max(sum_ / n for sum_, n in zip(first, freedom, strict=True) if n) if freedom.total else 0.0
+    if fastest == 0 and (found := stiffest(system, state)) is not None:
+        fastest = found.rate**2  # the start is a minimum, where no force says how fast motions are
+    if not isfinite(fastest) or fastest <= 0:
+        return 0.0
+    dt = STEP / sqrt(fastest)
+    stages = list(system.scene.stages)
+    # Langevin's thermostat at a fifth of that rate brings any start to its temperature within the first half
+    heat = {"thermostat": "langevin", "thermostat_time_ps": None, "friction_translation_per_ps": sqrt(fastest) / 5}
+    pilot_stage = stage.decided("baoab", dt / FEMTOSECOND)
+    stages[k] = pilot_stage.model_copy(update=heat | {"friction_rotation_per_ps": None})
+    pilot = replace(system, scene=system.scene.model_copy(update={"stages": tuple(stages)}))
+    scheme = row(pilot, k)
+    moving = engine.begin(state, scheme)
+    moving.step[:] = 0
+    moving.begin_stretch(0.0)
+    every = round(SPAN / STEP / LOOKS)
+    seen = []
+    for look in range(LOOKS):
+        engine.advance(moving, scheme, dt, (look + 1) * every)
+        seen.append(sum(square_rate(system, engine, moving, thermal)))
+    rate = float(np.mean(seen[LOOKS // 2 :])) / freedom.total
+    if not isfinite(rate):
+        raise SimulationError("the pilot run that measures frequencies for bias_kT has no finite forces")
+    return rate

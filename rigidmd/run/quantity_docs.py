@@ -1,0 +1,72 @@
+"""Explanations of the values of `rigidmd energy` whose names are not enough."""
+
+from math import inf
+from typing import cast
+
+import numpy as np
+
+from rigidmd.assemble.electrostatics import NEUTRAL
+from rigidmd.engines.system import System
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.potentials.coulomb import ReactionField
+from rigidmd.forces.potentials.truncation import Plain
+from rigidmd.units import BAR
+
+
+def meanings(system: System) -> dict[str, str]:
+    """Name of an energy component, `virial` or `pressure` -> explanation."""
+    methods = {"reaction_field": _of_reaction_field, "ewald": _of_ewald, "pme": _of_ewald}
+    has = {*system.terms, *system.constants}
+    of_charges = methods.get(system.scene.forces.electrostatics, lambda system: {})(system)
+    found = {name: text for name, text in of_charges.items() if name in has}
+    if system.space.volume < inf:
+        found |= _of_pressure(system)
+    return found
+
+
+def _of_reaction_field(system: System) -> dict[str, str]:
+    """Of a reaction field."""
+    if system.cutoff == inf or "coulomb" not in system.terms:
+        return {}
+    name = system.scene.forces.truncation
+    shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).law).shape
+    start = 0.0 if isinstance(shape, Plain) else shape.start
+    ends = {"plain": "", "shift": ", less its value at the cut-off", "force_shift": ", less its value and slope there"}
+    if name in ends:
+        how = ends[name]
+    elif name == "force_switch":
+        how = f", its force switched off from {start:g} Å on"
+    else:
+        how = f", less its value at the cut-off, times {name} from {start:g} Å on"
+    return {
+        "coulomb": f"q q (1/r + k r²) up to the cut-off{how}",
+        "reaction_field_self": "charges of each molecule in their own reaction field",
+    }
+
+
+def _of_ewald(system: System) -> dict[str, str]:
+    """Of Ewald sums; they depend on whether the real-space energy is shifted."""
+    real, own = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
+    if system.scene.forces.ewald_truncation == "plain":
+        return {"coulomb_real": f"{real}, plain at the cut-off", "coulomb_self": own}
+    charged = any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species)
+    more = (
+        ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is the cut-off"
+        if charged
+        else "; shifted energies add nothing to it, as every molecule is neutral"
+    )
+    return {"coulomb_real": f"{real}, less its value at the cut-off", "coulomb_self": own + more}
+
+
+def _of_pressure(system: System) -> dict[str, str]:
+    """Of virial and pressure: which of them includes constant parts."""
+    virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
+    if system.external:
+        virial += ", of their forces on one another: fields, walls and restraints act from outside and add nothing"
+    if system.tail is not None:
+        virial += ", without the tail correction"
+        pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"
+    if "coulomb_frozen" in system.constants:
+        constant = f"{system.constant_pressure / BAR:.10g} bar"
+        pressure += f", and {constant}, which removes the forces between frozen molecules"
+    return {"virial": virial, "pressure": pressure}

@@ -1,0 +1,166 @@
+"""What the folder of a run holds: its scene, its summary, and the columns of its log or motion."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidmd.assemble.body import build_body
+from rigidmd.assemble.build import build
+from rigidmd.core.state import State
+from rigidmd.engines import samples
+from rigidmd.engines.body_motion import Snapshot, motion
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.columns import BODY
+from rigidmd.engines.system import System
+from rigidmd.errors import CheckpointError, OutputError
+from rigidmd.io.checkpoint import latest
+from rigidmd.io.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
+from rigidmd.io.run_files import Summary, read_columns, read_json
+from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.scene.stage import Stage
+
+#: Name of a column -> its header in log.csv, and back.
+HEADERS = {column.header: name for name, column in samples.COLUMNS.items() if column.header}
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run as its folder tells it.
+
+    summary : None of a run that did not end
+    columns : (t,) each; of molecules by the names of `results[...]`, of a body by those of motion.csv
+    missing : sentences about what is not there, and why
+    """
+
+    folder: Path
+    scene: MolecularScene | BodyScene
+    system: System | BodySystem
+    summary: dict[str, Any] | None
+    columns: dict[str, np.ndarray]
+    missing: list[str]
+
+    @property
+    def is_body(self) -> bool:
+        """Whether it is a single body."""
+        return isinstance(self.scene, BodyScene)
+
+    @property
+    def body(self) -> BodySystem:
+        """The system of a single body. Raises TypeError for molecules."""
+        if not isinstance(self.system, BodySystem):
+            raise TypeError("this is a run of molecules")
+        return self.system
+
+    @property
+    def molecules(self) -> System:
+        """The system of molecules. Raises TypeError for a single body."""
+        if not isinstance(self.system, System):
+            raise TypeError("this is a run of a single body")
+        return self.system
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the samples, ps for molecules, s for a body."""
+        return self.columns["t" if self.is_body else "time"]
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Which samples (t,) are of motion: none of minimisations, in which no time passes."""
+        stages = getattr(self.scene, "stages", ())
+        return np.array(
+            [not (stages and stages[k].is_minimisation) for k in self.columns.get("stage", self.time)], bool
+        )
+
+    @property
+    def time_unit(self) -> str:
+        """Of `time`."""
+        return "s" if self.is_body else "ps"
+
+
+def read_record(folder: Path) -> Record:
+    """Read the folder of a run, ended or not. Raises OutputError if it is none, or holds nothing to look at."""
+    check_is_run(folder)
+    scene = Scene.read(folder / SCENE)
+    summary, missing = _summary(folder)
+    if isinstance(scene, BodyScene):
+        system = build_body(scene)
+        columns = _motion(folder, system, missing)
+    else:
+        system = build(scene, bare=True)
+        columns = _log(folder, scene.stages)
+    if not columns or len(next(iter(columns.values()))) == 0:
+        raise OutputError(
+            f"{folder}: the run wrote no samples yet; `rigidmd resume {shlex.quote(str(folder))}` goes on with it"
+        )
+    return Record(folder, scene, system, summary, columns, missing)
+
+
+def _summary(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
+    found = read_json(folder / SUMMARY, Summary)
+    if found is None:
+        return None, [
+            f"This run has not ended: there is no {SUMMARY}. What follows is what it wrote so far; "
+            f"`rigidmd resume {shlex.quote(str(folder))}` goes on with it."
+        ]
+    ended = "This run was interrupted; what follows is what it wrote so far."
+    return found.model_dump(exclude_unset=True), [ended] if found.interrupted else []
+
+
+def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
+    """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
+    read = read_columns(folder / LOG)
+    if read is None:
+        raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
+    headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
+    if lacking := [name for name in ("time", "stage_name") if name not in headers]:
+        raise OutputError(f"{read.path} is no log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
+    found = {
+        name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
+        for name, header in headers.items()
+    }
+    return found | {"stage": _stage_of(found["stage_name"], found["time"], stages)}
+
+
+def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
+    """Index of the stage of each line. Several stages may have one name; their times tell them apart."""
+    found, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
+    for k, stage in enumerate(stages[:-1]):
+        end += stage.duration
+        own = (names[first:] == stage.label) & (time[first:] <= end + 0.5e-3 * stage.timestep_fs)
+        count = len(own) if own.all() else int(own.argmin())
+        found[first : first + count] = k
+        first += count
+    return found
+
+
+def _columns_of(system: BodySystem) -> list[str]:
+    """Columns that every motion of a body has."""
+    families = ["time", "position", "kinetic", "potential", "energy", "work"]
+    if system.turns:
+        families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
+    return [name for family in families for name in BODY[family].names]
+
+
+def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
+    """Columns of motion.csv; of a run that did not write it, those of its last checkpoint."""
+    if (found := read_columns(folder / MOTION)) is not None:
+        needed = _columns_of(system)
+        if lacking := [name for name in needed if name not in found.cells]:
+            raise OutputError(f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}")
+        return {header: found.numbers(header, finite=header in needed) for header in found.cells}
+    try:
+        kept, _ = latest(folder)
+    except CheckpointError:
+        return {}
+    for owner in kept.told.get("of", {}):
+        part = kept.of(owner).arrays
+        if "t" in part and set(State._fields) <= set(part):
+            states = zip(*(part[name] for name in State._fields), strict=True)
+            snapshots = [Snapshot(t, State(*state)) for t, state in zip(part["t"].tolist(), states, strict=True)]
+            missing.append(f"{MOTION} is written at the end; the motion shown is that of the last checkpoint.")
+            return motion(system, snapshots).columns
+    return {}

@@ -1,0 +1,160 @@
+"""Reports of a run: summary.json, the summary as text, and energy.png."""
+
+from collections.abc import Container
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigidmd.io.write import write_json
+
+if TYPE_CHECKING:
+    pass
+from rigidmd.figures.run import NO_ERROR, signed
+
+POSITIONS = {
+    "unwrapped": "molecules follow continuous paths",
+    "wrapped": "molecules are wrapped into the box; displacements need unwrapped frames",
+}
+
+
+def write_summary(path: Path, summary: dict) -> None:
+    """summary.json."""
+    write_json(path, summary, indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def summary_text(summary: dict, known: Container[str] = ()) -> str:
+    """The summary as text, without the notes that the reader knows."""
+    species = ", ".join(f"{count} {name}" for name, count in summary["species"].items())
+    freedom = summary["degrees_of_freedom"]
+    lines = [
+        f"{summary['scene']}: {species}; {summary['molecules']} bodies, {summary['sites']} sites, {freedom} degrees of "
+        f"freedom ({summary['degrees_of_freedom_translation']} translation, "
+        f"{summary['degrees_of_freedom_rotation']} rotation)"
+    ]
+    for stage in summary["stages"]:
+        lines += ["", stage_title(stage)]
+        lines += [f"  {name:<16}{value}" for name, value in stage_rows(stage)]
+    lines += ["", f"  {'orthogonality':<16}|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"]
+    lines.append(
+        f"  {'momentum':<16}|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, "
+        f"{summary['momentum_relative']:.1e} of the sum of |m v|"
+    )
+    if removed := summary["momentum_removed"]:
+        lines.append(
+            f"  {'':<16}removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"
+        )
+    if summary["positions"]:
+        lines.append(f"  {'positions':<16}{summary['positions']}: {POSITIONS[summary['positions']]}")
+    lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
+    if summary["interrupted"]:
+        lines += ["", "  interrupted: these are the results so far"]
+    return "\n".join(lines)
+
+
+def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
+    """The summary of a single body's run as text, without the notes that the reader knows."""
+    lines = [f"\n{body_title(summary)}", *(f"  {name:<16}{value}" for name, value in body_rows(summary))]
+    lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
+    if summary["interrupted"]:
+        lines += ["", "  interrupted: these are the results so far"]
+    return "\n".join(lines)
+
+
+def body_title(summary: dict) -> str:
+    """Steps and speed of a single body's run."""
+    speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
+    return f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"
+
+
+def body_rows(summary: dict) -> list[tuple[str, str]]:
+    """Name and value of what a single body's run found."""
+    rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
+    if summary["work_J"]:
+        rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
+    if summary["theta_range_deg"]:
+        low, high = summary["theta_range_deg"]
+        rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
+    for name, error in summary["largest_relative_error"].items():
+        of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
+        rows.append((f"{name} error", f"at most {error:.1e} of {of}"))
+    if summary["largest_orthogonality_error"] is not None:
+        rows.append(("orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"))
+    return rows
+
+
+def stage_title(stage: dict) -> str:
+    """Steps and speed of a stage, or how its minimisation ended."""
+    if found := stage["minimum"]:
+        ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
+        relief = f" and {found['relief_steps']} of relief" if found["relief_steps"] else ""
+        return f"{stage['name']}: {ended} after {found['iterations']} iterations{relief}; {stage['computing_s']:.1f} s"
+    title = f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs, {stage['duration_ps']:g} ps"
+    if stage["steps_per_s"]:
+        title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:.3g} ns/day"
+    return title
+
+
+def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
+    before, after = found["energy_before_kJ_mol_per_molecule"], found["energy_after_kJ_mol_per_molecule"]
+    rows = [("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after")]
+    torque = f", torque {found['largest_torque_kJ_mol']:.2g} kJ/mol"
+    rows.append(("largest force", f"{found['largest_force_kJ_mol_A']:.2g} kJ/(mol Å){torque}"))
+    if found["pressure_bar"] is not None:
+        off = found["largest_pressure_deviation_bar"]
+        more = "" if off is None else f", within {off:.2g} bar of the one asked for"
+        rows.append(("pressure", f"{found['pressure_bar']:.4g} bar without the kinetic part{more}"))
+    if stage.get("density_g_cm3") is not None:
+        rows.append(("density", f"{stage['density_g_cm3']:.4f} g/cm³"))
+        edges = (f"{edge} {stage[f'{edge}_A']:.4f}" for edge in "abc")
+        rows.append(("box", f"{', '.join(edges)} Å"))
+    return rows
+
+
+def stage_rows(stage: dict) -> list[tuple[str, str]]:
+    """Name and value of what a stage found; a row without a name belongs to the one before it."""
+    if stage["minimum"]:
+        return _minimum_rows(stage, stage["minimum"])
+    rows = [("integrator", stage["choice"])] if stage["choice"] else []
+    if stage["temperature_K"] is not None:
+        parts = _temperatures(stage, "K")
+        value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
+        rows.append(("temperature", f"{value} ({parts})"))
+        if parts := _temperatures(stage, "unbiased_K"):
+            rows.append(("", f"{parts} without the error of the time step"))
+    rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
+    if stage["pressure_bar"] is not None:
+        rows.append(("pressure", _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")))
+    if stage.get("density_g_cm3") is not None:
+        rows.append(("density", _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³")))
+        edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
+        rows.append(("box", f"{', '.join(edges)} Å"))
+    if stage["moves_tried"]:
+        share = stage["moves_accepted"] / stage["moves_tried"]
+        rows.append(("box moves", f"{stage['moves_tried']}, {100 * share:.0f} % accepted"))
+    if stage["drift_kJ_mol_ns_per_molecule"] is not None:
+        what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
+        value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
+        rows.append(("drift", f"{signed(value, error)} kJ/mol/ns per molecule ({what})"))
+        if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
+            value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
+            rows.append(("", f"{signed(value, error)} kT/ns per degree of freedom"))
+        if stage["drift_over_kinetic_std"] is not None:
+            rows.append(
+                ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in total")
+            )
+        rows.append(
+            ("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line")
+        )
+    return rows
+
+
+def _with_error(value: float, error: float | None, places: int, unit: str = "") -> str:
+    told = f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+    return f"{told} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
+
+
+def _temperatures(stage: dict, ending: str) -> str:
+    values = (
+        ("T_trans", stage[f"temperature_translation_{ending}"]),
+        ("T_rot", stage[f"temperature_rotation_{ending}"]),
+    )
+    return ", ".join(f"{name} {value:.2f}" for name, value in values if value is not None)

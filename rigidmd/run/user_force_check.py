@@ -1,0 +1,133 @@
+"""Whether forces of users are what their energies say: differences of energies, for a few molecules and for the box."""
+
+from collections.abc import Callable
+from functools import partial
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidmd.core.state import Load, State
+from rigidmd.engines import Engine
+from rigidmd.errors import SceneError
+from rigidmd.mechanics.rotation import from_vector
+from rigidmd.units import KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
+
+#: How far molecules are moved, in diameters of the smallest; a force is right if either step says so. Two, because a
+#: pair that crosses a cut-off at which the energy jumps spoils a difference.
+STEPS = (1e-4, 1e-5)
+#: A difference may be off by this much of the largest force, torque or virial of the term.
+WITHIN = 1e-4
+#: Components of a strain that leave a lower triangular; the six that a box may have.
+COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
+#: Rounding of an energy, in parts of its size.
+ROUNDING = 1e-13
+
+
+def check_forces(system: "System", state: State) -> None:
+    """Compare the user's own forces with their energies. Raises SceneError with the numbers of those that are wrong."""
+    faults = []
+    for name in system.own:
+        engine = system.engine_of({name: system.terms[name]}, "double")
+        energy = partial(_energy, engine, name)
+        load, tallies = engine.evaluate(state)
+        tally = tallies[name]
+        if not np.isfinite(tally.energy):
+            faults.append(f"{name}: its energy at the start is {tally.energy}")
+            continue
+        noise = ROUNDING * max(abs(tally.energy), np.abs(load.force).sum() * system.smallest_diameter)
+        found = _of_molecules(system, state, name, load, energy, noise)
+        found = found or _of_box(system, state, name, tally.virial, energy, noise)
+        faults += [found] if found else []
+    if faults:
+        raise SceneError(system.scene.source, faults)
+
+
+def _energy(engine: Engine, name: str, state: State) -> float:
+    return engine.evaluate(state)[1][name].energy
+
+
+def _of_molecules(
+    system: "System", state: State, name: str, load: Load, energy: Callable[[State], float], noise: float
+) -> str:
+    """What is wrong with forces and torques on the two molecules with the largest and one with a middling one; empty if
+    nothing is."""
+    rng = np.random.default_rng(0)
+    for kind, acting, unit in (("force", load.force, "kJ/mol/Å"), ("torque", load.torque_body, "kJ/mol")):
+        size = np.linalg.norm(acting, axis=1)
+        if not len(size):
+            continue
+        ranked = np.argsort(size, kind="stable")
+        radii = np.array([m.radius for m in system.species])[system.model.species]
+        for m in dict.fromkeys(ranked[[-1, -min(2, len(ranked)), len(ranked) // 2]].tolist()):
+            if kind == "torque" and not radii[m]:
+                continue
+            along = rng.standard_normal(3) + (acting[m] / size[m] if size[m] else 0.0)
+            if kind == "torque":
+                along *= system.model.inertia[system.model.species[m]] > 0
+            if not along.any():
+                continue
+            along /= np.linalg.norm(along)
+            said, seen = float(acting[m] @ along), []
+            for share in STEPS:
+                step = share * (system.smallest_diameter if kind == "force" else 1.0)
+                sides = [energy(_moved(state, kind, m, sign * step * along)) for sign in (1, -1)]
+                seen.append((sides[1] - sides[0]) / (2 * step))
+                if abs(seen[-1] - said) <= WITHIN * size.max() + noise / step:
+                    break
+            else:
+                where = "the lab's axes" if kind == "force" else "the axes of its body"
+                return (
+                    f"{name}: the {kind} on molecule {m + 1} ({system.species[system.model.species[m]].name}) is not "
+                    f"the derivative of the energy: along ({', '.join(f'{x:.3f}' for x in along)}) in {where} it is "
+                    f"{said / KJ_PER_MOL:.8g} {unit}, and the energy falls by {seen[0] / KJ_PER_MOL:.8g} {unit}"
+                )
+    return ""
+
+
+def _moved(state: State, kind: str, m: int, by: np.ndarray) -> State:
+    """A copy of a state with a molecule moved (Å, lab) or turned (rad, body axes)."""
+    moved = state.copy()
+    if kind == "force":
+        moved.position[m] += by
+    else:
+        moved.rotation[m] = moved.rotation[m] @ from_vector(by)
+    return moved
+
+
+def _of_box(
+    system: "System", state: State, name: str, virial: np.ndarray, energy: Callable[[State], float], noise: float
+) -> str:
+    """What is wrong with the virial, where there is a box to stretch; empty if nothing is."""
+    if state.volume == inf or name in system.tied_to_places:
+        return ""
+    size = max(float(np.abs(virial).sum()), noise)
+    for i, j in COMPONENTS:
+        said, seen = float(virial[j, i]), []
+        for step in (1e-5, 1e-6, 1e-7):
+            ends = [energy(_strained(state, i, j, sign * step)) for sign in (1, -1)]
+            seen.append((ends[1] - ends[0]) / (2 * step))
+            if abs(seen[-1] - said) <= WITHIN * max(size, abs(seen[-1])) + noise / step:
+                break
+        else:
+            break
+    else:
+        return ""
+    axes = f"{'xyz'[j]}{'xyz'[i]}"
+    advice = "add it" if not virial.any() else "mend it"
+    return (
+        f"{name}: the component {axes} of its molecular virial is {said / KJ_PER_MOL:.8g} kJ/mol, and when box and "
+        f"centres of mass are stretched the energy falls by {seen[0] / KJ_PER_MOL:.8g} kJ/mol: {advice}, or, if the "
+        "energy depends on places in the lab, say tied_to_places = True in its class"
+    )
+
+
+def _strained(state: State, i: int, j: int, by: float) -> State:
+    """A copy of a state with centres of mass and cell strained, x_j += by x_i (lab)."""
+    strained = state.copy()
+    for array in (strained.position, strained.cell):
+        array[:, j] += by * array[:, i]
+    return strained

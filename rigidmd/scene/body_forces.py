@@ -1,0 +1,179 @@
+"""Tables of a scene that act on a single body: fields, forces, friction, fluids, frames, wheels. SI units."""
+
+from itertools import pairwise
+from math import inf
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from rigidmd.mechanics.inertia import impossible
+from rigidmd.scene.validation import NonNegative, Number, Positive, Section, Vector
+
+NonNegativeVector = tuple[NonNegative, NonNegative, NonNegative]
+PositiveVector = tuple[Positive, Positive, Positive]
+Times = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
+
+
+class Gravity(Section):
+    """A uniform field."""
+
+    acceleration_m_s2: Vector = (0.0, 0.0, -9.81)
+    """Along the lab's (or frame's) axes"""
+
+
+class Timed(Section):
+    """Quantities that are constant, limited to a window of time, or interpolated linearly in a table."""
+
+    times_s: Times | None = None
+    """Increasing times; each quantity is then a list of as many values"""
+    from_s: NonNegative | None = None
+    """Begin"""
+    to_s: NonNegative | None = None
+    """End"""
+
+    @field_validator("times_s")
+    @classmethod
+    def _increase(cls, times):
+        for k, (a, b) in enumerate(pairwise(times or ())):
+            if not b > a:
+                raise ValueError(f"must increase: entry {k + 1} is {b:g} after {a:g}")
+        return times
+
+    def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
+        """Faults between the times and these quantities; a single value is of type `entry`."""
+        faults, times = [], self.times_s
+        if times is not None and (self.from_s is not None or self.to_s is not None):
+            faults.append("from_s and to_s would do nothing beside times_s")
+        if not (self.to_s is None or self.to_s > (self.from_s or 0)):
+            faults.append(f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}")
+        for key, value in values.items():
+            if value is None:
+                continue
+            if value == ():
+                faults.append(f"{key} is an empty list")
+                continue
+            many = isinstance(value, tuple) and (entry is float or isinstance(value[0], tuple))
+            if times is None and many:
+                faults.append(f"{key} is a list of values: times_s is missing")
+            elif times is not None and not many:
+                faults.append(f"{key} is one value: with times_s it must be a list of {len(times)}")
+            elif times is not None and len(value) != len(times):
+                faults.append(f"{key} has {len(value)} values for {len(times)} times")
+        return faults
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Begin and end."""
+        return self.from_s or 0.0, inf if self.to_s is None else self.to_s
+
+
+class Applied(Timed):
+    """An external force and torque."""
+
+    axes: Literal["lab", "body"] = "lab"
+    """Axes of the components: fixed in the lab, or turning with the body"""
+    force_N: Vector | tuple[Vector, ...] | None = None
+    """Force"""
+    torque_N_m: Vector | tuple[Vector, ...] | None = None
+    """Torque in addition to that of the force"""
+    at_m: Vector | None = None
+    """Point of action, body axes, from the centre of mass or the pivot; default: that point itself"""
+
+    def _faults(self):
+        yield from self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
+        if self.force_N is None and self.torque_N_m is None:
+            yield "needs force_N or torque_N_m"
+        if self.at_m is not None and self.force_N is None:
+            yield "at_m would do nothing without force_N"
+
+
+class Friction(Section):
+    """Friction of bearings, about the body's axes, relative to the frame."""
+
+    viscous_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity, about each axis"""
+    dry_N_m: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque against any turning, about each axis"""
+
+
+class Fluid(Section):
+    """A fluid at rest around the body: resistance, buoyancy, added mass. Along the body's axes."""
+
+    linear_resistance_kg_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Force per velocity"""
+    quadratic_resistance_kg_m: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Force per velocity squared"""
+    linear_rotational_resistance_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity"""
+    quadratic_rotational_resistance_N_m_s2: NonNegativeVector = (0.0, 0.0, 0.0)
+    """Torque per angular velocity squared"""
+    density_kg_m3: Positive | None = None
+    """Density of the fluid, from which displaced and added mass of a sphere or ellipsoid follow"""
+    displaced_mass_kg: NonNegative | None = None
+    """Mass of the fluid displaced: buoyancy is its weight"""
+    centre_of_buoyancy_m: Vector | None = None
+    """Point where buoyancy acts, body axes, from the centre of mass or the pivot; default: the centre of mass"""
+    added_mass_kg: NonNegativeVector | None = None
+    """Mass of fluid carried along each axis"""
+    added_inertia_kg_m2: NonNegativeVector | None = None
+    """Inertia of fluid carried about each axis"""
+
+
+class Frame(Timed):
+    """A frame with turning axes or an accelerated origin; the motion is relative to it."""
+
+    angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
+    """Of the frame, along its own axes"""
+    angular_acceleration_rad_s2: Vector | None = None
+    """Of the frame, along its own axes, constant from the start"""
+    origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
+    """Of the frame's origin, along the frame's axes; the body feels the opposite acceleration"""
+
+    def _faults(self):
+        timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
+        yield from self.timing_faults(timed, tuple)
+        if self.from_s is not None or self.to_s is not None:
+            yield "from_s and to_s are not supported here; use times_s"
+        if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
+            yield "angular_acceleration_rad_s2 and times_s contradict each other"
+        if all(value is None for value in timed.values()) and self.angular_acceleration_rad_s2 is None:
+            yield "needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2"
+
+
+class Wheel(Timed):
+    """A rotor on an axis fixed in the body. The inertia of the body includes the wheel, except that about this axis."""
+
+    axis: Vector
+    """Direction of the axis, body axes, of any length"""
+    momentum_kg_m2_s: Number = 0.0
+    """Initial angular momentum along the axis, relative to the lab"""
+    motor_torque_N_m: Number | tuple[Number, ...] | None = None
+    """Torque of its motor on the wheel; the body feels the opposite"""
+
+    def _faults(self):
+        yield from self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
+        if not any(self.axis):
+            yield "axis is zero, which is not a direction"
+        idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
+        if self.motor_torque_N_m is None and idle:
+            yield f"{', '.join(idle)} would do nothing without motor_torque_N_m"
+
+
+class ChangingInertia(Timed):
+    """Principal moments as given functions of time, along fixed body axes; mass and centre of mass do not change.
+
+    About the centre of mass, which must be the pivot of a pinned body.
+    """
+
+    inertia_kg_m2: tuple[PositiveVector, ...]
+    """Principal moments at each time"""
+
+    def _faults(self):
+        timed = {"inertia_kg_m2": self.inertia_kg_m2}
+        yield from ["times_s is missing"] if self.times_s is None else self.timing_faults(timed, tuple)
+        if self.from_s is not None or self.to_s is not None:
+            yield "from_s and to_s are not supported here; use times_s"
+        for k, moments in enumerate(self.inertia_kg_m2):
+            if why := impossible(np.diag(moments)):
+                yield f"no body has the inertia of entry {k}: {why}"

@@ -1,0 +1,422 @@
+"""Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds published models."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+from scipy.spatial import KDTree
+
+from rigidmd.core.toml import impossible_values, read_toml
+from rigidmd.errors import MoleculeError
+from rigidmd.mechanics.inertia import Kind, principal_frame, rotational_freedom
+from rigidmd.scene.validation import (
+    Line,
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    Vector,
+    faults_of,
+    meant,
+    numbers_beyond,
+    place,
+)
+from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
+
+MODELS = Path(__file__).parent.parent / "models"
+#: Absolute values of the numbers of molecules, in Å, u, e, kJ/mol, ps, unless they are 0: products of a few are finite.
+SIZES = (1e-30, 1e30)
+
+#: Of one rigid molecule.
+MOST_SITES = 5000
+#: Two sites closer than this fraction of the molecule's size count as coinciding.
+SAME_PLACE = 1e-6
+#: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
+OFF_AXIS = 1e-4
+MOST_PARAMETERS = 100  # of one site
+
+
+#: Keys of a site of which both or none are given.
+DEPTHS = ("epsilon_kJ_mol", "epsilon_kcal_mol", "epsilon_K")
+LENNARD_JONES = ("sigma_A", *DEPTHS)
+
+#: Names of sites and residues that every structure format can hold: one to five visible ASCII characters.
+SiteName = Annotated[str, Field(pattern=r"^[!-~]{1,5}$")]
+
+
+class Site(Section):
+    """A point of a rigid molecule with optional mass, charge and Lennard-Jones parameters."""
+
+    name: SiteName
+    """Name in trajectories and topology files, at most five characters"""
+    element: str = "X"
+    """Chemical symbol; X for a site without mass"""
+    mass_u: NonNegative | None = None
+    """Mass; 0 for a massless site. With `file` the default follows from the element"""
+    position_A: Vector | None = None
+    """Position in any frame fixed in the molecule; with `file` it is taken from there"""
+    charge_e: Number | None = None
+    """Charge in elementary charges"""
+    sigma_A: Positive | None = None
+    """Lennard-Jones diameter"""
+    epsilon_kJ_mol: NonNegative | None = None
+    """Lennard-Jones well depth"""
+    epsilon_kcal_mol: NonNegative | None = None
+    """Lennard-Jones well depth; 1 kcal is 4.184 kJ"""
+    epsilon_K: NonNegative | None = None
+    """Lennard-Jones well depth over Boltzmann's constant"""
+    parameters: dict[str, Number] = Field(default={}, max_length=MOST_PARAMETERS)
+    """Numbers for pair laws of one's own, by their names"""
+
+    @model_validator(mode="after")
+    def _lennard_jones_is_whole(self):
+        given = [key for key in DEPTHS if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give one of {', '.join(given)}, not {'both' if len(given) == 2 else 'all'}")
+        if bool(given) != (self.sigma_A is not None):
+            raise ValueError(f"a Lennard-Jones site needs both sigma_A and one of {', '.join(DEPTHS)}")
+        return self
+
+    @property
+    def epsilon(self) -> float:
+        """Well depth in u Å²/ps²; 0 without one."""
+        kilojoules, kilocalories = (self.epsilon_kJ_mol or 0.0), (self.epsilon_kcal_mol or 0.0)
+        return kilojoules * KJ_PER_MOL + kilocalories * ENERGY_UNITS["kcal/mol"] + (self.epsilon_K or 0.0) * BOLTZMANN
+
+
+Mixing = Literal["lorentz-berthelot", "geometric"]
+
+#: In the order of `rigidmd models`.
+GROUPS = ("water", "ion", "noble gas", "gas", "organic", "other")
+
+
+class MoleculeFile(Section):
+    """A file of `models/`."""
+
+    name: Line = Field(min_length=1)
+    title: str = ""
+    group: Literal[GROUPS] = "other"  # type: ignore[valid-type]
+    """Group in the list of `rigidmd models`"""
+    source: str = ""
+    """Source of the numbers"""
+    note: str = ""
+    """Advice for its users"""
+    mixing: Mixing | None = None
+    """Mixing rule of the model, if its sites have several kinds of parameters"""
+    residue_names: tuple[SiteName, ...] = ()
+    sites: tuple[Site, ...] = Field(min_length=1)
+
+
+class ParameterFile(Section):
+    """A table of parameters that several molecules may share; the key `parameters` of a scene names it."""
+
+    title: str = ""
+    source: str = ""
+    sites: tuple[Site, ...] = Field(min_length=1)
+    """Keyed by site name, or else by element"""
+
+
+@dataclass(frozen=True, eq=False)
+class Molecule:
+    """A rigid molecule in its principal frame, centre of mass at the origin.
+
+    masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²; inertia (3,) u Å²,
+    ascending; 0 about an axis on which the whole mass lies.
+    """
+
+    name: str
+    title: str
+    source: str
+    residue_names: tuple[str, ...]
+    site_names: tuple[str, ...]
+    elements: tuple[str, ...]
+    masses: np.ndarray
+    positions_body: np.ndarray
+    charges: np.ndarray
+    sigma: np.ndarray
+    epsilon: np.ndarray
+    mass: float
+    inertia: np.ndarray
+    kind: Kind
+    group: str = "other"
+    note: str = ""
+    mixing: Mixing | None = None
+    parameters: tuple[dict[str, float], ...] = ()  # of each site, for pair laws of users
+
+    def __repr__(self) -> str:
+        return f"<Molecule {self.name}: {self.words}>"
+
+    @property
+    def marks(self) -> tuple[float, ...]:
+        """Mass, u, moments of inertia, u Å², and number of sites (5,): by them a saved state knows its model."""
+        return (self.mass, *map(float, self.inertia), float(len(self.masses)))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Degrees of freedom: three of translation and those of rotation."""
+        return 3 + rotational_freedom(self.kind)
+
+    @property
+    def charge(self) -> float:
+        """Net charge in e; exactly 0 if the charges of the sites cancel to rounding."""
+        total = float(self.charges.sum())
+        return 0.0 if abs(total) <= 1e-12 * np.abs(self.charges).sum() else total
+
+    @property
+    def dipole_debye(self) -> float:
+        """Dipole moment about the centre of mass in debye (1 e Å = 4.80320471 D)."""
+        return float(np.linalg.norm(self.charges @ self.positions_body)) / DEBYE
+
+    @property
+    def has_dipole(self) -> bool:
+        """Whether the dipole moment about the centre of mass is more than rounding."""
+        scale = SAME_PLACE * self.radius * np.abs(self.charges).sum()
+        return bool(self.dipole_debye * DEBYE > scale)
+
+    @property
+    def quadrupole_debye_A(self) -> np.ndarray:
+        """Traceless quadrupole moment (3, 3) about the centre of mass, body frame, D Å: sum of q (3 x x - r²) / 2."""
+        x, q = self.positions_body, self.charges
+        return (1.5 * np.einsum("s,si,sj->ij", q, x, x) - 0.5 * np.sum(q * np.sum(x**2, axis=1)) * np.eye(3)) / DEBYE
+
+    @property
+    def planar(self) -> bool:
+        """Whether all sites, massless ones included, lie in one plane but not on one line."""
+        return bool(self._extents[2] <= OFF_AXIS * self.radius < self._extents[1])
+
+    @property
+    def _extents(self) -> np.ndarray:
+        """Extents (3,) of the sites along the principal axes of their shape, Å, descending."""
+        return np.append(np.linalg.svd(self.positions_body, compute_uv=False), [0.0, 0.0])[:3]
+
+    @property
+    def words(self) -> str:
+        """Kind of body, sites, mass, charge and dipole in words."""
+        shape = f"{self.kind}, planar" if self.planar else self.kind
+        charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
+        dipole = ""
+        if self.charges.any() and self.radius > 0:
+            dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
+        return f"{shape}, {_counted(len(self.masses), 'site')}, {self.mass:.4f} u, {charge}{dipole}"
+
+    @property
+    def radius(self) -> float:
+        """Distance of the outermost site from the centre of mass, Å."""
+        return float(np.linalg.norm(self.positions_body, axis=1).max())
+
+    def sites(self) -> list[dict]:
+        """The sites as in a scene file, in the principal frame."""
+        entries = []
+        for i, name in enumerate(self.site_names):
+            entry = {
+                "name": name,
+                "element": self.elements[i],
+                "mass_u": float(self.masses[i]),
+                "position_A": [float(x) for x in self.positions_body[i]],
+                "charge_e": float(self.charges[i]),
+            }
+            if self.epsilon[i] > 0:
+                entry |= {"sigma_A": float(self.sigma[i]), "epsilon_kJ_mol": float(self.epsilon[i] / KJ_PER_MOL)}
+            if self.parameters[i]:
+                entry["parameters"] = dict(self.parameters[i])
+            entries.append(entry)
+        return entries
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def molecule(
+    name: str, sites: tuple[Site, ...], title: str = "", source: str = "", residue_names: tuple[str, ...] = ()
+) -> Molecule:
+    """The rigid body of these sites, each of which needs a position and a mass.
+
+    Raises MoleculeError with all faults.
+    """
+    faults = [
+        f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
+    ]
+    if len(sites) > MOST_SITES:
+        faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
+    if faults:
+        raise MoleculeError(f"molecule {name}", faults)
+    masses = np.array([s.mass_u for s in sites])
+    positions = np.array([s.position_A for s in sites])
+    if masses.sum() == 0:
+        raise MoleculeError(f"molecule {name}", ["all sites are massless; a body needs mass to move"])
+    size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
+    frame = principal_frame(masses, positions, size)
+    body = (positions - frame.centre) @ frame.axes
+    near = KDTree(body).query_pairs(SAME_PLACE * size, output_type="ndarray")
+    faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
+    if frame.kind == "point" and not faults:
+        off = np.linalg.norm(body, axis=1)
+        faults += [
+            f"site {s.name} is {d:.3g} Å from the centre of mass, but all the mass is there: nothing resists its torque"
+            for s, d in zip(sites, off, strict=True)
+            if d > OFF_AXIS * size
+        ]
+    if frame.kind == "linear":
+        off = np.linalg.norm(body[:, 1:], axis=1)
+        faults += [
+            f"site {s.name} is {d:.3g} Å off the axis of a linear body: nothing resists its torque about that axis"
+            for s, d in zip(sites, off, strict=True)
+            if d > OFF_AXIS * size
+        ]
+    if faults:
+        raise MoleculeError(f"molecule {name}", faults)
+    if frame.kind == "point":
+        body = np.zeros_like(body)  # exactly at the centre of mass, without rounding errors
+    return Molecule(
+        name=name,
+        title=title,
+        source=source,
+        residue_names=tuple(residue_names) or (name.upper()[:5],),
+        site_names=tuple(s.name for s in sites),
+        elements=tuple(s.element for s in sites),
+        masses=masses,
+        positions_body=body,
+        charges=np.array([s.charge_e or 0.0 for s in sites]),
+        sigma=np.array([s.sigma_A or 0.0 for s in sites]),
+        epsilon=np.array([s.epsilon for s in sites]),
+        mass=float(frame.mass),
+        inertia=frame.inertia,
+        kind=frame.kind,
+        parameters=tuple(s.parameters for s in sites),
+    )
+
+
+def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
+    """The same molecule with other masses (u) of sites (isotopes), keyed by site name or else element.
+
+    Raises MoleculeError.
+    """
+    faults, changed = [], {}
+    for key, mass in masses.items():
+        places = [i for i, name in enumerate(found.site_names) if name == key] or [
+            i for i, element in enumerate(found.elements) if element == key
+        ]
+        heavy = [i for i in places if found.masses[i] > 0]
+        if not heavy:
+            known = dict.fromkeys([*found.elements, *found.site_names])
+            why = (
+                "is massless, and stays so" if places else f"is no site or element of it; there are {', '.join(known)}"
+            )
+            faults.append(f"masses_u.{key} {why}")
+        changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
+    if faults:
+        raise MoleculeError(f"molecule {found.name}", faults)
+    sites = [Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])}) for i, entry in enumerate(found.sites())]
+    again = molecule(found.name, tuple(sites), found.title, found.source, found.residue_names)
+    return replace(again, group=found.group, note=found.note, mixing=found.mixing)
+
+
+def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:
+    """Sites with missing keys filled in from a table, by site name or else element."""
+    filled = []
+    for site in sites:
+        if (entry := find_site(table, site.name, site.element)) is not None:
+            keys = [key for key in ("mass_u", "charge_e") if getattr(site, key) is None]
+            keys += ["element"] if site.element == "X" else []
+            keys += LENNARD_JONES if site.sigma_A is None else []
+            keys += [] if site.parameters else ["parameters"]
+            site = site.model_copy(update={key: getattr(entry, key) for key in keys})
+        filled.append(site)
+    return tuple(filled)
+
+
+def of_each(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
+    """values[k] (own, ...) of each molecule of species k, one molecule after the other; species (n,)."""
+    counts = np.array([len(own) for own in values])
+    begin, own = np.cumsum(counts) - counts, counts[species]
+    rows = np.repeat(begin[species] - np.cumsum(own) + own, own)
+    rows += np.arange(len(rows))
+    return np.concatenate(values)[rows]
+
+
+def named_sites(species: list[Molecule], name: str) -> list[np.ndarray]:
+    """Which sites of each species a name means: those of this name, or else of this element; SPECIES.NAME of one."""
+    owner, _, own = name.rpartition(".")
+    for of_molecule in ("site_names", "elements"):
+        found = [
+            np.array([owner in ("", m.name) and other == own for other in getattr(m, of_molecule)]) for m in species
+        ]
+        if any(of.any() for of in found):
+            break
+    return found
+
+
+def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
+    """The entry of this name, or else of the element."""
+    return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)
+
+
+def available_models() -> list[str]:
+    """Names of the shipped models."""
+    return list(_shipped())
+
+
+@cache
+def _shipped() -> tuple[str, ...]:
+    return tuple(sorted(path.stem for path in MODELS.glob("*.toml")))
+
+
+@cache
+def model_fault(name: str) -> str:
+    """Message that there is no model of this name; empty if there is one."""
+    known = available_models()
+    if name in known:
+        return ""
+    return f"there is no model {name!r}{meant(name, known) or ';'} `rigidmd models` lists all {len(known)}"
+
+
+def load_model(name: str) -> Molecule:
+    """A shipped model by name. Raises MoleculeError."""
+    if fault := model_fault(name):
+        raise MoleculeError("models", [fault])
+    return read_molecule(MODELS / f"{name}.toml")
+
+
+def read_molecule(path: Path) -> Molecule:
+    """A molecule from a TOML file like those in `models/`. Raises MoleculeError."""
+    data = _read(path, MoleculeFile)
+    found = molecule(data.name, data.sites, data.title, data.source, data.residue_names)
+    return replace(found, group=data.group, note=data.note, mixing=data.mixing)
+
+
+def read_parameters(path: Path) -> tuple[Site, ...]:
+    """The entries of a table of parameters. Raises MoleculeError."""
+    return read_table(path).sites
+
+
+def read_table(path: Path) -> ParameterFile:
+    """A table of parameters. Raises MoleculeError."""
+    table = _read(path, ParameterFile)
+    entries = table.sites
+    names = [s.name for s in entries]
+    faults = [f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
+    faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in entries if s.position_A is not None]
+    if faults:
+        raise MoleculeError(str(path), faults)
+    return table
+
+
+Table = TypeVar("Table", bound=Section)
+
+
+def _read(path: Path, kind: type[Table]) -> Table:
+    """A file read as this kind of table. Raises MoleculeError."""
+    data, text = read_toml(path, MoleculeError)
+    wrong = impossible_values(data)
+    if not wrong:
+        wrong = numbers_beyond(data, *SIZES)
+    if wrong:
+        raise MoleculeError(str(path), [f"{place(keys, text)}: {fault}" for keys, fault in wrong])
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        raise MoleculeError(str(path), faults_of(error, kind, text)) from None

@@ -1,0 +1,168 @@
+"""Shipped with the package: example scenes, notebooks, scripts and the chapters of the documentation."""
+
+import difflib
+import json
+import re
+import shutil
+import textwrap
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from rigidmd.core.files import whole_file
+from rigidmd.errors import Faults, OutputError
+
+PACKAGE = Path(__file__).parent.parent
+
+#: In a wheel the scenes are inside the package; in a checkout or an editable install they are beside it.
+SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
+DOCS = PACKAGE / "docs"
+NOTEBOOK, SCRIPT = ".ipynb", ".py"
+#: Shipped files in the chapters: stem, ending.
+_SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
+#: What an example is, by the ending of its file.
+KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
+
+#: In the order of the list.
+CHAPTERS = (
+    "top",
+    "water",
+    "molecule",
+    "ensembles",
+    "looking",
+    "notebook",
+    "measuring",
+    "studies",
+    "ase",
+    "engines",
+    "extending",
+    "manual",
+    "benchmarks",
+    "validation",
+    "changelog",
+)
+
+
+class Example(NamedTuple):
+    """A shipped scene, notebook or script."""
+
+    name: str
+    path: Path
+    about: str  # the first line of its comment, or of its text
+    is_body: bool = False
+
+    @property
+    def kind(self) -> str:
+        """scene, notebook or script."""
+        return KINDS[self.path.suffix]
+
+
+def examples() -> list[Example]:
+    """The shipped scenes, sorted by name."""
+    found = []
+    for path in sorted(SYSTEMS.glob("*.toml")):
+        text = path.read_text(encoding="utf-8")
+        about = text.partition("\n")[0].removeprefix("# ")
+        found.append(Example(path.stem, path, about, "body" in tomllib.loads(text)))
+    return sorted(found, key=_in_series)
+
+
+def notebooks() -> list[Example]:
+    """The shipped notebooks, sorted by name."""
+    found = []
+    for path in sorted((SYSTEMS / "notebooks").glob(f"*{NOTEBOOK}")):
+        first = json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"]
+        found.append(Example(path.stem, path, "".join(first).partition("\n")[0].removeprefix("# ")))
+    return found
+
+
+def scripts() -> list[Example]:
+    """The shipped scripts, each an extension, sorted by name."""
+    return [
+        Example(path.stem, path, path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# "))
+        for path in sorted((SYSTEMS / "scripts").glob(f"*{SCRIPT}"))
+    ]
+
+
+def _in_series(example: Example) -> list:
+    """Sort key in which numbers within a name count as numbers."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
+
+
+def find_example(name: str) -> Example:
+    """The example of this name, or the first scene of a numbered series of this name. Raises Faults."""
+    known = {example.name: example for example in [*examples(), *notebooks(), *scripts()]}
+    if name in known:
+        return known[name]
+    if series := series_of(name):
+        return known[series[0]]
+    stem = Path(name).stem
+    near = [other for other in known if other == stem or other.startswith(f"{stem}_")]
+    near = near or difflib.get_close_matches(stem, known, 3, 0.6)
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    raise Faults("examples", [f"there is no scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
+
+
+def series_of(name: str) -> list[str]:
+    """The scenes NAME_1, NAME_2, ...; empty if there is no such series."""
+    return [example.name for example in examples() if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)]
+
+
+def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path] = ()) -> list[Path]:
+    """Copy an example to `path` and the files that it reads beside it; the paths written. Raises OutputError."""
+    if path.suffix != example.path.suffix:
+        raise OutputError(f"{path} must end in {example.path.suffix}: name a file for the {example.kind} with -o")
+    inputs = {path.parent / file.relative_to(example.path.parent): file for file in read}
+    for target in (path, *inputs):
+        kept = target in inputs and target.is_file() and target.read_bytes() == inputs[target].read_bytes()
+        if target.is_dir():
+            raise OutputError(f"{target} is a folder; name another file with -o")
+        if target.exists() and not force and not kept:
+            raise OutputError(f"{target} exists; --force replaces it, -o names another file")
+    for target, source in {path: example.path, **inputs}.items():
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(target) as temporary:
+                shutil.copyfile(source, temporary)
+        except OSError as error:
+            raise OutputError(f"{target} cannot be written: {error.strerror}") from None
+    return [path, *inputs]
+
+
+def contents() -> dict[str, str]:
+    """Chapters of the documentation: name -> what it is about, the first line under its title."""
+    return {name: (DOCS / f"{name}.md").read_text(encoding="utf-8").splitlines()[2] for name in CHAPTERS}
+
+
+def chapter_text(name: str) -> str:
+    """A chapter as plain text, without comments; pictures become name and path. Raises Faults."""
+    if name not in CHAPTERS:
+        near = difflib.get_close_matches(name, CHAPTERS, 1, 0.6)
+        hint = f"did you mean {near[0]}? " if near else ""
+        word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
+        found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
+        named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
+        where = f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
+        raise Faults("help", [f"there is no chapter {name!r}; {hint}{where}"])
+    return _plain(name)
+
+
+def _plain(name: str) -> str:
+    """The text of a chapter. Shipped files, which lie elsewhere in a wheel, are named as `rigidmd new` copies them."""
+    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
+    copied = sorted(set(_SHIPPED.findall(text)))
+    title, _, text = text.partition("\n")
+    if copied:
+        files = textwrap.fill(", ".join(f"{stem}{ending}" for stem, ending in copied), 120)
+        title += f"\n\n`rigidmd new NAME` copies the shipped files that are named here:\n{files}"
+    text = re.sub(r"!\[([^\]]*)\]\(((?:\.\./)*)([^)]*)\)", _picture, _SHIPPED.sub(r"\1\2", text))
+    return f"{title}\n{text}".rstrip()
+
+
+def _picture(found: re.Match) -> str:
+    """A picture as plain text: its name, and its path where it is there."""
+    about, up, path = found.groups()
+    there = (DOCS / up / path).is_file()
+    return f"[picture: {about}{f', {path}' if there else ''}]"

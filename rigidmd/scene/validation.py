@@ -1,0 +1,218 @@
+"""Input data: strict value types for pydantic, and its errors as sentences with key and line."""
+
+import difflib
+import re
+from collections.abc import Iterable
+from math import isfinite
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+from rigidmd.core.toml import cut, line_of, shortened
+from rigidmd.errors import MOST_SHOWN
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Strict(), Field(gt=0)]
+Flag = Annotated[bool, Strict()]
+Vector = tuple[Number, Number, Number]
+
+T = TypeVar("T")
+
+#: Tables in a list of tables. Scenes have a handful.
+MOST_TABLES = 1000
+
+#: With more similar names than this, no suggestion is made from a common beginning or end.
+MOST_MEANT = 8
+#: Names longer than this, and more of them, are compared with no others: that would take long and say nothing.
+LONGEST_NAME, MOST_NAMES = 60, 1000
+
+
+class Section(BaseModel):
+    """A frozen table of a TOML file; unknown keys are faults."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @model_validator(mode="after")
+    def _is_sound(self):
+        if faults := "; ".join(self._faults()):
+            raise ValueError(faults)
+        return self
+
+    def _faults(self) -> Iterable[str]:
+        """What is wrong between the keys of this table."""
+        return ()
+
+
+#: A name or a path: without line ends and other characters that no terminal shows.
+Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max_length=4096)]
+
+
+def settled(value: T | None) -> T:
+    """A value that may be left out of a scene, but is there where it is used: in a validated and resolved one."""
+    assert value is not None, "the scene is not validated or not resolved"
+    return value
+
+
+def faults_of(
+    error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
+) -> list[str]:
+    """One sentence for each error of pydantic: line (if the TOML text is given), key, what was expected.
+
+    overridden : dotted keys whose values come from the command line, so that they have no line
+    """
+    faults: dict[tuple, list[str]] = {}
+    for detail in error.errors(include_url=False):
+        unknown = detail["type"] == "extra_forbidden"  # the last key is what a stranger wrote
+        names = detail["loc"][:-1] if unknown else detail["loc"]
+        keys = [*(key for key in names if not _is_union_branch(key)), *(detail["loc"][-1:] if unknown else ())]
+        if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
+            keys = keys[:-1]  # a list lacks an entry: the fault is the list's
+        # Faults beyond those that are shown only count.
+        sentence = _sentence(detail, keys, model) if len(faults) <= MOST_SHOWN else detail["msg"]
+        faults.setdefault(tuple(keys), []).append(sentence)
+    # pydantic reports one error for each type that a value may have: join them. An error inside a value is more
+    # specific than one about the whole value.
+    around = {keys[:depth] for keys in faults for depth in range(1, len(keys))}
+    return [
+        f"{place(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
+        for keys, sentences in faults.items()
+        if keys not in around
+    ]
+
+
+def numbers_beyond(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
+    """Numbers of nested tables and lists that are too small or too large, each with its path of keys and what is wrong.
+
+    Infinities and NaN, which some keys allow, are left to the types of those keys.
+    """
+    found: list[tuple[list, str]] = []
+    rest: list[tuple[list, Any]] = [([], data)]
+    while rest:
+        keys, value = rest.pop()
+        if isinstance(value, dict | list | tuple):
+            inner = value.items() if isinstance(value, dict) else enumerate(value)
+            rest += [([*keys, key], part) for key, part in inner]
+        elif isinstance(value, float) and value != 0 and not least <= abs(value) <= largest and isfinite(value):
+            bounds = f"{least:g} and {largest:g}".replace("e+", "e")
+            found.append((keys, f"is {value:g}, must be 0 or between {bounds}"))
+    return found[::-1]
+
+
+def _either(sentences: list[str]) -> str:
+    """Join sentences: "is 1, must be a list" and "is 1, must be a table" state only once that it is 1."""
+    begin, must, _ = sentences[0].partition(", must be ")
+    return " or ".join([sentences[0], *(sentence.removeprefix(begin + must) for sentence in sentences[1:])])
+
+
+def place(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
+    """Where a key of a scene was given: its line, or the command line."""
+    path = ".".join(cut(str(key)) for key in keys)
+    if any(f"{path}.".startswith(f"{key}.") for key in overridden):
+        return f"--set {path}"
+    line = line_of(keys, text)
+    return (f"line {line}: " if line else "") + (path or "scene")
+
+
+def _is_union_branch(key: Any) -> bool:
+    """Whether pydantic put this into a location to name the branch of a union."""
+    return isinstance(key, str) and bool(re.search(r"[\[(]|^(constrained-)?(float|int|bool|str)$", key))
+
+
+#: Sentences on a value by the type of pydantic's error.
+SENTENCES = {
+    "missing": "is missing",
+    "too_long": "has {actual_length} entries, must not have more than {max_length}",
+    "too_short": "has {actual_length} entries, needs at least {min_length}",
+    "greater_than": "is {shown}, must be greater than {gt:g}",
+    "greater_than_equal": "is {shown}, must not be less than {ge:g}",
+    "less_than_equal": "is {shown}, must not be more than {le:g}",
+    "finite_number": "is {shown}, must be a finite number",
+    "float_type": "is {shown}, must be a number",
+    "int_type": "is {shown}, must be a whole number",
+    "int_from_float": "is {shown}, must be a whole number",
+    "bool_type": "is {shown}, must be true or false",
+    "string_type": "is {shown}, must be a text in quotes",
+    **dict.fromkeys(("tuple_type", "list_type"), "is {shown}, must be a list"),
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "is {shown}, must be a table"),
+    "value_error": "{error}",
+}
+
+
+def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
+    value = detail["input"]
+    shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shortened(value)
+    context = detail.get("ctx", {})
+    match detail["type"]:
+        case "extra_forbidden":
+            known = _known_keys(model, keys[:-1])
+            listed = f"; known here: {', '.join(known)}" if known else ""
+            return "unknown key" + (meant(str(keys[-1]), known) or listed)
+        case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
+            return f"has {len(value)} entries, needs more"
+        case "literal_error":
+            wanted = context["expected"]
+            return f"is {shown}, must be {wanted}" + meant(str(value), re.findall(r"'([^']*)'", wanted))
+        case "tuple_type" | "list_type" if isinstance(value, dict):
+            return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
+        case "string_pattern_mismatch" if "!-~" in context["pattern"]:
+            return f"is {shown}, must be one to five visible ASCII characters without spaces"
+        case "string_pattern_mismatch" if "x1f" in context["pattern"]:
+            return f"is {shown}, must be one line without control characters"
+        case kind if kind in SENTENCES:
+            return SENTENCES[kind].format(shown=shown, **context)
+    return f"is {shown}: {detail['msg']}"
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """'; did you mean ...?' for an unknown name; empty if no known name is similar."""
+    return perhaps(nearest(name, known))
+
+
+def perhaps(names: list[str]) -> str:
+    """'; did you mean ...?' for these names; empty for none."""
+    return f"; did you mean {' or '.join(names)}?" if names else ""
+
+
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """Known names that an unknown one may stand for.
+
+    These are the names that differ only in case and punctuation; else those that begin with it, as when a unit is
+    forgotten, or end with it; else the one with the most similar spelling.
+    """
+    known = list(known)
+    if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
+        return []
+    plain = {key: _plain(key) for key in known}
+    asked = _plain(name)
+    near = [key for key, letters in plain.items() if letters == asked]
+    near = near or [key for key, letters in plain.items() if asked and letters.startswith(asked)]
+    near = near or [key for key, letters in plain.items() if asked and letters.endswith(asked)]
+    if not near or len(near) > MOST_MEANT:
+        alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
+        near = [key for key, letters in plain.items() if letters in alike]
+    return near
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\W_]", "", name).lower()
+
+
+def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
+    """Keys of the section at a path of keys."""
+    for key in keys:
+        if isinstance(key, int):
+            continue
+        inner = _models_in(model.model_fields[key].annotation)
+        if not inner:
+            return []
+        model = inner[0]
+    return list(model.model_fields)
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for part in getattr(annotation, "__args__", ()) for m in _models_in(part)]

@@ -1,0 +1,1 @@
+"""Many runs: accuracy, stability, sweeps, comparisons of runs and engines."""

@@ -1,0 +1,1 @@
+"""Error against run time of every integrator, and the error of averages."""

@@ -1,0 +1,116 @@
+"""A scene as a folder that another engine runs by itself."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from rigidmd.assemble.build import build
+from rigidmd.core.state import State
+from rigidmd.engines.force_field import Portrait, portrait
+from rigidmd.engines.system import System
+from rigidmd.errors import OutputError, SceneError
+from rigidmd.io.folder import SCENE, check_names, write_marker, written_by_runs
+from rigidmd.io.scene_file import input_names, write_scene
+from rigidmd.io.write import writing
+from rigidmd.run import MolecularSimulation
+from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene.engine import EngineChoice
+
+#: Lists what an export wrote in its folder; --force replaces files of an export only.
+MARKER = ".rigidmd-export"
+
+
+class Writer(NamedTuple):
+    """How scenes go to an engine."""
+
+    title: str
+    faults: Callable[[Portrait], list[str]]  # what it cannot do
+    write: Callable[[Path, Portrait, State], list[str]]  # into a folder; the files
+    command: str  # that runs it there
+
+
+class Exported(NamedTuple):
+    """What was written."""
+
+    title: str  # the engine
+    files: list[str]
+    notes: list[str]
+    command: str  # that runs it, in the folder
+
+
+def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported:
+    """Write a scene for "lammps", "openmm" or "gromacs", from the state from which time passes in a run of rigidmd.
+
+    Raises SceneError with all that the engine cannot do, OutputError if the folder is in use.
+    """
+    if not isinstance(scene, MolecularScene):
+        raise SceneError(scene.source, ["a single body stays with rigidmd: export is for molecules"])
+    _check(folder, force)
+    writer = writer_for(to)
+    system = build(scene.model_copy(update={"engine": engine_named(to)}))
+    drawn = portrait(system)
+    faults = writer.faults(drawn) + [
+        f"stages.{k}: a minimisation after other stages stays with rigidmd"
+        for k, stage in enumerate(system.scene.stages)
+        if stage.is_minimisation and any(not before.is_minimisation for before in system.scene.stages[:k])
+    ]
+    if faults:
+        raise SceneError(scene.source, [f"{writer.title}: {fault}" for fault in faults])
+    state = start_of(system)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".export", dir=folder) as made:
+            write_scene(Path(made), system.scene)
+            names = [SCENE, *input_names(system.scene).values(), *writer.write(Path(made), drawn, state)]
+            check_names(folder, names, MARKER)
+            for name in written_by_runs(folder, MARKER):
+                (folder / name).unlink(missing_ok=True)
+            for name in names:
+                (Path(made) / name).replace(folder / name)
+        write_marker(folder, names, MARKER)
+    return Exported(writer.title, names, system.notes, writer.command)
+
+
+def start_of(system: System) -> State:
+    """The state from which time passes: overlaps relieved, first minimisations done, by rigidmd itself."""
+    scene = system.scene.model_copy(update={"engine": EngineChoice()})
+    return MolecularSimulation(scene, warn=lambda sentence: None).settle()
+
+
+def engine_named(to: str) -> EngineChoice:
+    """The engine for which a scene leaves things open; GROMACS has the thermostats and barostats of rigidmd."""
+    return EngineChoice() if to == "gromacs" else EngineChoice.model_validate({"name": to})
+
+
+def writer_for(to: str) -> Writer:
+    """How scenes go to "lammps", "openmm" or "gromacs"."""
+    if to == "lammps":
+        from rigidmd.engines.lammps.files import INPUT, faults, write_lammps
+
+        return Writer("LAMMPS", faults, write_lammps, f"lmp -in {INPUT}")
+    if to == "gromacs":
+        from rigidmd.engines.gromacs.files import faults, write_gromacs
+
+        return Writer("GROMACS", faults, write_gromacs, "sh run.sh")
+    from rigidmd.engines.openmm.files import write_openmm
+    from rigidmd.engines.openmm.system import faults
+
+    return Writer("OpenMM", faults, write_openmm, "python run.py")
+
+
+def _check(folder: Path, force: bool) -> None:
+    """Raise OutputError if an export cannot be written there; changes nothing."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name another folder with -o")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not (folder / MARKER).is_file():
+            raise OutputError(f"{folder} is not empty and holds no earlier export; name another folder with -o")
+        if not force:
+            raise OutputError(f"{folder} holds an earlier export; --force replaces it, -o names another folder")
+    parent = folder
+    while not parent.exists():
+        parent = parent.parent
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")

@@ -1,0 +1,194 @@
+"""Running the points of a sweep: which comes next, what is written down, and how it is stopped."""
+
+import contextlib
+import signal
+import time as clock
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rigidmd.run.checkpoints import checked_walltime
+from rigidmd.run.signals import handled
+from rigidmd.scene import Scene
+from rigidmd.studies.sweep.cluster import Cluster
+from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, Point, write_manifest
+from rigidmd.studies.sweep.plan import settle
+from rigidmd.studies.sweep.processes import Message, Pool
+from rigidmd.studies.sweep.worker import Task
+
+#: Seconds between two looks at the clock, and between two writings of the manifest.
+TICK, WRITING = 0.5, 1.0
+#: Of a wall time: seconds left for table and figure, and those that a point needs at least; not more than these shares.
+SPARE, LEAST = 10.0, 20.0
+SPARE_SHARE, LEAST_SHARE = 0.1, 0.2
+
+
+#: Who runs points: processes here, or a cluster.
+Runner = Pool | Cluster
+
+
+@dataclass
+class Outcome:
+    """How a sweep ended. Names of points that finished now, that failed, that were finished before."""
+
+    finished: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    left: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    signal: int | None = None
+    out_of_time: bool = False
+
+
+def run_points(
+    folder: Path,
+    manifest: Manifest,
+    runner: Runner,
+    walltime: float | None = None,
+    trust: Sequence[str] = (),
+    hear: Callable[[str, str, Any], object] = lambda name, kind, value: None,
+) -> Outcome:
+    """Run what is not finished. A point waits while one that compiles the same code has not begun.
+
+    walltime : seconds after which all has to have ended
+    trust : Python files that the scene may run
+    hear : told (point, kind, value) of every `Message`
+
+    Raises OutputError if the manifest cannot be written.
+    """
+    began, found = clock.monotonic(), Outcome()
+    by_name = {point.folder: point for point in manifest.points}
+    found.skipped = [point.folder for point in manifest.points if point.state == FINISHED]
+    waiting = Waiting(manifest, [point for point in manifest.points if point.state != FINISHED])
+    changed, written = True, 0.0
+    busy: set[str] = set()
+    ends_at, least = None, 0.0
+    if walltime is not None:
+        ends_at = clock.time() + checked_walltime(walltime) - min(SPARE, SPARE_SHARE * walltime)
+        least = min(LEAST, LEAST_SHARE * walltime)
+    pressed = 0
+
+    def stop(number: int) -> None:
+        nonlocal pressed
+        found.signal = found.signal or number
+        pressed += number == signal.SIGINT
+
+    with handled(stop, signal.SIGINT, signal.SIGTERM), contextlib.closing(runner):
+        while True:
+            late = ends_at is not None and clock.time() + least > ends_at
+            while found.signal is None and not late and runner.free and (point := waiting.next()):
+                busy.add(point.folder)
+                runner.give(task_of(folder, manifest, point, ends_at, trust))
+            if not busy:
+                break
+            if found.signal is not None:
+                runner.kill() if pressed > 1 else runner.stop()
+            for name, message in runner.messages(TICK):
+                if name not in busy:  # a cluster may deliver late
+                    continue
+                if message.kind != "died" or found.signal is None:  # else it was stopped before its first step
+                    hear(name, *message)
+                point = by_name[name]
+                if message.kind == "begun":
+                    waiting.compiled(point)
+                    point.state, point.message = RUNNING, None
+                elif message.kind in ("ended", "died"):
+                    busy.discard(name)
+                    waiting.compiled(point)
+                    _note(folder, point, message, found)
+                else:
+                    continue
+                changed = True
+            if changed and clock.monotonic() - written > WRITING:
+                write_manifest(folder, manifest)
+                changed, written = False, clock.monotonic()
+    found.out_of_time |= found.signal is None and bool(waiting)
+    found.left = [point.folder for point in manifest.points if point.state not in (FINISHED, FAILED)]
+    write_manifest(folder, manifest)
+    found.seconds = clock.monotonic() - began
+    return found
+
+
+def _note(folder: Path, point: Point, message: Message, found: Outcome) -> None:
+    """Write down how a point ended."""
+    if message.kind == "died":
+        if found.signal is not None:  # it was stopped before it could answer
+            point.state = INTERRUPTED
+            settle(folder, point)
+        else:
+            point.state, point.message = FAILED, message.value
+    else:
+        ended = message.value
+        point.state, point.message, point.ran_sha256 = ended["state"], ended["message"], ended["sha256"]
+        point.seconds += ended["seconds"]
+        found.out_of_time |= ended["out_of_time"]
+    if point.state in (FINISHED, FAILED):
+        (found.finished if point.state == FINISHED else found.failed).append(point.folder)
+
+
+def task_of(
+    folder: Path, manifest: Manifest, point: Point, ends_at: float | None = None, trust: Sequence[str] = ()
+) -> Task:
+    """A point for a worker."""
+    return {
+        "folder": str(folder.absolute()),
+        "name": point.folder,
+        "scene": manifest.scene,
+        "overrides": manifest.overrides(point),
+        "trust": [str(Path(path).absolute()) for path in trust],
+        "sha256": point.scene_sha256,
+        "ran_sha256": point.ran_sha256,
+        "ends_at": ends_at,
+    }
+
+
+class Waiting:
+    """Points that have not begun. Of those that compile the same code one goes first, so that it is compiled once."""
+
+    def __init__(self, manifest: Manifest, points: list[Point]):
+        self._kinds: dict[str, str] = {}
+        self._known: set[str] = set()  # kinds whose code is compiled
+        self._first: str | None = None  # a point that compiles now
+        self._queue = deque(points)
+        for point in points:
+            self._kinds[point.folder] = code_kind(Scene.read(manifest.scene, manifest.overrides(point)))
+
+    def __bool__(self) -> bool:
+        return bool(self._queue)
+
+    def next(self) -> Point | None:
+        """The next point that may begin."""
+        for point in self._queue:
+            known = self._kinds[point.folder] in self._known
+            if known or self._first is None:
+                self._first = self._first if known else point.folder
+                self._queue.remove(point)
+                return point
+        return None
+
+    def compiled(self, point: Point) -> None:
+        """Note that a point has compiled its code, or will not any more."""
+        self._known.add(self._kinds[point.folder])
+        if self._first == point.folder:
+            self._first = None
+
+
+def code_kind(scene: Scene) -> str:
+    """What decides the code that a scene compiles: its keys and words, without its numbers and files."""
+
+    def bare(value: Any) -> Any:
+        match value:
+            case bool() | str() | None:
+                return value
+            case int() | float():
+                return 0
+            case dict():
+                return {key: bare(inner) for key, inner in sorted(value.items())}
+            case _:
+                return [bare(inner) for inner in value]
+
+    from rigidmd.run.provenance import APART, keys_of, plain
+
+    return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.held, *APART))))

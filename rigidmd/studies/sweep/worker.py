@@ -1,0 +1,162 @@
+"""A process that runs points of a sweep, one after another: `python -m rigidmd.studies.sweep.worker`.
+
+Each line of its standard input is a task, each line of its output a message, both JSON. It ends with its input: when
+whoever started it has died, it stops with a checkpoint.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+import time as clock
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypedDict
+
+from rigidmd.errors import RigidMDError
+from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, Point, state_on_disk
+
+#: Looks at a run for its progress.
+LOOKS = 100
+#: Seconds to wait for a run in the folder of a point that is about to stop: its sweep was killed, or dask moved it.
+PATIENCE = 120.0
+
+Tell = Callable[[str, Any], None]
+
+
+class Task(TypedDict):
+    """One point, in words that JSON has.
+
+    folder : of the sweep; name : of the point's folder in it; sha256 : digest of its scene
+    ends_at : `time.time()` at which it has to have ended; None for never
+    """
+
+    folder: str
+    name: str
+    scene: str
+    overrides: dict[str, Any]
+    trust: list[str]
+    sha256: str
+    ran_sha256: str | None
+    ends_at: float | None
+
+
+class Ended(TypedDict):
+    """How a point ended. sha256 : scene_sha256 of its summary."""
+
+    state: str
+    message: str | None
+    sha256: str | None
+    seconds: float
+    out_of_time: bool
+
+
+def run_task(task: Task, tell: Tell = lambda kind, value: None, progress: bool = False) -> Ended:
+    """Run a point in its folder, from its last checkpoint if it has one. A point that has finished is left as it is.
+
+    tell : called with ("begun", None) when it is compiled, ("share", share that is done), ("warned", sentence)
+    """
+    began = clock.monotonic()
+    ended: Ended = {"state": FAILED, "message": None, "sha256": None, "seconds": 0.0, "out_of_time": False}
+    try:
+        _run(task, tell, progress, ended)
+    except RigidMDError as error:
+        ended["message"] = str(error)
+    except KeyboardInterrupt:
+        ended["state"] = INTERRUPTED
+    except MemoryError:
+        ended["message"] = "not enough memory; run fewer points at a time (--jobs)"
+    except Exception as error:
+        traceback.print_exc()
+        ended["message"] = f"{type(error).__name__}: {error}"
+    ended["seconds"] = clock.monotonic() - began
+    return ended
+
+
+def _run(task: Task, tell: Tell, progress: bool, ended: Ended) -> None:
+    from rigidmd.assemble.user_code.trust import trust
+    from rigidmd.run import Every, Observer, Simulation
+    from rigidmd.scene import BodyScene, MolecularScene, Scene
+    from rigidmd.studies.sweep.points import Digests
+
+    class Begun(Observer):
+        """Tells when the first step is about to be taken."""
+
+        def begin(self, run: Simulation) -> None:
+            tell("begun", None)
+
+    for path in task["trust"]:
+        trust(path)
+    scene = Scene.read(task["scene"], task["overrides"])
+    if Digests().of(scene) != task["sha256"]:
+        raise RigidMDError(f"{task['scene']} or a file that it reads has changed since the sweep began")
+    sweep, folder = Path(task["folder"]), Path(task["folder"]) / task["name"]
+    wait_for_others(folder)
+    point = Point(task["name"], {}, task["sha256"], ran_sha256=task["ran_sha256"])
+    if state_on_disk(sweep, point) == FINISHED:
+        ended["state"], ended["sha256"] = FINISHED, task["ran_sha256"]
+        return
+    walltime = None if task["ends_at"] is None else max(0.0, task["ends_at"] - clock.time())
+    observers: list[Observer] = [Begun()]
+    if isinstance(scene, MolecularScene):
+        whole = sum(stage.duration for stage in scene.stages)
+    else:
+        whole = scene.run.duration_s if isinstance(scene, BodyScene) else 0.0
+    if whole > 0:
+        observers.append(Every(whole / LOOKS, lambda moment: tell("share", min(1.0, moment.time / whole))))
+    resume = scene.output.checkpoint_minutes is not False  # without checkpoints it begins again
+    simulation = Simulation(
+        scene, folder, not resume, observers=observers, say=lambda sentence: tell("said", sentence),
+        warn=lambda sentence: tell("warned", sentence), resume=resume, walltime=walltime,
+    )  # fmt: skip
+    results = simulation.run(progress=progress)
+    ended["state"] = INTERRUPTED if results.interrupted else FINISHED
+    ended["sha256"] = None if results.interrupted else results.summary["scene_sha256"]
+    ended["out_of_time"] = results.out_of_time
+
+
+def wait_for_others(folder: Path, patience: float = PATIENCE) -> None:
+    """Wait until no other run writes in a folder. Raises OutputError when patience is at its end."""
+    from filelock import FileLock, Timeout
+
+    from rigidmd.errors import OutputError
+    from rigidmd.io.folder import LOCK
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder / LOCK, timeout=patience):
+            pass
+    except Timeout:
+        raise OutputError(f"another run is writing in {folder}, and did not end within {patience:g} s") from None
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
+
+
+def main() -> None:
+    """Run tasks until standard input ends."""
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what others print is no message
+    tasks: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in sys.stdin:
+            tasks.put(json.loads(line))
+        tasks.put(None)
+        os.kill(os.getpid(), signal.SIGTERM)  # a run stops at its next look
+
+    def tell(kind: str, value: Any) -> None:
+        with contextlib.suppress(BrokenPipeError):  # nobody listens any more: the run is stopping
+            print(json.dumps([kind, value]), file=channel, flush=True)
+
+    threading.Thread(target=read, daemon=True).start()
+    while (task := tasks.get()) is not None:
+        tell("ended", run_task(task, tell))
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Studies that consist of many runs: precision, stability."""

@@ -1,0 +1,183 @@
+"""What scenes, simulations and results show of themselves in a notebook, light or dark: a table and a figure."""
+
+import html
+from collections.abc import Iterable
+from math import inf
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from rigidmd.assemble.body import build_body
+from rigidmd.assemble.species import species_of
+from rigidmd.assemble.stage_description import stage_in_words
+from rigidmd.core.display import html as html_of
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.errors import Faults
+from rigidmd.figures.run import run_figures
+from rigidmd.mechanics.rotation import to_euler_angles
+from rigidmd.run.report import body_rows, body_title, stage_rows, stage_title
+from rigidmd.run.results import Results
+from rigidmd.run.simulation import Simulation
+from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.view.page import Raw, figure, notes, table
+
+STYLE = Path(__file__).with_name("notebook.css").read_text(encoding="utf-8")
+#: What acts on a body: a table of its scene, and what it is called.
+ACTING = {"gravity": "gravity", "applied": "applied forces", "friction": "friction", "fluid": "a fluid",
+          "frame": "a moving frame", "wheels": "wheels", "changing_inertia": "changing inertia"}  # fmt: skip
+COULOMB = {"reaction_field": "reaction field", "ewald": "Ewald sum", "pme": "particle mesh Ewald",
+           "damped_shifted_force": "damped shifted force", "none": "charges ignored"}  # fmt: skip
+OWN = "own forces"
+
+Row = tuple[str, str]
+
+
+@html_of.register
+def scene_html(scene: Scene) -> str:
+    """What a scene is: molecules, box, forces, stages; of a body its kind, moments, start and method."""
+    return _shown(scene.name, _kind(scene), _table(_rows(scene)))
+
+
+@html_of.register
+def simulation_html(simulation: Simulation) -> str:
+    """The scene, who looks at the run, and where it writes."""
+    folder = simulation.folder
+    where = "nowhere: the results stay in memory" if folder is None else str(folder)
+    own = [(OWN, f"{name}: {words}") for name, words in getattr(simulation.system, "own", {}).items()]
+    rows = [*(row for row in _rows(simulation.scene) if row[0] != OWN), *own]
+    rows += [("threads", str(simulation.threads)), ("writes to", where)]
+    if names := [type(observer).__name__ for observer in simulation._observers]:
+        rows.append(("observers", ", ".join(names)))
+    return _shown(simulation.scene.name, "ready to run: run() does it", _table(rows))
+
+
+@html_of.register
+def results_html(results: Results) -> str:
+    """The summary, the first figure of the run, notes, and a list of all columns."""
+    summary = results.summary
+    told = []
+    if isinstance(results.system, BodySystem):
+        told += [f"<p>{html.escape(body_title(summary))}</p>", _table(body_rows(summary))]
+    else:
+        for stage in summary["stages"]:
+            told += [f"<p>{html.escape(stage_title(stage))}</p>", _table(stage_rows(stage))]
+    drawn = run_figures(results.system, results.samples, summary)
+    left = f"<div>{''.join(told)}{notes(summary['notes'])}</div>"
+    name, first = next(iter(drawn.items()), ("", None))
+    right = "" if first is None else f"<div>{_svg(first, name, results)}</div>"
+    body = f'<div class="sides">{left}{right}</div>{_columns(results)}'
+    return _shown(results.system.scene.name, results._told, body)
+
+
+def _shown(name: str, about: str, body: str) -> str:
+    head = f'<div class="head">{html.escape(name)} <span class="faint">{html.escape(about)}</span></div>'
+    return f'<style>{STYLE}</style><div class="rigidmd">{head}{body}</div>'
+
+
+def _table(rows: Iterable[Row]) -> str:
+    """Rows, of which those of the same name tell it once."""
+    told, before = [], ""
+    for name, value in rows:
+        told.append(("" if name == before else name, value))
+        before = name
+    return table([], told, words=True)
+
+
+def _svg(drawn, name: str, results: "Results") -> str:
+    """A figure whose colours are those of the notebook; one with a lit solid is on white, dark or not."""
+    found = figure(drawn, f"{results.system.scene.name}-{name}", f"figure: {name}").replace("#000000", "var(--ink)")
+    found = found.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
+    return f'<div class="{"paper" if "<image" in found else "figure"}">{found}</div>'
+
+
+def _kind(scene: Scene) -> str:
+    return "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
+
+
+def _rows(scene: Scene) -> list[Row]:
+    """Name and value of what a scene says. What is wrong with a scene that cannot be built is one of them."""
+    try:
+        if isinstance(scene, BodyScene):
+            return list(_body_rows(build_body(scene)))
+        return list(_molecular_rows(cast(MolecularScene, scene)))
+    except Faults as error:
+        return [("this scene", scene.in_short), *(("fault", fault) for fault in error.faults)]
+
+
+def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
+    species = species_of(scene)
+    for entry, molecule in zip(scene.molecules, species, strict=True):
+        count = f"{entry.count} " if entry.count else ""
+        frozen = ", frozen" if entry.frozen else ""
+        yield "molecules", f"{count}{molecule.name}: {molecule.words}{frozen}"
+    if scene.structure is not None:
+        yield "start", f"from {scene.structure.file}"
+    yield "box", _box(scene)
+    forces = scene.forces
+    acting = ["Lennard-Jones"] if forces.lennard_jones and any((m.epsilon > 0).any() for m in species) else []
+    acting += [COULOMB[forces.electrostatics]] if any(m.charges.any() for m in species) else []
+    acting += [f"cut-off {forces.cutoff_A:g} Å"] if forces.cutoff_A and acting else []
+    yield "forces", ", ".join(acting) or "none of the models"
+    for force in forces.custom:
+        yield OWN, f"{force.name}: {force.energy or force.module}"
+    for name in type(scene.fields).model_fields:
+        if getattr(scene.fields, name):
+            yield "fields", name.replace("_", " ")
+    for stage in scene.stages:
+        yield "stages", stage_in_words(stage)[0]
+
+
+def _box(scene: MolecularScene) -> str:
+    box = scene.box
+    if not box.periodic:
+        return "not periodic"
+    if box.density_g_cm3 is not None:
+        return f"periodic, {box.density_g_cm3:g} g/cm³"
+    if box.lengths_A is not None:
+        lengths = box.lengths_A if isinstance(box.lengths_A, tuple) else (box.lengths_A,) * 3
+        return f"periodic, {' x '.join(f'{length:g}' for length in lengths)} Å"
+    return "periodic, that of the structure file"
+
+
+def _body_rows(system: BodySystem) -> Iterable[Row]:
+    scene, run = system.scene, system.scene.run
+    pinned = "" if system.flies else ", pinned"
+    yield "body", f"{system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of freedom"
+    if system.turns:
+        moments = ", ".join(f"{x:.6g}" for x in system.inertia)
+        yield "moments", f"{moments} kg m² about the {'centre of mass' if system.flies else 'pivot'}"
+        pose = system.pose(0.0, system.state)
+        angles = ", ".join(f"{x + 0.0:.6g}°" for x in np.degrees(to_euler_angles(pose.rotation)).round(9))
+        spin = float(np.linalg.norm(pose.angular_velocity_body))
+        turn = "at rest"
+        if spin * run.duration_s > 1e-6:
+            turn = f"turning at {spin:.6g} rad/s, {2 * np.pi / spin / run.timestep_s:.3g} steps a turn"
+        yield "start", f"φ, θ, ψ = {angles}; {turn}"
+    if acting := [word for name, word in ACTING.items() if getattr(scene, name)]:
+        yield "acting", ", ".join(acting)
+    yield "run", f"{run.duration_s:g} s in {run.steps} steps of {run.timestep_s:g} s"
+    yield "method", "chosen before the run" if run.is_open else run.integrator
+    interval = scene.output.interval_s or inf
+    yield "samples", f"every {max(1, round(interval / run.timestep_s)) * run.timestep_s:g} s"
+
+
+def _columns(results: "Results") -> str:
+    """All columns with units, first and last values, folded."""
+    families: dict[tuple[str, str], list[str]] = {}
+    for name, column in results.samples.described.items():
+        families.setdefault((column.unit, column.about), []).append(name)
+    rows = [
+        (Raw(" ".join(f"<code>{name}</code>" for name in names)), unit, _ends(results, names), about)
+        for (unit, about), names in families.items()
+    ]
+    listed = table(["column", "unit", "first ... last", ""], rows, words=True)
+    return f"<details><summary>{len(results.units)} columns: results[name]</summary>{listed}</details>"
+
+
+def _ends(results: "Results", columns: list[str]) -> str:
+    """First and last value of a scalar column."""
+    values = results[columns[0]]
+    if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
+        return ""
+    return " ... ".join(str(x) if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])

@@ -1,0 +1,106 @@
+"""The template of all pages: one self-contained HTML file, readable on a phone, in the dark and in print."""
+
+import html
+import io
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from rigidmd.figures.style import COOL, FAINT, INK, WARM, curve_style, save_figure, settings
+
+#: Classes of a verdict: what is good, what to look at, what is wrong.
+GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
+
+STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+
+
+def page(title: str, parts: Iterable[str], head: str = "") -> str:
+    """A whole page of HTML parts under a title (plain text). `head` is added to its head: more style or scripts."""
+    told = html.escape(title)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{told}</title>\n<style>{STYLE}</style>{head}</head>\n<body>\n<h1>{told}</h1>\n"
+        + "\n".join(part for part in parts if part)
+        + "\n</body></html>\n"
+    )
+
+
+def section(title: str, *parts: str, anchor: str = "") -> str:
+    """A heading (plain text) and HTML parts; empty without any part."""
+    if not any(parts):
+        return ""
+    name = f' id="{html.escape(anchor)}"' if anchor else ""
+    return f"<section><h2{name}>{html.escape(title)}</h2>\n" + "\n".join(part for part in parts if part) + "</section>"
+
+
+def table(titles: Sequence[str], rows: Iterable[Sequence[object]], words: bool = False) -> str:
+    """A table of plain text, which scrolls if it is too wide. words: cells are sentences, aligned left."""
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
+    kind = ' class="words"' if words else ""
+    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>\n" for row in rows)
+    top = f"<thead><tr>{head}</tr></thead>" if titles else ""
+    return f'<div class="scroll"><table{kind}>{top}<tbody>\n{body}</tbody></table></div>' if body else ""
+
+
+class Raw(str):
+    """A cell or item that is HTML already."""
+
+
+def _cell(value: object) -> str:
+    text = plain(value)
+    seen = re.sub(r"<[^>]*>", "", text) if isinstance(value, Raw) else str(value)
+    return f'<td class="wrap">{text}</td>' if len(seen) > 40 else f"<td>{text}</td>"
+
+
+def plain(value: object) -> str:
+    """A value as HTML."""
+    if isinstance(value, Raw):
+        return value
+    return "" if value is None else html.escape(str(value))
+
+
+def chips(names: Iterable[str]) -> dict[str, Raw]:
+    """Names with the colours of their curves, as cells."""
+    return {
+        name: Raw(f'<span style="color:{curve_style(k)["color"]}">■</span> {plain(name)}')
+        for k, name in enumerate(names)
+    }
+
+
+def items(lines: Iterable[object]) -> str:
+    """A list of sentences."""
+    found = "".join(f"<li>{plain(line)}</li>\n" for line in lines)
+    return f"<ul>\n{found}</ul>" if found else ""
+
+
+def notes(lines: Iterable[str]) -> str:
+    """Sentences that must be seen."""
+    return "\n".join(f'<p class="note">{html.escape(line)}</p>' for line in lines)
+
+
+def code(text: str) -> str:
+    """Commands or listings."""
+    return f"<pre>{html.escape(text)}</pre>"
+
+
+def figure(drawn, salt: str, about: str) -> str:
+    """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each figure of a page."""
+    stream = io.StringIO()
+    drawn.patch.set_visible(False)
+    for axis in drawn.axes:
+        axis.patch.set_visible(False)
+    with settings({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        save_figure(drawn, stream, format="svg", metadata={"Date": None, "Creator": None})
+    found = stream.getvalue()
+    found = found[found.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1)
+    for color, name in ((INK, "ink"), (FAINT, "faint"), (COOL, "cool"), (WARM, "warm")):
+        found = found.replace(color, f"var(--{name})")
+    return found
+
+
+def wide(drawn, salt: str, about: str) -> str:
+    """A figure of several panels, which scrolls on a narrow screen."""
+    width = 120 * drawn.get_figwidth()  # pixels
+    style = f"max-width:{width:.0f}px;min-width:{min(620.0, 0.7 * width):.0f}px"
+    return f'<div class="scroll"><div class="wide" style="{style}">{figure(drawn, salt, about)}</div></div>'

@@ -1,0 +1,246 @@
+"""The page of a run without its film: what was simulated, means with errors, plots, margins, files, how to repeat."""
+
+import html
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.analysis.files import drawn, read_findings
+from rigidmd.assemble.describe import describe
+from rigidmd.core.files import write_text
+from rigidmd.core.statistics import mean, with_error
+from rigidmd.figures.run import signed
+from rigidmd.io.folder import SCENE
+from rigidmd.run.record import Record, read_record
+from rigidmd.view import plots
+from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, section, table
+
+REPORT = "report.html"
+#: Columns of the table of means: name in the log, title; per molecule or not.
+MEANS = (
+    ("temperature", "T (K)", False),
+    ("temperature_translation", "T_trans (K)", False),
+    ("temperature_rotation", "T_rot (K)", False),
+    ("potential", "U (kJ/mol per molecule)", True),
+    ("pressure_bar", "P (bar)", False),
+    ("density", "density (g/cm³)", False),
+)
+#: What a summary tells of the machine and the programs, and what went in.
+KNOWN = (
+    ("rigidmd_version", "rigidmd"), ("numba_version", "Numba"), ("llvmlite_version", "llvmlite"),
+    ("numpy_version", "NumPy"), ("python_version", "Python"), ("machine", "machine"), ("processor", "processor"),
+    ("vector_bits", "bits of a vector"), ("numba_settings", "settings of Numba"), ("threads", "threads"),
+    ("precision", "precision"), ("seed", "seed"), ("scene_sha256", "SHA-256 of the scene"),
+    ("input_sha256", "SHA-256 of the files that it read"),
+)  # fmt: skip
+#: Files of a run: ending or name -> what is in it.
+ABOUT = {
+    "scene.toml": "the scene with all defaults: it repeats the run to the bit",
+    "summary.json": "the values of this page",
+    "log.csv": "energies, temperatures and pressures over time",
+    "motion.csv": "position, attitude, velocities, energies and errors over time",
+    "motion.npz": "the same columns as arrays",
+    "final.npz": "the last state, every bit of it",
+    "pressure_tensor.csv": "the pressure tensor over time, for a viscosity",
+    "analysis.json": "values of `rigidmd analyse` with their errors",
+    "checkpoint.npz": "from which `rigidmd resume` goes on",
+    "checkpoint_previous.npz": "the checkpoint before it",
+    "last_good_state.npz": "the last state before the run failed",
+}
+
+
+def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
+    """Write the page of the run in a folder. Returns its path, and what is missing. Raises OutputError."""
+    record = read_record(folder)
+    write_text(path, page(f"{record.scene.name}: a run of rigidmd", parts(record)))
+    return path, record.missing
+
+
+def parts(record: Record, film: str = "") -> Iterator[str]:
+    """The parts of the page, as HTML. film: what stands in the place of the plots, with them."""
+    yield f'<p class="faint">{html.escape(record.scene.in_short)}</p>'
+    yield notes([*record.missing, *(record.summary or {}).get("notes", ())])
+    yield film
+    if record.is_body:
+        yield section("Results", _body_table(record))
+    else:
+        yield section("Means of each stage", _means(record), _drifts(record))
+    if not film:
+        yield section("Plots", plots.draw(record))
+    yield section("Analyses", *_analyses(record))
+    yield section("Stability margins", _margins(record))
+    simulated, left_out = _told(record)
+    yield section("What was simulated", code(simulated))
+    yield section("What was left out, and why", items(left_out))
+    yield section("Files", _files(record))
+    yield section("How to repeat it", *_repeat(record))
+
+
+def _means(record: Record) -> str:
+    """Means of the log with their standard errors, which account for correlation."""
+    n, seen = len(record.molecules.model.species), record.columns
+    shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
+    rows = []
+    for k in np.unique(seen["stage"][record.moving]):
+        own = np.flatnonzero(seen["stage"] == k)
+        time = seen["time"][own]
+        cells = [
+            seen["stage_name"][own[0]],
+            f"{time[-1] - (seen['time'][own[0] - 1] if own[0] else time[0]):g}",
+            len(own),
+        ]
+        for column, _, per_molecule in shown:
+            values = seen[column][own] / (n if per_molecule else 1)
+            if np.ptp(values) <= 1e-9 * np.abs(values).max():
+                cells.append(f"{values[0]:.6g}")
+                continue
+            value, error = mean(values)
+            cells.append("" if value is None else with_error(value, error))
+        rows.append(cells)
+    told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, of few lines no error."
+    told = f'<p class="faint">{told}</p>'
+    return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + told
+
+
+def _drifts(record: Record) -> str:
+    """Drift of the conserved energy and speed, which the summary of an ended run tells."""
+    rows = []
+    for stage in (record.summary or {}).get("stages", ()):
+        cells = [stage["name"], stage.get("integrator"), _number(stage.get("timestep_fs"))]
+        for value in ("drift_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom"):
+            error = value.replace("drift_", "drift_error_")
+            known = stage.get(value) is not None and stage.get(error) is not None
+            cells.append(signed(stage[value], stage[error]) if known else "")
+        cells += [_number(stage.get("energy_rms_kJ_mol_per_molecule")), _number(stage.get("ns_per_day"))]
+        rows.append(cells)
+    titles = ["stage", "integrator", "step (fs)", "drift (kJ/mol/ns per molecule)",
+              "drift (kT/ns per degree of freedom)", "energy noise (kJ/mol per molecule)", "ns/day"]  # fmt: skip
+    return table(titles, rows)
+
+
+def _analyses(record: Record) -> Iterator[str]:
+    """What `rigidmd analyse` found: values, what was left out, figures."""
+    rows, left_out, figures, stretches = [], [], [], []
+    for finding, stretch in read_findings(record.folder):
+        for value in finding.values:
+            told = "" if value.value is None else with_error(value.value, value.error)
+            time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
+            rows.append([value.name, told, value.unit if told and value.unit != "1" else "", time, value.note])
+        if not finding.values and not finding.curves:
+            left_out += [f"{finding.name}: {note}" for note in finding.notes]
+        else:
+            stretches.append(stretch)
+        for curve in finding.curves:
+            svg = figure(drawn(curve), f"analysis-{curve.file}", curve.label)
+            figures.append(f"<figure>{svg}</figure>")
+    if not rows and not figures and not left_out:
+        return
+    told = "; ".join(dict.fromkeys(stretches))
+    yield f'<p class="faint">Values ± one standard error, of {html.escape(told)}.</p>' if told else ""
+    yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
+    yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
+    yield "<p>Left out:</p>" + items(left_out) if left_out else ""
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
+
+
+def _body_table(record: Record) -> str:
+    """Energy, its errors, and the range of theta."""
+    seen, rows = record.columns, []
+    rows.append(["time", f"{record.time[-1]:g} s, {len(record.time)} samples"])
+    rows.append(["energy", f"{seen['energy'][0]:.9g} J at the start, {seen['energy'][-1]:.9g} J at the end"])
+    if seen["work"].any():
+        rows.append(["work", f"{seen['work'][-1]:.9g} J done on the body"])
+    if "theta" in seen:
+        low, high = np.degrees([seen["theta"].min(), seen["theta"].max()])
+        rows.append(["θ", f"between {low:.6f}° and {high:.6f}°"])
+    for name in ("energy", "L_lab", "L_size", "L_x", "L_y", "L_z", "L_1", "L_2", "L_3"):
+        if (key := f"{name}_error") in seen:
+            of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
+            rows.append([f"error of {name}", f"at most {np.abs(seen[key]).max():.1e} of {of}"])
+    if "orthogonality_error" in seen:
+        rows.append(["orthogonality", f"|QᵀQ - 1| at most {seen['orthogonality_error'].max():.1e}"])
+    return table([], rows, words=True)
+
+
+def _margins(record: Record) -> str:
+    """How far each time step is from the longest stable one."""
+    summary, rows = record.summary or {}, []
+    if record.is_body:
+        stages = [{"name": record.scene.name, **summary}] if summary else []
+        step, stable, unit = "timestep_s", "stable_timestep_s", "s"
+    else:
+        stages, step, stable, unit = summary.get("stages", ()), "timestep_fs", "stable_timestep_fs", "fs"
+    for stage in stages:
+        if stage.get(step) and stage.get(stable):
+            share = stage[step] / stage[stable]
+            kind, word = next(entry[1:] for entry in MARGINS if share <= entry[0])
+            rows.append(
+                [stage["name"], f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * share:.2g} %",
+                 Raw(f'<span class="{kind}">{word}</span>')]
+            )  # fmt: skip
+    more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd precision --averages`."
+    told = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
+    titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "share", ""]
+    return table(titles, rows) + told if rows else ""
+
+
+#: Share of the longest stable step up to which a step is good, and so on.
+MARGINS = ((0.5, GOOD, "safe"), (1.0, DOUBTFUL, "near the limit"), (float("inf"), BAD, "too long"))
+
+
+def _told(record: Record) -> tuple[str, list[str]]:
+    """What `rigidmd check` says: of the run, and what is left out."""
+    lines = describe(record.scene, bare=True).splitlines()
+    if "left out:" not in lines:
+        return "\n".join(lines), []
+    start = lines.index("left out:")
+    end = next((k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines))
+    return "\n".join([*lines[:start], *lines[end:]]), [line.strip() for line in lines[start + 1 : end]]
+
+
+def _files(record: Record) -> str:
+    output, rows = record.scene.output, []
+    about = ABOUT | {output.topology: "names and first positions, for viewers"}
+    if output.trajectory:
+        viewers = {".gsd": "ovito", ".traj": "ase gui"}
+        viewer = viewers.get(Path(output.trajectory).suffix, f"vmd {output.topology}")
+        turns = " and rotations" if output.trajectory.endswith(".gsd") else ""
+        about[output.trajectory] = f"positions{turns} over time: {viewer} {output.trajectory}"
+    for path in sorted(record.folder.iterdir()):
+        if path.name.startswith(".") or not path.is_file():
+            continue
+        told = "a figure" if path.suffix in (".png", ".svg") else about.get(path.name, "")
+        rows.append([path.name, _size(path.stat().st_size), told])
+    return table(["file", "size", ""], rows, words=True)
+
+
+def _size(size: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} GB"
+
+
+def _told_value(value: object) -> str:
+    """A value of the summary; digests of several files as words."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {digest}" for key, digest in value.items())
+    return str(value)
+
+
+def _repeat(record: Record) -> Iterator[str]:
+    summary, folder = record.summary or {}, shlex.quote(str(record.folder))
+    yield code(
+        f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run\n"
+        f"rigidmd compare {folder} {folder}-again    # to the same bits"
+    )
+    yield table([], [[name, _told_value(summary[key])] for key, name in KNOWN if summary.get(key)], words=True)
+    seconds = [f"{summary[key]:.1f} s {word}" for key, word in (("preparing_s", "to compile and prepare"),
+               ("computing_s", "of steps"), ("wall_s", "in all, output included")) if summary.get(key)]  # fmt: skip
+    yield f"<p>{html.escape('; '.join(seconds))}.</p>" if seconds else ""
