@@ -21,7 +21,7 @@ import numba
 from rigidmd.compile.machine import CODE_SETTINGS, SIMD_BITS
 
 PACKAGE = Path(__file__).parent.parent
-#: Files and folders with compiled code; tests/test_rooms.py checks that no other file has a kernel.
+#: Files and folders with compiled code; tests/test_architecture.py checks that no other file has a kernel.
 COMPILED = (
     "errors.py", "units.py", "core", "compile", "mechanics", "forces", "dynamics", "analysis/pair_histogram.py",
     "engines/__init__.py", "engines/cpu.py", "engines/ode.py",

@@ -1,0 +1,139 @@
+"""The architecture: packages import in one direction, and each heavy library is used in few of them."""
+
+import ast
+import functools
+import subprocess
+import tomllib
+
+import pytest
+from support import COMPILED, ROOT
+
+PACKAGE = ROOT / "rigidmd"
+
+#: From the bottom up: a package imports from those before it and from itself.
+LAYERS = (
+    "errors", "units", "core", "compile", "mechanics", "forces", "dynamics", "scene", "engines", "io", "figures",
+    "assemble", "run", "analysis", "view", "studies", "ase", "commands",
+)  # fmt: skip
+#: `rigidmd` itself and `python -m rigidmd` are above all packages.
+ABOVE_ALL = ("__init__", "__main__")
+RANK = {name: rank for rank, name in enumerate((*LAYERS, *ABOVE_ALL))}
+
+#: Library -> the packages and files that import it.
+LIBRARIES = {
+    "ase": {"io", "assemble", "run", "ase.py"},
+    "chemiscope": {"view"},
+    "distributed": {"studies/sweep"},
+    "gsd": {"io/formats"},
+    "IPython": {"io/progress.py"},
+    "llvmlite": {"compile"},
+    "MDAnalysis": {"io", "run/results.py"},
+    "matplotlib": {"figures", "analysis/files.py", "view", "studies"},
+    "numba": {"compile", "forces"},
+    "numba.core": {"compile"},
+    "numba.extending": {"compile"},
+    "openmm": {"engines/openmm"},
+    "pydantic": {"scene", "io", "run", "analysis/files.py", "studies/sweep"},
+    "rocket_fft": {"forces/ewald/pme.py"},
+    "sympy": {"forces/potentials/formulas.py", "engines/expressions.py"},
+    "tomli_w": {"io/scene_file.py"},
+}  # fmt: skip
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def name_of(path):
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def package_of(path):
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+@functools.cache
+def imports(path):
+    """(line, module) of all imports of a file: at the top, inside functions, and for type checkers only."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name_of(path)}:{node.lineno}: a relative import"
+            for alias in node.names:
+                inner = ROOT.joinpath(*node.module.split("."), alias.name)
+                is_module = inner.with_suffix(".py").is_file() or inner.is_dir()
+                found.append((node.lineno, f"{node.module}.{alias.name}" if is_module else node.module))
+    return found
+
+
+def upward(path):
+    """'file:line: imports module, ...' for imports from packages above, and from the package rigidmd itself."""
+    package = package_of(path)
+    for line, module in imports(path):
+        root, _, rest = module.partition(".")
+        other = rest.partition(".")[0]
+        if root == "rigidmd" and RANK[other or "__init__"] > RANK[package]:
+            yield f"{name_of(path)}:{line}: imports {module}: {package} is below {other or 'rigidmd'}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_imports_point_down(path):
+    """Imports inside functions and for type checkers count. The order of layers excludes circles of packages."""
+    assert package_of(path) in RANK, f"{name_of(path)} is in no layer"
+    found = list(upward(path))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_each_library_has_its_packages(library):
+    strange = [
+        f"{name_of(path)}:{line}: imports {module}"
+        for path in FILES
+        for line, module in imports(path)
+        if f"{module}.".startswith(f"{library}.")
+        and not any(f"{name_of(path)}/".startswith(f"{place}/") for place in LIBRARIES[library])
+    ]
+    assert not strange, "\n".join(strange)
+
+
+def test_the_digest_that_names_the_cache_includes_all_compiled_code():
+    """A kernel in a file outside of `cache.COMPILED`, or a constant from outside, would stay old after a change."""
+    for path in FILES:
+        ours = [(line, module) for line, module in imports(path) if module.startswith("rigidmd.")]
+        if is_compiled(name_of(path)):
+            strange = [
+                f"{line}: {m}"
+                for line, m in ours
+                if not is_compiled(f"{m.removeprefix('rigidmd.').replace('.', '/')}.py")
+            ]
+            assert not strange, f"{name_of(path)} is compiled and imports {strange}"
+        else:
+            kernels = [m for _, m in ours if m.startswith("rigidmd.compile")]
+            allowed = {"rigidmd.compile.machine", "rigidmd.compile.cache"}  # about the processor and the cache
+            assert set(kernels) <= allowed, f"{name_of(path)} compiles"
+
+
+def is_compiled(name):
+    parts = name.removesuffix(".py")
+    return any(name == entry or parts == entry or name.startswith(f"{entry}/") for entry in COMPILED)
+
+
+def test_core_compiles_nothing():
+    for path in (PACKAGE / "core").rglob("*.py"):
+        assert not [m for _, m in imports(path) if m.split(".")[0] == "numba"], name_of(path)
+
+
+def test_every_folder_of_code_is_a_package_that_is_installed():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {".".join(path.parent.relative_to(ROOT).parts) for path in FILES}
+    assert folders | {"rigidmd.systems"} == set(settings["packages"])
+    assert all((path.parent / "__init__.py").is_file() for path in FILES)
+
+
+def test_the_top_level_holds_what_it_should():
+    allowed = {"pyproject.toml", "rigidmd", "tests", "systems", "README.md", "LICENSE"}
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    found = {line.split("/")[0] for line in listed.stdout.splitlines()}
+    assert {name for name in found if not name.startswith(".")} <= allowed

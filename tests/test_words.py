@@ -1,0 +1,147 @@
+"""The vocabulary: docstrings, messages, help texts and documents use the field's terms."""
+
+import ast
+import re
+import sys
+
+import pytest
+from support import ROOT
+
+PACKAGE = ROOT / "rigidmd"
+
+#: Pattern of a word that is not used -> what to write instead. All are matched in lower case.
+REFUSED = {
+    r"waves?(?! (?:vectors?|numbers?)\b)": "k-vectors, reciprocal space",
+    r"endings?": "truncation, cutoff scheme; of a file name: extension",
+    r"baths?": "thermostat",
+    r"books?|booked|pays?|paid": "energy ledger: heat, work; accounted for",
+    r"looks?|looked|looking(?! up)": "observation; observed",
+    r"told|tells?|telling|says?|said|saying": "given, passed, set; report, print, name",
+    r"own|one's own": "user, custom; or leave it out",
+    r"shares": "fractions, work ranges",
+    r"share (?:of|that|in)": "fraction, work range",
+    r"crews?|leaders?|parcels?": "thread pool, main thread, task arguments",
+    r"stretch(?:es|ed|ing)?": "segment of a run; scaling of a box",
+    r"places?|placed|placing": "position",
+    r"turn(?:s|ed|ing)?": "rotate; become",
+    r"leans?|leaning": "tilt",
+    r"laws?": "pair potential",
+    r"go(?:es|ing)? on|went on": "resume, continue",
+    r"held against|stands? against": "compared with",
+    r"beside": "next to",
+    r"apart(?! from)": "separate, differ",
+    r"faults?|mistakes?": "error",
+    r"so many|is no [a-z]+|that of the|those of the": "name the thing",
+    r"rooms?|doors?|houses?|whoever": "package, interface, architecture; memory, space",
+    r"reliefs?|relieves?|relieved|relieving": "overlap removal",
+}
+WORDS = [
+    (re.compile(rf"(?<![\w`./-])(?:{pattern})(?![\w`/-])", re.IGNORECASE), better)
+    for pattern, better in REFUSED.items()
+]
+
+#: Uses that stay: they are names of the field or of keys.
+ALLOWED = re.compile(
+    r"""
+      Newton's\ laws?|law\ of\ \w+|Coulomb's\ law|Fick's\ law|second\ law      # physics
+    | (?:plane|sound|sine|square)\ waves?
+    | turns?\ (?:on|off|out)|in\ turns?|turned\ (?:on|off)
+    | takes?\ place|took\ place|taking\ place|in\ place(?:\ of)?|decimal\ places?|first\ place
+    | (?:its|their|your|his|our)\ own                                         # but not "one's own"
+    | no\ longer|no\ such|no\ more|no\ less|books?\ of\ \w+
+    | look(?:s|ed|ing)?\ (?:up|for|at|like)|what\ to\ look\ at              # of people
+    """,
+    re.IGNORECASE | re.VERBOSE,
+)
+
+
+def refused_in(text):
+    """(position, word, better) of each refused word in plain text."""
+    kept = [match.span() for match in ALLOWED.finditer(text)]
+    for pattern, better in WORDS:
+        for match in pattern.finditer(text):
+            if not any(start <= match.start() and match.end() <= end for start, end in kept):
+                yield match.start(), match.group(), better
+
+
+def without_code(text):
+    """Text in which quoted code is blank, so that positions and lines stay."""
+    return re.sub(
+        r"```.*?```|`[^`\n]*`|<[^>\n]*>|https?://\S+", lambda m: re.sub(r"[^\n]", " ", m.group()), text, flags=re.DOTALL
+    )
+
+
+def texts_of(path):
+    """(line, text) of docstrings, and of strings of several words, of a Python file; of the whole of a document."""
+    source = path.read_text(encoding="utf-8")
+    if path.suffix == ".md":
+        yield 1, without_code(source)
+        return
+    tree = ast.parse(source)
+    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            text = "".join(v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
+            text = node.value
+        else:
+            continue
+        if re.search(r"[A-Za-z]{2,}\S* \S*[A-Za-z]{2,}", text):
+            yield node.lineno, without_code(text)
+
+
+#: Parts of identifiers that are not used, besides the words above.
+REFUSED_NAMES = set(
+    ["bath", "baths", "book", "books", "booked", "crew", "ending", "endings", "leader", "lean", "leaning", "leans", "look", "looked", "looks", "mistake", "own", "parcel", "pays", "relief", "relieve", "relieved", "room", "share", "shares", "stretch", "stretches", "tell", "told", "wave", "waves"]
+)
+#: Names that stay: keys of scenes and names of other libraries.
+ALLOWED_NAMES: set[str] = set()
+
+
+def names_in(path):
+    """(line, name) of what a Python file defines: functions, classes, arguments, variables, attributes."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            yield node.lineno, node.name
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+        elif isinstance(node, (ast.Name, ast.Attribute)) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id if isinstance(node, ast.Name) else node.attr
+
+
+def refused_names(path):
+    for line, name in names_in(path):
+        parts = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().split("_")
+        if name not in ALLOWED_NAMES and (bad := REFUSED_NAMES & set(parts)):
+            yield f"{path.relative_to(ROOT)}:{line}: the name {name!r} has {', '.join(sorted(bad))}"
+
+
+def comments_of(path):
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        if match := re.search(r"(?:^|\s)#:? (.*)$", line):
+            yield number, without_code(match.group(1))
+
+
+def found_in(path, comments=False):
+    """Lines 'file:line: word, write ...' of a file."""
+    pieces = [*texts_of(path), *(comments_of(path) if comments and path.suffix == ".py" else ())]
+    for line, text in pieces:
+        for at, word, better in refused_in(text):
+            yield f"{path.relative_to(ROOT)}:{line + text[:at].count(chr(10))}: {word!r}: write {better}"
+
+
+FILES = sorted([*PACKAGE.rglob("*.py"), *(PACKAGE / "docs").glob("*.md"), ROOT / "README.md"])
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_words_of_the_field(path):
+    found = list(found_in(path, comments=True))
+    if path.suffix == ".py":
+        found += refused_names(path)
+    assert not found, "\n" + "\n".join(found)
+
+
+if __name__ == "__main__":
+    wanted = [ROOT / name for name in sys.argv[1:]] or [ROOT]
+    for path in (path for path in FILES if any(path.is_relative_to(folder) for folder in wanted)):
+        print(*found_in(path, True), *(refused_names(path) if path.suffix == ".py" else ()), sep="\n")
