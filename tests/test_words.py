@@ -92,7 +92,39 @@ def texts_of(path):
 
 #: Parts of identifiers that are not used, besides the words above.
 REFUSED_NAMES = set(
-    ["bath", "baths", "book", "books", "booked", "crew", "ending", "endings", "leader", "lean", "leaning", "leans", "look", "looked", "looks", "mistake", "own", "parcel", "pays", "relief", "relieve", "relieved", "room", "share", "shares", "stretch", "stretches", "tell", "told", "wave", "waves"]
+    [
+        "bath",
+        "baths",
+        "book",
+        "books",
+        "booked",
+        "crew",
+        "ending",
+        "endings",
+        "leader",
+        "lean",
+        "leaning",
+        "leans",
+        "look",
+        "looked",
+        "looks",
+        "mistake",
+        "own",
+        "parcel",
+        "pays",
+        "relief",
+        "relieve",
+        "relieved",
+        "room",
+        "share",
+        "shares",
+        "stretch",
+        "stretches",
+        "tell",
+        "told",
+        "wave",
+        "waves",
+    ]
 )
 #: Names that stay: keys of scenes and names of other libraries.
 ALLOWED_NAMES: set[str] = set()

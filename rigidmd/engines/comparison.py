@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.engines import Engine
 from rigidmd.engines.observables import kinetic_energies, observe
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.units import KJ_PER_MOL
 

@@ -29,7 +29,7 @@ from rigidmd.dynamics.force_gradient import Probe, probe_for
 from rigidmd.dynamics.observables import Extent, Sums, sums_over
 from rigidmd.dynamics.step_loop import Advance, Model, advance_body, code_of, row_of
 from rigidmd.dynamics.thermostats import NoBath, heat_room
-from rigidmd.engines import Tally
+from rigidmd.engines.protocol import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields.walls import Behind, LennardJonesWalls
 from rigidmd.forces.terms import (

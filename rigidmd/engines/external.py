@@ -9,9 +9,9 @@ import numpy as np
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, Load, State
 from rigidmd.dynamics.step_loop import Model
-from rigidmd.engines import Tally
 from rigidmd.engines.cpu import keep_time
 from rigidmd.engines.force_field import Portrait, portrait
+from rigidmd.engines.protocol import Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 

@@ -17,8 +17,8 @@ from rigidmd.compile import kernel
 from rigidmd.core.integrators import DOP853, FORMULATIONS, RADAU, RK4, Scheme, Solver
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
 from rigidmd.dynamics.body_step_loop import Body, relative_motion
-from rigidmd.engines import Halted
 from rigidmd.engines.cpu import Engine, keep_time
+from rigidmd.engines.protocol import Halted
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import frame_rate
 from rigidmd.forces.body.resistance import braking

@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.core.state import State
 from rigidmd.dynamics.momenta import mobile
 from rigidmd.dynamics.step_loop import Model
-from rigidmd.engines import Engine
 from rigidmd.engines.cpu import BehindWallError
+from rigidmd.engines.protocol import Engine
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run.checks import kicks
 

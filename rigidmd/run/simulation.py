@@ -20,8 +20,8 @@ from rigidmd.core.display import Displayed
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.process import ONE_AT_A_TIME
 from rigidmd.core.state import NOW, ORIGIN, State
-from rigidmd.engines import Engine, Halted
 from rigidmd.engines.cpu import NotFiniteError
+from rigidmd.engines.protocol import Engine, Halted
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SimulationError
 from rigidmd.io.checkpoint import Checkpoint, latest
 from rigidmd.io.folder import (

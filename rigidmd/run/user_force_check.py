@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.state import Load, State
-from rigidmd.engines import Engine
+from rigidmd.engines.protocol import Engine
 from rigidmd.errors import SceneError
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.units import KJ_PER_MOL

@@ -9,9 +9,9 @@ import numpy as np
 from rigidmd.assemble.build import build
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, State
-from rigidmd.engines import Engine
 from rigidmd.engines.comparison import ERRORS, Line, compare_at, in_words
 from rigidmd.engines.external import OtherEngine, other_engine
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene, Scene

@@ -19,12 +19,12 @@ import numpy as np
 
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.step_loop import Model
-from rigidmd.engines import Tally
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import OtherEngine, same
 from rigidmd.engines.lammps import files as files
 from rigidmd.engines.lammps.dump import read_dump
 from rigidmd.engines.observables import kinetic_energies
+from rigidmd.engines.protocol import Tally
 from rigidmd.engines.rigid_bodies import Bodies
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError

@@ -11,13 +11,13 @@ import numpy as np
 
 from rigidmd.core.state import HEAT, Load, State
 from rigidmd.dynamics.step_loop import Model
-from rigidmd.engines import Tally
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import OtherEngine, same
 from rigidmd.engines.force_field import Portrait
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.openmm import system as parts
 from rigidmd.engines.openmm.stages import integration_groups, integrator_of, movers, step, tolerance
+from rigidmd.engines.protocol import Tally
 from rigidmd.engines.rigid_bodies import Bodies
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError

@@ -26,7 +26,7 @@ import numpy as np
 
 from rigidmd.assemble.stage_flows import row
 from rigidmd.core.state import State
-from rigidmd.engines import Engine
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.run.pilot.choice import rounded_down

@@ -18,10 +18,10 @@ from rigidmd.core.drift import slope
 from rigidmd.core.integrators import RK4, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean
-from rigidmd.engines import Engine
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.observables import Observation
 from rigidmd.engines.ode import OdeEngine
+from rigidmd.engines.protocol import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import KJ_PER_MOL
