@@ -8,7 +8,8 @@ import numpy as np
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.momenta import Freedom
 from rigidmd.dynamics.observables import sums_over
-from rigidmd.engines.protocol import Engine, cpu
+from rigidmd.engines import cpu
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
