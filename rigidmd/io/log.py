@@ -12,7 +12,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from rigidmd.core.files import AppendedFile
-from rigidmd.engines.protocol import samples
+from rigidmd.engines import samples
 from rigidmd.engines.samples import Sample
 
 #: Seconds that a line may wait for others, which together take a tenth of the time, and after which it waits for none.

@@ -11,10 +11,10 @@ import numpy as np
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.state import State
+from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.columns import BODY
-from rigidmd.engines.protocol import samples
 from rigidmd.engines.system import System
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.io.checkpoint import latest
