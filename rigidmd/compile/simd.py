@@ -2,11 +2,11 @@
 
 Lanes of float32 or float64 support `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
 from and stored to contiguous arrays. The number of lanes follows from the machine (machine.SIMD_BITS): 16 float32 with
-AVX-512, 8 with AVX2, otherwise 4; half as many float64. `lane_types` has the types and operators, this file the
+AVX-512, 8 with AVX2, otherwise 4; half as many float64. `simd_types` has the types and operators, this file the
 functions.
 
 Functions that appear in formulas also take scalars, so that one formula serves pair loops and single numbers; so do
-those of Python's `math`, see `lane_math`.
+those of Python's `math`, see `simd_math`.
 """
 
 from math import prod, sqrt
@@ -17,7 +17,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from rigidmd.compile import SIMD_BITS, implements
+from rigidmd.compile import (
+    SIMD_BITS,
+    implements,
+    simd_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
+)
 from rigidmd.compile.machine import IS_X86
 from rigidmd.compile.simd_types import COUNT, Lanes, Mask, filled, multiply_add
 

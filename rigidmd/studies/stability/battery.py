@@ -5,9 +5,7 @@ from collections.abc import Callable
 
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import meant
-from rigidmd.studies.stability import (
-    water,  # noqa: F401  (enter cases)
-)
+from rigidmd.studies.stability import bodies, boxes, collisions, resistance, tops, unfit, water  # noqa: F401  (cases)
 from rigidmd.studies.stability.outcomes import Finding
 from rigidmd.studies.stability.runs import CASES, Case
 
