@@ -45,7 +45,7 @@ class Faults(RigidMDError):
         else:
             more = [f"and {len(self.faults) - MOST_SHOWN} more"] if len(self.faults) > MOST_SHOWN else []
             shown = "\n".join(f"  {fault}" for fault in [*self.faults[:MOST_SHOWN], *more])
-            super().__init__(f"{where}: {len(self.faults)} faults\n{shown}")
+            super().__init__(f"{where}: {len(self.faults)} errors\n{shown}")
 
 
 class SceneError(Faults):

@@ -217,7 +217,7 @@ def test_all_faults_at_once(capsys, tmp_path):
         .replace("timestep_fs = 1", "timestep_fs = 0\nfoo = 1")
     )
     message = refused(capsys, tmp_path, text)
-    assert "4 faults" in message
+    assert "4 errors" in message
     for key in ("box.lengths_A", "molecules.0.count", "stages.0.timestep_fs", "stages.0.foo"):
         assert key in message
 

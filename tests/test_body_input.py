@@ -110,7 +110,7 @@ def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
     assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     for part in (
-        "6 faults", "line 1: body: no body has this inertia", "line 7: start.position_m: the body is pinned",
+        "6 errors", "line 1: body: no body has this inertia", "line 7: start.position_m: the body is pinned",
         "line 6: start: the matrix is not a rotation", "line 11: friction.viscous_N_m_s.1: is -1, must not be less than 0",
         "line 14: applied.0.times_s: must increase: entry 2 is 1 after 2",
         "line 20: run.integrater: unknown key; did you mean integrator?",

@@ -314,7 +314,7 @@ class Trial:
         assert not UNSEEN.search(said), said
         if code == 2:
             assert err.getvalue().startswith("rigidmd: "), said
-            assert len(err.getvalue().splitlines()[0].split(": ")) >= 3 or "faults" in said, said
+            assert len(err.getvalue().splitlines()[0].split(": ")) >= 3 or "errors" in said, said
             assert len(said) < 100_000
         return code
 

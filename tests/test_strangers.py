@@ -118,7 +118,7 @@ def test_twenty_thousand_faults_are_told_at_once(what, capsys, tmp_path):
         "molecules": GOOD + "".join(f'[[molecules]]\nmodel = "spce{n}"\n' for n in range(5000)),
     }[what]
     message = refusal(capsys, tmp_path, some)
-    assert f"{5000 if what == 'molecules' else 20_000} faults" in message
+    assert f"{5000 if what == 'molecules' else 20_000} errors" in message
     assert "\n  and " in message
     assert len(message) < 20_000
 

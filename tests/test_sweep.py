@@ -629,7 +629,7 @@ def test_words_for_slurm():
         ([], "no key has several values"),
         (["--set", "seed=3"], "no key has several values"),
         (["--set", "seed=1..3", "--set", "seed=5,6"], "seed is set 2 times"),
-        (["--set", "seed=4..1", "--set", "a=1,,2"], "2 faults"),
+        (["--set", "seed=4..1", "--set", "a=1,,2"], "2 errors"),
         (["--set", "seed=1,1"], "seed: 1 is there 2 times"),
         (["--set", "start.temperature_K=90,90.0"], "90 is there 2 times"),
         (["--set", "sed=1..3"], "did you mean seed?"),
@@ -650,7 +650,7 @@ def test_all_faults_of_all_points_at_once(argon, tmp_path, capsys):
     arguments = ["--set", "start.temperature_K=-5,100,cold", "--set", "forces.cutoff_A=8,12", "-o", str(tmp_path / "s")]
     assert cli.main(["sweep", str(argon), *arguments]) == 2
     said = capsys.readouterr().err
-    assert "3 faults" in said
+    assert "3 errors" in said
     assert "at temperature_K = -5, cutoff_A = 8 and 1 more points: --set start.temperature_K: is -5" in said
     assert "at temperature_K = 100, cutoff_A = 12: forces.cutoff_A = 12 is longer than half" in said
     assert "at temperature_K = cold" in said
