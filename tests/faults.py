@@ -93,7 +93,7 @@ def scene_of(rng: random.Random, wide: bool) -> tuple[str, dict]:
         "trajectory_interval_ps": rng.choice([0.004, 0.01, 0.014]),
         "trajectory": "trajectory"
         + rng.choice([".xtc", ".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"]),
-        "figure": wide and rng.random() < 0.1,
+        "figures": wide and rng.random() < 0.1,
     }
     if output["trajectory"] == "trajectory.dcd":  # frames of it are evenly spaced
         output["trajectory_interval_ps"] = 0.01

@@ -35,7 +35,7 @@ FORTY_WATERS = {
     "molecules": [{"model": "spce", "count": 40}],
     "forces": {"cutoff_A": 5.0, "truncation": "smooth_switch"},
     "start": {"temperature_K": 298.0},
-    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figure": False},
+    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figures": False},
 }
 NVT = {"ensemble": "nvt", "temperature_K": 298.0, "duration_ps": 0.1, "timestep_fs": 1.0}
 NPT = NVT | {"ensemble": "npt", "pressure_bar": 1.0, "barostat_interval_ps": 0.007, "temperature_K": [298.0, 320.0]}

@@ -35,7 +35,7 @@ sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 from peer_engines import gro, top
 
 SHORT = {"stages.0.duration_ps": 0.02, "stages.1.duration_ps": 0.2, "output.trajectory_interval_ps": 0.004,
-         "output.trajectory": "trajectory.trr", "output.log_interval_ps": 0.004, "output.figure": False,
+         "output.trajectory": "trajectory.trr", "output.log_interval_ps": 0.004, "output.figures": False,
          "output.pressure_tensor_interval_ps": 0.004}  # fmt: skip
 GROMACS = shutil.which("gmx")
 needs_gromacs = pytest.mark.skipif(not GROMACS, reason="GROMACS is not installed")
@@ -548,7 +548,7 @@ def test_stages_of_one_name_are_told_apart(tmp_path):
         {"name": "x", "ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.02},
         {"name": "x", "duration_ps": 0.2},
     ]
-    output = {"trajectory_interval_ps": 0.01, "log_interval_ps": 0.01, "figure": False}
+    output = {"trajectory_interval_ps": 0.01, "log_interval_ps": 0.01, "figures": False}
     Simulation(small_scene({"argon": 20}, 25.0, stages=stages, output=output), tmp_path / "run").run()
     record = read_record(tmp_path / "run")
     assert np.bincount(record.columns["stage"].astype(int)).tolist() == [3, 20]

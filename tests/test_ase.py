@@ -45,7 +45,7 @@ FORCES = FORTY_WATERS["forces"]
 NVE = {"duration_ps": 0.06, "timestep_fs": 2.0}
 #: Factor of charges that gives them ASE's Coulomb constant, of CODATA 2014.
 SAME_COULOMB = float(np.sqrt(units.Hartree * units.Bohr * EV / COULOMB))
-OUTPUT = {"log_interval_ps": 0.02, "trajectory_interval_ps": 0.02, "figure": False}
+OUTPUT = {"log_interval_ps": 0.02, "trajectory_interval_ps": 0.02, "figures": False}
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ seed = 5
 threads = 1
 forces.cutoff_A = 6.0
 start.temperature_K = 90.0
-output = { trajectory = false, figure = false, log_interval_ps = 0.01 }
+output = { trajectory = false, figures = false, log_interval_ps = 0.01 }
 [box]
 lengths_A = 16.0
 [[molecules]]

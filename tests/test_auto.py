@@ -39,7 +39,7 @@ def liquid(**last):
     """27 waters, warmed up, then 0.3 ps of NVE as told."""
     stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5}, {"duration_ps": 0.3} | last]
     return small_scene({"spce": 27}, 9.4, forces={"cutoff_A": 4.69, "switch_start_A": 3.0}, stages=stages,
-                       output={"trajectory": False, "log_interval_ps": 0.01, "figure": False})  # fmt: skip
+                       output={"trajectory": False, "log_interval_ps": 0.01, "figures": False})  # fmt: skip
 
 
 def energy_error(results):
@@ -91,7 +91,7 @@ def test_the_error_asked_for_is_kept_over_a_long_stage(kind, target):
     counts, edge, forces, temperature = KEPT[kind]
     warm = {"ensemble": "nvt", "temperature_K": temperature, "duration_ps": 2.0}
     stages = [warm, {"duration_ps": 10.0, "integrator": "auto", "energy_error_kT": target}]
-    output = {"trajectory": False, "log_interval_ps": 0.05, "figure": False}
+    output = {"trajectory": False, "log_interval_ps": 0.05, "figures": False}
     scene = small_scene(counts, edge, forces=forces, start={"temperature_K": temperature}, stages=stages, output=output)
     results = Simulation(scene).run()
     assert target / 30 < energy_error(results) < 1.7 * target

@@ -60,8 +60,8 @@ def worst(results, name):
 def test_every_scene_keeps_what_it_should_and_says_what_to_look_at(path):
     assert "What to look at" in path.read_text()
     results = run(path.stem)
-    assert len(results["t"]) >= 450  # enough to draw
-    assert results["t"][-1] == pytest.approx(results.system.scene.run.duration_s)
+    assert len(results["time"]) >= 450  # enough to draw
+    assert results["time"][-1] == pytest.approx(results.system.scene.run.duration_s)
     for name, error in results.summary["largest_relative_error"].items():
         # Two scenes with resistance are of order 2; the gyrocompass hides its slow swing in a fast spin.
         allowed = {"body_in_fluid": 1e-8, "gyroscope_friction": 1e-8, "gyrocompass": 1e-7}.get(path.stem, 1e-11)
@@ -76,7 +76,7 @@ def test_free_symmetric_top(shape):
     i1, i2, i3 = results.system.inertia
     assert i1 == i2
     assert (i3 < i1) == (shape == "prolate")
-    t, omega, rotation = results["t"], vectors(results, "omega_body_"), rotations(results)
+    t, omega, rotation = results["time"], vectors(results, "omega_body_"), rotations(results)
     expected, turned = known.free_symmetric_top(i1, i3, omega[0], t, rotation[0])
     size = np.linalg.norm(omega[0])
     assert np.abs(omega - expected).max() < 1e-9 * size
@@ -98,7 +98,7 @@ def test_free_asymmetric_top_over_ten_periods():
     omega0 = (1.0, 0.4, 1.3)
     period = known.free_asymmetric_period((1, 2, 2.8), omega0)
     results = run("free_asymmetric_top", run__duration_s=10 * period, run__timestep_s=period / 800)
-    omega, rotation = known.free_asymmetric_top((1, 2, 2.8), rotations(results)[0], np.array(omega0), results["t"])
+    omega, rotation = known.free_asymmetric_top((1, 2, 2.8), rotations(results)[0], np.array(omega0), results["time"])
     found = vectors(results, "omega_body_")
     assert np.abs(found - omega).max() < 1e-10
     assert np.abs(rotations(results) - rotation).max() < 1e-10
@@ -139,7 +139,7 @@ def top_of(results) -> known.LagrangeTop:
 @pytest.mark.parametrize("k", range(1, 8))
 def test_heavy_tops_follow_the_elliptic_solution(k):
     results = run(f"heavy_top_{k}")
-    top, t = top_of(results), results["t"]
+    top, t = top_of(results), results["time"]
     assert np.abs(results["theta"] - top.theta(t)).max() < 1e-8
     assert np.abs(rotations(results) - top.rotation(t)).max() < 1e-8
     low, high = top.theta_limits
@@ -170,7 +170,7 @@ def test_nutation_and_mean_precession_of_heavy_tops(k):
 )
 def test_the_seven_pictures_are_what_their_names_say(k, picture):
     results = run(f"heavy_top_{k}")
-    precession = np.gradient(np.unwrap(results["phi"]), results["t"])
+    precession = np.gradient(np.unwrap(results["phi"]), results["time"])
     theta = results["theta"]
     if picture == "circle":
         assert np.ptp(theta) < 1e-12
@@ -186,7 +186,7 @@ def test_the_seven_pictures_are_what_their_names_say(k, picture):
         assert abs(smallest) < 0.02 * largest
         assert theta[np.argmin(precession)] == pytest.approx(theta.min(), abs=0.01)
     if k == 7:  # one loop of a cardioid, closed after a turn round the vertical
-        turn = np.searchsorted(results["t"], top_of(results).period)
+        turn = np.searchsorted(results["time"], top_of(results).period)
         assert np.unwrap(results["phi"])[turn] == pytest.approx(2 * np.pi, rel=0.01)
 
 
@@ -196,7 +196,7 @@ def test_steady_precession_stays_steady(root):
     assert np.ptp(results["theta"]) < 1e-9
     top = top_of(results)
     rates = known.steady_precession_rates(top.i1, top.l_3, top.mgl, np.radians(60))
-    found = np.polyfit(results["t"], np.unwrap(results["phi"]), 1)[0]
+    found = np.polyfit(results["time"], np.unwrap(results["phi"]), 1)[0]
     assert found == pytest.approx(rates[("slow", "fast").index(root)], rel=1e-9)
     assert top.i1 * 0.5 * found**2 - top.l_3 * found + top.mgl == pytest.approx(0, abs=1e-9 * top.l_3 * found)
 
@@ -223,8 +223,8 @@ def test_the_sleeping_top_wakes_where_it_should():
 def test_the_fast_heavy_top_comes_through():
     results = run("fast_heavy_top")
     assert results["energy"][0] == pytest.approx(5435.696790865546875, rel=1e-14)
-    at = np.searchsorted(results["t"], 0.5 - 1e-9)
-    assert results["t"][at] == pytest.approx(0.5)
+    at = np.searchsorted(results["time"], 0.5 - 1e-9)
+    assert results["time"][at] == pytest.approx(0.5)
     place = vectors(results, "", "xyz")
     expected = [-0.7024682970565856, -0.02116518470192333, -0.7114002576517344]
     assert place[at] == pytest.approx(expected, abs=1e-9)
@@ -275,7 +275,7 @@ def test_euler_angles_refuse_the_pole_or_come_through_it(solver):
 
 def test_gyroscope_friction():
     results = run("gyroscope_friction")
-    system, t = results.system, results["t"]
+    system, t = results.system, results["time"]
     friction = system.scene.friction
     spin = known.coasting_spin(system.inertia[2], friction.viscous_N_m_s[2], friction.dry_N_m[2],
                                results["omega_body_3"][0], t)  # fmt: skip
@@ -290,17 +290,17 @@ def test_gyroscope_friction():
     fine = run("gyroscope_friction", run__duration_s=0.5, output__interval_s=1e-4)
     w = vectors(fine, "omega_body_")
     power = -(w**2 @ np.array(friction.viscous_N_m_s) + np.abs(w) @ np.array(friction.dry_N_m))
-    assert simpson(power, x=fine["t"]) == pytest.approx(fine["work"][-1], rel=1e-8)
+    assert simpson(power, x=fine["time"]) == pytest.approx(fine["work"][-1], rel=1e-8)
 
 
 def test_a_top_spun_down_stops_and_stays():
     results = run("gyroscope_friction", start__euler_angles_deg=(0, 180, 0), start__euler_rates_rad_s=None,
                   start__angular_velocity_body_rad_s=(0, 0, 20), run__duration_s=10)  # fmt: skip
     stop = known.coasting_stop(1.2e-4, 1e-5, 5e-4, 20.0)
-    at_rest = results["t"] > stop + results.system.scene.run.timestep_s
+    at_rest = results["time"] > stop + results.system.scene.run.timestep_s
     assert 0 < stop < 9
     assert (results["omega_body_3"][at_rest] == 0).all()
-    assert (results["omega_body_3"][results["t"] < stop - 1e-3] > 0).all()
+    assert (results["omega_body_3"][results["time"] < stop - 1e-3] > 0).all()
 
 
 def test_body_in_fluid():
@@ -323,7 +323,7 @@ def test_gyrocompass():
     assert omega == pytest.approx(7.2921e-5, rel=1e-4)
     period = known.gyrocompass_period_linear((0.05, 0.04, 0.045), 1.0, 9.81 * 0.005, omega, latitude)
     simple = known.gyrocompass_period(1.0, 9.81 * 0.005, omega, latitude)
-    t, heading = results["t"], np.degrees(np.mod(results["phi"], 2 * np.pi)) - 180
+    t, heading = results["time"], np.degrees(np.mod(results["phi"], 2 * np.pi)) - 180
     slow = np.abs(np.fft.rfft(heading - heading.mean()))
     assert 2 <= np.argmax(slow) <= 4
     rising = np.flatnonzero((heading[:-1] < 0) & (heading[1:] >= 0))
@@ -341,7 +341,7 @@ def test_gyrocompass():
 def test_dropped_stone_and_the_same_fall_from_outside():
     results = run("dropped_stone")
     turning = np.array([0, 5.1563e-5, 5.1563e-5])
-    start, t = np.array([0, 0, 100.0]), results["t"]
+    start, t = np.array([0, 0, 100.0]), results["time"]
     place, speed = known.rotating_fall(turning, np.array([0, 0, -9.806]), start, np.zeros(3), t)
     assert np.abs(vectors(results, "", "xyz") - place).max() < 1e-10
     assert np.abs(vectors(results, "v", "xyz") - speed).max() < 1e-10
@@ -359,13 +359,13 @@ def test_dropped_stone_and_the_same_fall_from_outside():
         return from_vector(turning * pose.time) @ [0, 0, -9.806], np.zeros(3)
 
     seen = Simulation(outside, applied={"weight": weight}).run()
-    back = from_vector(-turning * seen["t"][:, None])
+    back = from_vector(-turning * seen["time"][:, None])
     assert np.abs(np.einsum("tij,tj->ti", back, vectors(seen, "", "xyz")) - place).max() < 1e-10
 
 
 def test_satellite_wheel():
     results = run("satellite_wheel")
-    angle = known.wheel_turn(6.0, 0.02, 20.0, results["t"])
+    angle = known.wheel_turn(6.0, 0.02, 20.0, results["time"])
     assert np.abs(np.unwrap(results["phi"] + results["psi"]) - angle).max() < 1e-12
     assert worst(results, "L_size") < 1e-14
     assert np.abs(vectors(results, "L_lab_", "xyz")).max() < 1e-15
@@ -379,7 +379,7 @@ def test_satellite_wheel():
 
 def test_satellite_mass_loss():
     results = run("satellite_mass_loss")
-    spin = known.changing_inertia_spin(30.0, lambda t: np.interp(t, [20, 120], [60, 30]), results["t"])
+    spin = known.changing_inertia_spin(30.0, lambda t: np.interp(t, [20, 120], [60, 30]), results["time"])
     assert np.abs(results["omega_body_3"] - spin).max() < 1e-10
     assert spin[-1] == 2 * spin[0]
     assert worst(results, "L_lab") < 1e-13
@@ -550,7 +550,7 @@ def test_free_bodies_of_others(reference):
             assert found[order] == pytest.approx([5 * np.sin(rate * t), 5 * np.cos(rate * t), 7], abs=1e-12)
     for k in range(3):
         spin = free_body([1, 2, 3], np.eye(3)[k], 4 * np.pi, np.pi / 400, "velocity_verlet")
-        assert np.abs(spin["q" + "xyz"[k]]) == pytest.approx(np.abs(np.sin(spin["t"] / 2)), abs=1e-12)
+        assert np.abs(spin["q" + "xyz"[k]]) == pytest.approx(np.abs(np.sin(spin["time"] / 2)), abs=1e-12)
         torque = {"applied": [{"axes": "body", "torque_N_m": (6 * np.eye(3)[k]).tolist()}]}
         pushed = free_body([1, 2, 3], [0, 0, 0], 1.0, 1e-3, "velocity_verlet", **torque)
-        assert pushed[f"omega_body_{k + 1}"] == pytest.approx(6 * pushed["t"] / (k + 1), abs=1e-12)
+        assert pushed[f"omega_body_{k + 1}"] == pytest.approx(6 * pushed["time"] / (k + 1), abs=1e-12)

@@ -423,14 +423,14 @@ def test_what_is_switched_on_and_off_gives_its_whole_impulse(integrator):
         results = simulate(stone | {"applied": [{"force_N": [3.0, 0.0, 0.0], "from_s": begin, "to_s": end}]})
         assert results["vx"][-1] == pytest.approx(1.5 * (end - begin), rel=1e-9)
         assert results["x"][-1] == pytest.approx(1.5 * (end - begin) * (100.0 - 0.5 * (begin + end)), rel=1e-9)
-        assert results["t"][-1] == pytest.approx(100.0, rel=2e-3)
-        assert np.diff(results["t"]).min() > 0
+        assert results["time"][-1] == pytest.approx(100.0, rel=2e-3)
+        assert np.diff(results["time"]).min() > 0
 
 
 def test_breaks_at_the_ends_and_on_top_of_each_other_do_no_harm():
     stone = {"body": {"mass_kg": 2.0}, "run": {"duration_s": 1.0, "timestep_s": 0.3}, "output": {"trajectory": False}}
     late = simulate(stone | {"applied": [{"force_N": [3.0, 0.0, 0.0], "from_s": 0.95}]})  # three steps end at 0.9
-    assert late["t"][-1] == pytest.approx(0.9)
+    assert late["time"][-1] == pytest.approx(0.9)
     assert (late["vx"] == 0).all()
     twins = [{"force_N": [3.0, 0.0, 0.0], "from_s": 0.5}, {"force_N": [1.0, 0.0, 0.0], "from_s": 0.5 + 1e-12}]
     assert simulate(stone | {"applied": twins})["vx"][-1] == pytest.approx(2 * 0.4, rel=1e-9)
@@ -719,7 +719,7 @@ def test_quadratic_resistance_never_lets_go(strength):
         Scene.from_dict(point | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
     ).run()
     speed = np.sqrt(sum(results[k] ** 2 for k in ("vx", "vy", "vz")))
-    known = speed[0] / (1 + strength * speed[0] * results["t"])
+    known = speed[0] / (1 + strength * speed[0] * results["time"])
     assert (np.diff(speed) <= 0).all()
     assert speed[-1] < speed[0]
     assert (speed[1:] <= 1.2 * known[1:]).all()

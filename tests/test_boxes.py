@@ -18,7 +18,7 @@ from support import (
     Pressure,
     VelocityRescaling,
     VolumeMoves,
-    box_of,
+    barostat_of,
     box_room,
     boxes,
     build,
@@ -40,7 +40,7 @@ from rigidmd.units import BAR, BOLTZMANN
 VERLET = SCHEMES["velocity_verlet"]
 THERMAL = 300 * BOLTZMANN
 NPT = {"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "duration_ps": 0.1}
-QUIET = {"trajectory": False, "figure": False}
+QUIET = {"trajectory": False, "figures": False}
 
 
 @numba.njit
@@ -107,7 +107,7 @@ def enthalpy(system, engine, state, pressure):
 @pytest.mark.parametrize("k", range(6))
 def test_what_drives_a_strain_is_minus_the_slope_of_the_enthalpy(liquid, k):
     system, engine, state = liquid
-    box = box_of(system, 0)._replace(at_rest=(0.0, 0.0, 0.0))
+    box = barostat_of(system, 0)._replace(at_rest=(0.0, 0.0, 0.0))
     room = box_room(state)
     tallied(system, engine, state, room)
     found = driving(box, system.model, state, room, k, state.volume, THERMAL)
@@ -126,7 +126,7 @@ def test_what_drives_a_strain_is_minus_the_slope_of_the_enthalpy(liquid, k):
 def test_a_move_and_its_reverse_are_in_balance(liquid, coupling):
     """The chance of a move times that of its reverse is 1: log ratios of opposite moves are opposite."""
     system, engine, state = liquid
-    box = box_of(system, 0)._replace(coordinate=COUPLINGS[coupling])
+    box = barostat_of(system, 0)._replace(coordinate=COUPLINGS[coupling])
     if coupling in ("isotropic", "semi_isotropic"):
         box = box._replace(pressure=Pressure((9.0,) * 3 + (0.0,) * 3, (9.0,) * 3 + (0.0,) * 3, 1.0))
     rng = np.random.default_rng(4)
@@ -218,7 +218,7 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
 def test_a_rejected_move_leaves_no_trace(liquid):
     system, _, state = liquid
     dear = CellRescaling(
-        steady(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * box_of(system, 0).rate,
+        steady(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * barostat_of(system, 0).rate,
         COUPLINGS["flexible"], (1.0, 1.0, 1.0), (0.0, 0.0), key_of(1, BOX),
     )  # fmt: skip
     fresh = system.engine()
@@ -246,7 +246,7 @@ def compressed():
 @pytest.mark.parametrize(("integrator", "order"), [("velocity_verlet", 2), ("suzuki_4", 4)])
 def test_a_piston_conserves_the_enthalpy_to_its_order(compressed, integrator, order):
     system, start = compressed
-    row = SCHEMES[integrator].with_piston(box_of(system, 0))
+    row = SCHEMES[integrator].with_piston(barostat_of(system, 0))
     spreads = []
     for dt in (0.004, 0.002):
         engine = system.engine()
@@ -261,7 +261,7 @@ def test_a_piston_conserves_the_enthalpy_to_its_order(compressed, integrator, or
 
 def test_a_piston_can_be_run_backwards(compressed):
     system, start = compressed
-    row, engine = VERLET.with_piston(box_of(system, 0)), system.engine()
+    row, engine = VERLET.with_piston(barostat_of(system, 0)), system.engine()
     state = engine.begin(start, row)
     move(engine, state, row, 0.002, 40)
     assert abs(state.volume / start.volume - 1) > 1e-3

@@ -96,7 +96,7 @@ def test_an_ideal_gas_has_its_volumes_through_a_whole_run():
     scene = {
         "box": {"lengths_A": 10.0}, "molecules": [GAS | {"count": n}], "start": {"temperature_K": 300.0},
         "forces": {"cutoff_A": 0.02, "skin_A": 0.01, "electrostatics": "none"}, "stages": [stage],
-        "output": {"trajectory": False, "figure": False, "log_interval_ps": 0.02},
+        "output": {"trajectory": False, "figures": False, "log_interval_ps": 0.02},
     }  # fmt: skip
     results = Simulation(Scene.from_dict(scene)).run()
     tried, accepted = (results.summary["stages"][0][key] for key in ("moves_tried", "moves_accepted"))

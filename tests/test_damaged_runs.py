@@ -53,7 +53,7 @@ CELLS = [
 ARGON = {
     "box": {"lengths_A": 30.0}, "start": {"temperature_K": 90.0}, "molecules": [{"model": "argon", "count": 20}],
     "stages": [{"name": "first", "duration_ps": 0.02}, {"duration_ps": 0.1}],
-    "output": {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.01, "figure": False},
+    "output": {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.01, "figures": False},
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from math import pi
 
 import numpy as np
 import pytest
-from support import build, lammps_files, portrait, small_scene, write_gromacs, write_openmm
+from support import build, lammps_files, force_field_of, small_scene, write_gromacs, write_openmm
 
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
@@ -23,7 +23,7 @@ NPT = NVT | {"ensemble": "npt", "pressure_bar": 250.0}
 
 def drawn(*stages, counts=COUNTS, tail=False, **sections):
     forces = {"cutoff_A": 5.0, "truncation": "shift", "tail_correction": tail}
-    return portrait(build(small_scene(counts, 13.0, stages=list(stages), **{"forces": forces} | sections)))
+    return force_field_of(build(small_scene(counts, 13.0, stages=list(stages), **{"forces": forces} | sections)))
 
 
 # GROMACS

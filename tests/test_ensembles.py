@@ -76,7 +76,7 @@ def follow(scene: dict, interval: float, sites: bool = False, folder=".") -> Cou
             both = (system.site_positions(state), system.site_velocities(state)) if sites else (np.zeros((0, 3)),) * 2
             seen.append((state.velocity.copy(), state.angular_momentum_body.copy(), *both))
 
-    quiet = {"threads": 1, "output": {"trajectory": False, "figure": False, "log_interval_ps": interval}}
+    quiet = {"threads": 1, "output": {"trajectory": False, "figures": False, "log_interval_ps": interval}}
     simulation = Simulation(Scene.from_dict(quiet | scene, folder), observers=Every(interval, look))
     results = simulation.run()
     return Course(simulation.system, results, last, *(np.array(x) for x in zip(*seen, strict=True)))
@@ -370,7 +370,7 @@ def orientations(thermostat: dict, step: float, duration: float, interval: float
         "forces": {"electrostatics": "none"},
         "fields": {"electric_V_per_nm": direction.tolist()},
         "stages": [stage | {"duration_ps": 3.0}, stage | {"duration_ps": duration}],
-        "output": {"trajectory": False, "figure": False, "log_interval_ps": 10 * interval},
+        "output": {"trajectory": False, "figures": False, "log_interval_ps": 10 * interval},
     }
     course = follow(scene, interval, sites=True)
     sites = course.sites.reshape(len(course.sites), molecules, 4, 3)
@@ -528,7 +528,7 @@ def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
             if moment.stage == 1:
                 cells.append(moment.state.cell.copy())
 
-        scene = {"threads": 1, "output": {"trajectory": False, "figure": False}}
+        scene = {"threads": 1, "output": {"trajectory": False, "figures": False}}
         scene |= crystal(tmp_path, *pressed("flexible", pressure, duration))
         Simulation(Scene.from_dict(scene, tmp_path), observers=Every(0.1, look)).run()
         cells = np.array(cells)

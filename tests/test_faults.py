@@ -36,7 +36,7 @@ SCENE = """\
 box.density_g_cm3 = 0.9
 forces = { cutoff_A = 5.0, truncation = "smooth_switch" }
 start.temperature_K = 298.0
-output = { log_interval_ps = 0.002, trajectory_interval_ps = 0.02, checkpoint_minutes = 1e-9, figure = false }
+output = { log_interval_ps = 0.002, trajectory_interval_ps = 0.02, checkpoint_minutes = 1e-9, figures = false }
 
 [[molecules]]
 model = "spce"

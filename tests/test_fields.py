@@ -514,9 +514,9 @@ def test_fields_that_are_tied_to_places_say_so():
     assert scene({"restraints": [HELD]}).fields.holds_in_place
     assert scene({"gravity_m_s2": [0.0, 0.0, -1.0], "walls": [LJ]}).fields.holds_in_place
     assert not scene(OSCILLATING).fields.holds_in_place
-    assert build(scene(OSCILLATING)).tied_to_places == []
-    assert alone({"kite": 1, "etik": 1}, STEADY)[0].tied_to_places == ["electric_field"]
-    assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).tied_to_places == ["walls_0", "restraints_0"]
+    assert build(scene(OSCILLATING)).position_dependent == []
+    assert alone({"kite": 1, "etik": 1}, STEADY)[0].position_dependent == ["electric_field"]
+    assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).position_dependent == ["walls_0", "restraints_0"]
     assert not build(scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})).external  # a sweep may pass through nothing
 
 

@@ -12,13 +12,13 @@ from support import (
     export,
     gmx,
     kinetic_energies,
-    portrait,
+    force_field_of,
     random_rotations,
     shaken,
     small_scene,
     write_gromacs,
 )
-from support import gromacs_faults as faults
+from support import gromacs_unsupported as unsupported
 
 from rigidmd.errors import SceneError
 from rigidmd.units import KJ_PER_MOL
@@ -63,7 +63,7 @@ def energies(folder):
 def test_endings(case, tmp_path):
     system = build(small_scene(WATER, 16.0, forces={"cutoff_A": 6.0} | PLAIN[case], stages=STAGES))
     state = nudged(system)
-    names = write_gromacs(tmp_path, portrait(system), state)
+    names = write_gromacs(tmp_path, force_field_of(system), state)
     assert set(names) == {path.name for path in tmp_path.iterdir()}
     found = energies(tmp_path)
     lj, coulomb = Oracle(system).energy(state.position, state.rotation)
@@ -87,7 +87,7 @@ def test_energies_are_those_of_rigidmd(case, tmp_path):
     system, ours, state = built(
         counts, 16.0, seed=3, spread=0.2, forces={"cutoff_A": 6.0} | FINE | forces, stages=STAGES
     )
-    write_gromacs(tmp_path, portrait(system), state)
+    write_gromacs(tmp_path, force_field_of(system), state)
     found = energies(tmp_path)
     tallies = ours.evaluate(state)[1]
     potential = sum(t.energy for t in tallies.values()) + sum(system.constants.values())
@@ -113,7 +113,7 @@ def test_a_leaning_box(tmp_path):
     box = {"lengths_A": [16.0, 15.0, 15.5], "angles_deg": [75.0, 80.0, 100.0]}
     scene = small_scene({"spce": 12, "argon": 6}, 1.0, box=box, stages=STAGES, forces={"cutoff_A": 6.0} | FINE)
     system, ours, state = shaken(build(scene), 3, 0.2)
-    write_gromacs(tmp_path, portrait(system), state)
+    write_gromacs(tmp_path, force_field_of(system), state)
     found, tallies = energies(tmp_path), ours.evaluate(state)[1]
     potential = (sum(t.energy for t in tallies.values()) + sum(system.constants.values())) / KJ_PER_MOL
     assert found["Potential"] == pytest.approx(potential, abs=1e-5 * abs(found["Coul. recip."]))
@@ -135,7 +135,7 @@ def test_every_stage_runs(tmp_path):
         {"tip4p2005": 20, "nitrogen": 5}, 16.0, stages=stages, forces={"cutoff_A": 6.0, "electrostatics": "pme"}
     )
     system = build(scene)
-    write_gromacs(tmp_path, portrait(system), system.state)
+    write_gromacs(tmp_path, force_field_of(system), system.state)
     ran = subprocess.run(["./run.sh", "-nt", "1"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr[-3000:]
     assert "WARNING" not in ran.stderr
@@ -151,7 +151,7 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     ]
     counts = {"spce": 4, "methanol_trappe": 2, "methane_opls": 2}
     system = build(small_scene(counts, 16.0, stages=stages, forces={"cutoff_A": 6.0, "truncation": "smooth_switch"}))
-    told = " ".join(faults(portrait(system)))
+    told = " ".join(unsupported(force_field_of(system)))
     for words in (
         "smooth_switch", "with reaction_field", "no rigid bodies of this shape", "one kind of triangle", "andersen",
         "monte_carlo", "yoshida_4",

@@ -102,7 +102,7 @@ def test_the_film_of_a_body_is_its_motion(top, tmp_path):
     page = tmp_path / "top.html"
     assert cli.main(["view", str(top), "-o", str(page)]) == 0
     data, seen = data_of(page), read_record(top).columns
-    assert np.array_equal(numbers(data["time"], "<f8"), seen["t"])
+    assert np.array_equal(numbers(data["time"], "<f8"), seen["time"])
     quaternion = np.stack([seen[key] for key in ("qw", "qx", "qy", "qz")], axis=-1)
     assert np.allclose(numbers(data["quaternion"], "<f4").reshape(-1, 4), quaternion, atol=1e-6)
     tip = numbers(data["path"], "<f4").reshape(-1, 3)[-1]

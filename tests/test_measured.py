@@ -8,7 +8,7 @@ from rigidmd import Scene, Simulation
 
 pytestmark = pytest.mark.soak
 
-OUTPUT = {"trajectory_interval_ps": 0.1, "pressure_tensor_interval_ps": 0.01, "figure": False}
+OUTPUT = {"trajectory_interval_ps": 0.1, "pressure_tensor_interval_ps": 0.01, "figures": False}
 
 
 def liquid(model, count, density, duration, temperature=298.15, **output):

@@ -518,7 +518,7 @@ EVERY_STEP_OR_TWO = {"trajectory_interval_ps": 0.01, "log_interval_ps": 0.004, "
 
 
 def several(folder, stages, trajectory, **options):
-    output = EVERY_STEP_OR_TWO | {"trajectory": trajectory, "figure": False}
+    output = EVERY_STEP_OR_TWO | {"trajectory": trajectory, "figures": False}
     scene = small_scene({"argon": 20}, 20.0, stages=stages, start={"temperature_K": 90.0}, output=output)
     return Simulation(scene, folder, warn=lambda warning: None, **options)
 

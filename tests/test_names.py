@@ -8,7 +8,7 @@ import subprocess
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from support import Manifest, Point, build, gromacs_files, lammps_files, portrait, write_script
+from support import Manifest, Point, build, gromacs_files, lammps_files, force_field_of, write_script
 
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
@@ -62,7 +62,7 @@ def shape(text):
 @pytest.fixture(scope="module")
 def usual():
     system = build(named(PLAIN))
-    return system, portrait(system)
+    return system, force_field_of(system)
 
 
 @OFTEN
@@ -71,14 +71,14 @@ def usual():
 @example(('x"""', "$x", 'y"""', ";#", "\\"))
 def test_names_change_no_command_of_lammps(usual, tmp_path, names):
     found = build(named(names))
-    for drawn, name in ((usual[1], "usual"), (portrait(found), "found")):
+    for drawn, name in ((usual[1], "usual"), (force_field_of(found), "found")):
         lammps_files.write_data(tmp_path / name, drawn, usual[0].state)
     texts = [(tmp_path / name).read_text() for name in ("usual", "found")]
-    texts += [lammps_files.input_script(drawn) for drawn in (usual[1], portrait(found))]
+    texts += [lammps_files.input_script(drawn) for drawn in (usual[1], force_field_of(found))]
     for one, other in ((texts[0], texts[1]), (texts[2], texts[3])):
         assert without_comments(one, "#") == without_comments(other, "#")
         assert not re.search(r'"""|[&$\\`]', other)
-    assert lammps_files.settings(portrait(found)) == lammps_files.settings(usual[1])
+    assert lammps_files.settings(force_field_of(found)) == lammps_files.settings(usual[1])
 
 
 @OFTEN
@@ -88,7 +88,7 @@ def test_names_change_no_command_of_lammps(usual, tmp_path, names):
 def test_names_change_no_setting_of_gromacs(usual, tmp_path, names):
     found = build(named(names))
     files = {}
-    for drawn, name in ((usual[1], "usual"), (portrait(found), "found")):
+    for drawn, name in ((usual[1], "usual"), (force_field_of(found), "found")):
         (tmp_path / name).mkdir(exist_ok=True)
         files[name] = gromacs_files.write_gromacs(tmp_path / name, drawn, usual[0].state)
     assert len({*files["found"]}) == len(files["found"]) == len(files["usual"])
@@ -116,7 +116,7 @@ def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, nam
     from support import write_openmm
 
     texts = []
-    for drawn in (usual[1], portrait(build(named(names)))):
+    for drawn in (usual[1], force_field_of(build(named(names)))):
         write_openmm(tmp_path, drawn, usual[0].state)
         texts.append((tmp_path / "run.py").read_text())
     assert shape(texts[0]) == shape(texts[1])

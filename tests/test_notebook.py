@@ -215,7 +215,7 @@ def test_the_film_of_a_body_is_a_page_in_a_frame(tmp_path):
     assert shown.startswith("<iframe srcdoc=")
     assert "<canvas" not in shown  # it is quoted
     data = json.loads(re.search(r'id="film-data">(.*?)</script>', film.page)[1])
-    assert np.frombuffer(base64.b64decode(data["time"])).size == len(results["t"])
+    assert np.frombuffer(base64.b64decode(data["time"])).size == len(results["time"])
 
 
 def shifted(simulation):

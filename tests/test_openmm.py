@@ -22,14 +22,14 @@ from support import (
     load_model,
     mass_points,
     other_engine,
-    portrait,
+    force_field_of,
     random_rotations,
     read_record,
     shaken,
     small_scene,
     write_openmm,
 )
-from support import openmm_faults as faults
+from support import openmm_unsupported as unsupported
 
 from rigidmd.commands import cli
 from rigidmd.errors import EngineError, SceneError
@@ -83,7 +83,7 @@ def agree(ours, theirs, state, tolerance, of_loads=None):
 
 def system_moves(engine):
     """Which molecules are not frozen: what acts on the others has no meaning."""
-    return ~portrait(engine._system).frozen
+    return ~force_field_of(engine._system).frozen
 
 
 @pytest.mark.parametrize("name", available_models())
@@ -193,7 +193,7 @@ def test_damped_shifted_force():
     forces = {"cutoff_A": 6.0, "electrostatics": "damped_shifted_force"}
     system, _, state = built({"spce": 8, "argon": 8}, 13.0, forces=forces)
     found = OpenmmEngine(system, platform="Reference").evaluate(state)[1]["coulomb"].energy
-    x, charge, owner = system.site_positions(state), portrait(system).charge, system.sites.molecule
+    x, charge, owner = system.site_positions(state), force_field_of(system).charge, system.sites.molecule
     i, j = np.triu_indices(len(x), 1)
     d = x[i] - x[j]
     r = np.linalg.norm(d - 13.0 * np.rint(d / 13.0), axis=1)
@@ -360,7 +360,7 @@ def test_the_folder_runs_by_itself(tmp_path):
     system = build(
         small_scene({"tip4p2005": 10, "co2_trappe": 3, "methane_opls": 2}, 13.0, stages=stages, output=every, **BOX)
     )
-    drawn = portrait(system)
+    drawn = force_field_of(system)
     names = write_openmm(tmp_path, drawn, system.state)
     assert set(names) == {path.name for path in tmp_path.iterdir()}
     subprocess.run([sys.executable, "run.py", "Reference"], cwd=tmp_path, check=True)
@@ -383,7 +383,7 @@ def test_what_openmm_cannot_do_is_told_at_once():
         {"duration_ps": 0.1, "integrator": "yoshida_4"},
     ]
     scene = small_scene({"spce": 4}, 13.0, stages=stages, **BOX)
-    told = " ".join(faults(portrait(build(scene))))
+    told = " ".join(unsupported(force_field_of(build(scene))))
     for words in ("velocity_rescaling", "cell_rescaling", "nph", "changes over the stage", "yoshida_4"):
         assert words in told
     falling = small_scene(

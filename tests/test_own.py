@@ -344,7 +344,7 @@ def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
         if m.epsilon[i] > 0
     }
     own = build(scene.with_own([(law or rigidmd.pair_law)(given)]))
-    load, tallies = own.engine_of({name: own.terms[name] for name in own.own}, "double").evaluate(state)
+    load, tallies = own.engine_of({name: own.terms[name] for name in own.user_terms}, "double").evaluate(state)
     (tally,) = tallies.values()
     assert tally.energy == pytest.approx(expected["lennard_jones"].energy, rel=tolerance)
     assert tally.virial == pytest.approx(expected["lennard_jones"].virial, rel=tolerance, abs=tolerance * 1e5)

@@ -405,7 +405,7 @@ def test_comparators_stand_beside_the_schemes_and_fail_in_words():
     found = precision(Scene.from_dict(upright), names, [1e-3, 5e-4], span=0.2, repeats=1)
     assert {trial.integrator for trial in found.trials if trial.diverged} == {"rk4_euler_angles"}
     assert "rk4_euler_angles: the Euler angles became singular" in "\n".join(advice(found))
-    drift = {trial.integrator: trial.orthogonality for trial in found.trials if not trial.diverged}
+    drift = {trial.integrator: trial.orthogonality_error for trial in found.trials if not trial.diverged}
     assert drift["velocity_verlet"] < 1e-13
     assert drift["rk4"] > 1e-11  # nothing keeps Q a rotation there
     adaptive = trials(found, "dop853")

@@ -89,13 +89,13 @@ def test_observers_see_the_units_of_the_log():
 def test_a_body_has_matrices_and_si_units():
     results = Simulation(Scene.read(TOP, SHORT)).run()
     q = results["Q"]
-    assert q.shape == (len(results["t"]), 3, 3)
+    assert q.shape == (len(results["time"]), 3, 3)
     assert q[7, 0, 2] == results["q13"][7]
     assert q[7, 2, 0] == results["q31"][7]
     assert results.units["Q"] == "1"
     assert results.units["omega_body_1"] == "rad/s"
     assert results["kinetic"] + results["potential"] == pytest.approx(results["energy"])
-    with pytest.raises(KeyError, match=r"no column 'energ'; there are t, x.*, Q"):
+    with pytest.raises(KeyError, match=r"no column 'energ'; there are time, x.*, Q"):
         results["energ"]
     stone = Simulation(Scene.read(ROOT / "systems" / "dropped_stone.toml")).run()
     with pytest.raises(KeyError, match="no column 'Q'"):

@@ -295,7 +295,7 @@ BROKEN = {
     "a shorter scene": (lambda run: None, ["--until", "0.001ps"], "longer already"),
     "another seed": (lambda run: change(run / "scene.toml", "seed = 1", "seed = 2"), [], "seed is 2, there 1"),
     "a figure of another": (
-        lambda run: [change(run / "scene.toml", "figure = false", "figure = true"), (run / "energy.png").touch()],
+        lambda run: [change(run / "scene.toml", "figures = false", "figures = true"), (run / "energy.png").touch()],
         [],
         "energy.png exists, was not written by rigidmd",
     ),
@@ -406,7 +406,7 @@ def test_a_file_that_grows_replaces_what_has_its_name(tmp_path):
         ("mine.gsd", "output.trajectory=mine.gsd"),
         ("mine.pdb", "output.topology=mine.pdb"),
         ("pressure_tensor.csv", "output.pressure_tensor_interval_ps=0.01"),
-        ("energy.png", "output.figure=true"),
+        ("energy.png", "output.figures=true"),
         ("last_good_state.npz", None),
         ("log.csv", None),
     ],
@@ -527,7 +527,7 @@ def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
     first, second = Counting(0), Counting(100)
     Simulation(Scene.from_dict(data), again / "two", observers=[first, second, stopped_at({40})]).run()
     assert (first.counted, second.counted) == (5, 105)
-    figure = data | {"output": data["output"] | {"figure": True}}
+    figure = data | {"output": data["output"] | {"figures": True}}
     for now, own in (
         (figure, [stopped_at({70}), Counting(0), Counting(0)]),
         (data, [Counting(0), Counting(0), Counting(7)]),

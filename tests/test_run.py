@@ -430,7 +430,7 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **
         plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if name.startswith("temperature")}
         own = {name: float(values[k]) for name, values in made.items()}
         row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
-        rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality": 0.0} | own))
+        rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality_error": 0.0} | own))
     return summarise(system, rows, state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
 
 
@@ -876,7 +876,7 @@ def test_the_time_left_is_of_the_steps_of_this_run(monkeypatch, capsys, tmp_path
 
     def lines(duration, **options):
         stages = [{"ensemble": "minimise", "most_iterations": 2}, {"duration_ps": 0.02}, {"duration_ps": duration}]
-        scene = small_scene({"argon": 10}, 20.0, stages=stages, output={"figure": False})
+        scene = small_scene({"argon": 10}, 20.0, stages=stages, output={"figures": False})
         looks = Every(0.002, lambda moment: wait(20.0))
         compiling = {"say": lambda sentence: wait(500.0)}
         run = Simulation(scene, tmp_path / "out", observers=looks, warn=str, **compiling, **options)

@@ -335,7 +335,7 @@ def test_samples_give_back_what_was_added():
     added = [a_sample(k, (k / 3, -k)) for k in range(10)]
     for sample in added:
         samples.append(sample)
-    assert samples.rows == list(Samples(["a", "b"], samples.own, samples.table())) == added
+    assert samples.rows == list(Samples(["a", "b"], samples.user_terms, samples.table())) == added
     assert samples.row(-1) == added[-1]
     for name in COLUMNS:
         assert samples[name].tolist() == [getattr(sample, name) for sample in added]

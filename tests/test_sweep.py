@@ -67,7 +67,7 @@ timestep_fs = 5
 
 [output]
 trajectory_interval_ps = 0.05
-figure = false
+figures = false
 """
 GRID = ["--set", "start.temperature_K=90,120", "--set", "seed=1..2"]
 

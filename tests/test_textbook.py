@@ -28,7 +28,7 @@ def test_a_satellite_that_loses_mass_keeps_its_angular_momentum(integrator, step
     """omega3 = L3/I3(t); L turns about axis 3 at L3 (1/I3 - 1/I1) in the body and keeps its size: of its transverse part
     comes omega = L/I1(t). In the lab L stays, though the energy grows."""
     results = run(run__integrator=integrator, run__timestep_s=step)
-    t = results["t"]
+    t = results["time"]
     assert t[-1] == 150.0 and len(t) == 31
     first, third = moments(t)
     L = OMEGA * [40.0, 40.0, 60.0]

@@ -8,7 +8,7 @@ WATER = {
     "molecules": [{"model": "spce", "count": 40}],
     "forces": {"cutoff_A": 5.0, "truncation": "smooth_switch"},
     "start": {"temperature_K": 298.0},
-    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figure": False},
+    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figures": False},
 }
 CHAINS = {"ensemble": "nvt", "temperature_K": 298.0, "thermostat": "nose_hoover", "thermostat_time_ps": 0.05}
 

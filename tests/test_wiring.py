@@ -13,8 +13,8 @@ from support import (
     REST,
     TAKEN,
     advance,
-    bath_of,
-    box_of,
+    thermostat_of,
+    barostat_of,
     boxes,
     build,
     draw_momenta,
@@ -57,29 +57,29 @@ def test_langevin_has_the_friction_of_each_motion():
     system = system_of(
         NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0, "friction_rotation_per_ps": 7.0}
     )
-    bath = bath_of(system, 0)
+    bath = thermostat_of(system, 0)
     assert (bath.friction_translation, bath.friction_rotation) == (2.0, 7.0)
     assert bath.thermal_energy == TEMPERATURES
-    one = bath_of(system_of(NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0}), 0)
+    one = thermostat_of(system_of(NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0}), 0)
     assert (one.friction_translation, one.friction_rotation) == (2.0, 2.0)
 
 
 def test_chains_count_the_degrees_of_freedom_of_their_motion():
     system = system_of(NVT | {"thermostat": "nose_hoover", "thermostat_time_ps": 0.3, "nose_hoover_links": 4})
-    bath = bath_of(system, 0)
+    bath = thermostat_of(system, 0)
     assert (bath.freedom_translation, bath.freedom_rotation) == (TRANSLATION - 3, ROTATION)
     assert (bath.period, bath.links, bath.variables) == (0.3, 4, 16)
     assert bath.thermal_energy == TEMPERATURES
 
 
 def test_velocity_rescaling_counts_both_motions():
-    bath = bath_of(system_of(NVT | {"thermostat_time_ps": 0.3}), 0)
+    bath = thermostat_of(system_of(NVT | {"thermostat_time_ps": 0.3}), 0)
     assert (bath.time_constant, bath.degrees_of_freedom) == (0.3, TRANSLATION - 3 + ROTATION)
     assert bath.thermal_energy == TEMPERATURES
 
 
 def test_andersen_has_its_time():
-    bath = bath_of(system_of(NVT | {"thermostat": "andersen", "thermostat_time_ps": 0.3}), 0)
+    bath = thermostat_of(system_of(NVT | {"thermostat": "andersen", "thermostat_time_ps": 0.3}), 0)
     assert bath.time_constant == 0.3 and bath.thermal_energy == TEMPERATURES
 
 
@@ -101,10 +101,10 @@ def test_every_thermostat_acts_for_a_whole_step():
 def test_stages_have_random_numbers_of_their_own():
     """Steps count on through a run, so that no number is drawn twice; but a run of the second stage alone has others."""
     system = system_of(NPT | {"thermostat": "langevin"}, NPT | {"thermostat": "langevin"})
-    keys = {key for k in (0, 1) for key in (bath_of(system, k).key, box_of(system, k).key)}
+    keys = {key for k in (0, 1) for key in (thermostat_of(system, k).key, barostat_of(system, k).key)}
     assert len(keys) == 4
     again = system_of(NPT | {"thermostat": "langevin"}, seed=2)
-    assert not keys & {bath_of(again, 0).key, box_of(again, 0).key}
+    assert not keys & {thermostat_of(again, 0).key, barostat_of(again, 0).key}
 
 
 # barostats
@@ -124,7 +124,7 @@ def pressed(pressure):
 def test_a_monte_carlo_barostat_counts_the_molecules(thermostat):
     """Centres of mass: one for each molecule, whether or not a thermostat keeps the total momentum."""
     system = system_of(MONTE_CARLO | {"thermostat": thermostat})
-    box = box_of(system, 0)
+    box = barostat_of(system, 0)
     assert box.molecules == 12.0
     assert box.thermal_energy == TEMPERATURES
     assert box.width == pytest.approx(2 * np.sqrt(310 * KELVIN * 8e-5 / BAR * 14.0**3))
@@ -137,7 +137,7 @@ def test_a_monte_carlo_barostat_counts_the_molecules(thermostat):
 ])  # fmt: skip
 def test_cell_rescaling_knows_whether_the_total_momentum_is_kept(thermostat, at_rest):
     """It is what makes N + 1 of N in the law of an ideal gas."""
-    box = box_of(system_of(NPT | {"thermostat": thermostat, "barostat_time_ps": 0.4}), 0)
+    box = barostat_of(system_of(NPT | {"thermostat": thermostat, "barostat_time_ps": 0.4}), 0)
     assert box.at_rest == at_rest
     assert box.rate == pytest.approx(8e-5 / BAR / 0.4)
     assert box.coordinate == (0, 0, 0, -1, -1, -1)
@@ -160,7 +160,7 @@ def test_a_stress_has_its_components_in_the_order_of_the_strain(coupling, coordi
     """A scene lists xx, yy, zz, xy, xz, yz; the strain has (0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1)."""
     given = [1.0, 1.0, 3.0] if coupling == "semi_isotropic" else [1.0, 2.0, 3.0]
     given += [4.0, 5.0, 6.0] if coupling == "flexible" else []
-    box = box_of(system_of(NPT | {"pressure_coupling": coupling, "pressure_bar": given}), 0)
+    box = barostat_of(system_of(NPT | {"pressure_coupling": coupling, "pressure_bar": given}), 0)
     assert box.coordinate == coordinate
     assert box.pressure.first[: len(given)] == pytest.approx(np.array(given) * BAR)
     assert box.pressure.first == box.pressure.last
@@ -169,7 +169,7 @@ def test_a_stress_has_its_components_in_the_order_of_the_strain(coupling, coordi
 
 def test_a_piston_has_the_period_that_was_asked_for():
     """1/M of a mass M on the spring 1/(compressibility V): (2 pi/period)² compressibility V."""
-    box = box_of(system_of(NPH | {"barostat_time_ps": 0.4}), 0)
+    box = barostat_of(system_of(NPH | {"barostat_time_ps": 0.4}), 0)
     assert box.inverse_mass == pytest.approx((2 * pi / 0.4) ** 2 * 8e-5 / BAR * 14.0**3)
     pressed(box.pressure)
 
@@ -194,7 +194,7 @@ def test_the_total_momentum_is_taken_out_at_its_interval_where_it_is_kept(thermo
 def test_a_ramp_is_even_over_the_steps_of_its_stage():
     """At step k of n, counted from the begin of the stage, the pressure is p0 + (p1 - p0) k/n."""
     system = system_of(NPT)
-    box, state = box_of(system, 0), system.state.copy()
+    box, state = barostat_of(system, 0), system.state.copy()
     asked, present = boxes.asked.py_func, ramps.present.py_func
     state.step[ORIGIN] = 1000
     for taken in (0, 99, 249):  # the step that is being taken is the next one
@@ -214,7 +214,7 @@ def _driving(box, model, state, room, k, volume, thermal):
 def test_what_drives_the_cell_follows_a_ramp_of_the_pressure():
     """Between two steps of a ramp only the pressure differs: the drive falls by V dP."""
     system = system_of(NPT)
-    box, state = box_of(system, 0), system.state.copy()
+    box, state = barostat_of(system, 0), system.state.copy()
     room, found = boxes.box_room(state), []
     for taken in (0, 124, 249):
         state.step[NOW] = taken
@@ -232,7 +232,7 @@ def _log_chance(box, model, state, room, h):
 def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecules():
     """(V'/V)^N exp(-(dU + P dV)/kT)."""
     system = system_of(MONTE_CARLO)
-    box, state = box_of(system, 0), system.state.copy()
+    box, state = barostat_of(system, 0), system.state.copy()
     state.step[NOW] = 249  # 310 K, 500 bar
     room = boxes.box_room(state)
     room.tally[:, 0] = 250.0, 100.0

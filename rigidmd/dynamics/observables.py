@@ -21,7 +21,7 @@ class Sums(NamedTuple):
     torque: float  # sum n . I^-1 n
     momentum: np.ndarray  # (3,) sum m V
     flow: np.ndarray  # (3, 3) sum m V (x) V
-    orthogonality: float  # largest entry of |Q^T Q - 1|; NaN if one is
+    orthogonality_error: float  # largest entry of |Q^T Q - 1|; NaN if one is
 
 
 #: How many numbers there are in `Sums`.
@@ -82,9 +82,9 @@ def sums_over(model: "Model", state: State, load: Load = EXAMPLE[1]) -> Sums:
 
 def sums_of(found: np.ndarray) -> Sums:
     """The sums in the numbers that `add_up` has filled in."""
-    translation, rotation, force, torque, orthogonality = found[:5].tolist()
+    translation, rotation, force, torque, orthogonality_error = found[:5].tolist()
     vectors = found[5:].copy()
-    return Sums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality)
+    return Sums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality_error)
 
 
 @kernel(outer=True)

@@ -28,7 +28,7 @@ class Snapshot(NamedTuple):
 class Motion:
     """The samples of a run as columns.
 
-    columns : arrays (t,), in SI units, by the names in motion.csv; `described` explains them. Position, velocity,
+    columns : arrays (t,), in SI units, by their names; `described` explains them. Position, velocity,
         attitude and omega are relative to the frame; L is the angular momentum relative to axes that do not turn, that
         of wheels (h) included, along the frame's (lab) or body's axes; the kinetic energy is that of I omega, without
         that of wheels about their axes
@@ -40,7 +40,7 @@ class Motion:
     invariants: list[str]
 
     def __len__(self) -> int:
-        return len(self.columns.get("t", ()))
+        return len(self.columns.get("time", ()))
 
     def __repr__(self) -> str:
         return f"<Motion: {len(self)} samples of {', '.join(self.columns)}>"
@@ -52,6 +52,11 @@ class Motion:
         if column == MATRIX:
             return np.stack([self.columns[name] for name in BODY["rotation"].names], axis=-1).reshape(-1, 3, 3)
         return self.columns[column]
+
+    @property
+    def written(self) -> dict[str, np.ndarray]:
+        """The columns by their headers in motion.csv."""
+        return {BODY_COLUMNS[name].header: values for name, values in self.columns.items()}
 
     @property
     def described(self) -> dict[str, Column]:
@@ -67,13 +72,13 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     parts = [np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)]
     states = State._make([*parts, np.zeros(0)])
     position, velocity, rotation, omega = system.motion(times, states)
-    columns = {"t": times} | _columns("position", position) | _columns("velocity", velocity)
-    if system.turns:
+    columns = {"time": times} | _columns("position", position) | _columns("velocity", velocity)
+    if system.rotates:
         columns |= _rotation_columns(system, times, states, rotation, omega)
     columns |= energies(system, times, states)
     errors = _errors(system, columns)
     columns |= {f"{name}_error": error for name, error in errors.items()}
-    if system.turns:
+    if system.rotates:
         gap = np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)
         columns["orthogonality_error"] = np.abs(gap).max(axis=(1, 2))
     return Motion(columns, list(errors))
@@ -116,15 +121,15 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
     """Kinetic energy (less Omega . J in a turning frame), potential energy, their sum, and the work of other forces."""
     n = len(times)
     kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
-    if system.turns:
+    if system.rotates:
         rotation, momentum = states.rotation.reshape(n, 3, 3), states.angular_momentum_body.reshape(n, 3)
         inertia, carried = system.moments(times)
         own = np.divide((momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0)
         kinetic += 0.5 * own.sum(axis=1)
         about_origin += np.einsum("tij,tj->ti", rotation, momentum)
-    if system.flies:
+    if system.translates:
         position, impulse = states.position.reshape(n, 3), system.mass * states.velocity.reshape(n, 3)
-        along = np.einsum("tji,tj->ti", rotation, impulse) if system.turns else impulse
+        along = np.einsum("tji,tj->ti", rotation, impulse) if system.rotates else impulse
         kinetic += 0.5 * (along**2 / inertial_masses(system.body.flight)).sum(axis=1)
         about_origin += np.cross(position, impulse)
     kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
@@ -150,7 +155,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
     if is_balanced(system):
         balance = columns["energy"] - columns["work"]
         errors["energy"] = _relative(balance - balance[0], np.abs(columns["kinetic"]).max() or np.abs(balance[0]))
-    if not system.turns:
+    if not system.rotates:
         return errors
     momentum = {k: columns[f"L_lab_{k}"] for k in "xyz"}
     size = np.sqrt(sum(part**2 for part in momentum.values()))

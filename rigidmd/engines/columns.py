@@ -23,7 +23,7 @@ class Family(NamedTuple):
 
 
 BODY = {
-    "time": Family(("t",), "s", "time"),
+    "time": Family(("time",), "s", "time"),
     "position": Family(("x", "y", "z"), "m", "centre of mass"),
     "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
     "rotation": Family(
@@ -54,4 +54,8 @@ BODY = {
 #: Additional key of `results[...]` for a body: several columns as one array.
 MATRIX = "Q"
 
-BODY_COLUMNS = {name: Column(name, family.unit, family.about) for family in BODY.values() for name in family.names}
+BODY_COLUMNS = {
+    name: Column("t" if name == "time" else name, family.unit, family.about)
+    for family in BODY.values()
+    for name in family.names
+}

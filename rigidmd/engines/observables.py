@@ -36,7 +36,7 @@ class Reading(NamedTuple):
     momentum: np.ndarray  # (3,) u Å/ps
     force: np.ndarray  # (n, 3) on each molecule, lab frame, kJ/mol/Å
     torque_body: np.ndarray  # (n, 3) on each molecule, body frame, kJ/mol; (0, 3) of points
-    orthogonality: float  # largest entry of |QᵀQ - 1|
+    orthogonality_error: float  # largest entry of |QᵀQ - 1|
 
     def __repr__(self) -> str:
         return f"<Reading: potential {self.potential:.6g} kJ/mol, temperature {self.temperature:.6g} K>"
@@ -56,7 +56,7 @@ class Observation(NamedTuple):
     temperature_rotation_unbiased: float
     pressure_tensor: np.ndarray  # (3, 3) symmetric, u/(Å ps²); NaN without a box
     momentum: np.ndarray  # (3,)
-    orthogonality: float
+    orthogonality_error: float
     load: Load
 
     @property
@@ -132,7 +132,7 @@ def observe(
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
     volume, beyond = state.volume, 0.0
     if system.tail is not None:
-        components["tail" if system.own else "lennard_jones_tail"] = system.tail.energy(volume)
+        components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(volume)
         beyond = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     own = isinstance(engine, cpu.Engine)
@@ -157,7 +157,7 @@ def observe(
         temperature_rotation_unbiased=_temperature(rotation_unbiased, freedom.rotation),
         pressure_tensor=pressure,
         momentum=sums.momentum,
-        orthogonality=sums.orthogonality,
+        orthogonality_error=sums.orthogonality_error,
         load=load,
     )
 

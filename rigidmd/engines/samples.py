@@ -35,7 +35,7 @@ class Sample(NamedTuple):
     pressure_bar: Annotated[float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")]
     drift: Annotated[float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")]
     momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]
-    orthogonality: Annotated[float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")]
+    orthogonality_error: Annotated[float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")]
     a: Annotated[float, Column("a (A)", "Å", "length of the box's edge a")]
     b: Annotated[float, Column("b (A)", "Å", "length of the box's edge b")]
     c: Annotated[float, Column("c (A)", "Å", "length of the box's edge c")]
@@ -56,17 +56,17 @@ class Sample(NamedTuple):
         float, Column("", "kJ/mol", "energy less heat, work and what removals of momentum have put in")
     ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    own: tuple[float, ...] = ()  # energies of the user's own forces, kJ/mol
+    user_energies: tuple[float, ...] = ()  # energies of the user-defined forces, kJ/mol
 
 
 COLUMNS: dict[str, Column] = {
-    name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items() if name != "own"
+    name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items() if name != "user_energies"
 }
 
 
-def own_columns(own: Sequence[str]) -> dict[str, Column]:
+def user_columns(user_terms: Sequence[str]) -> dict[str, Column]:
     """The columns of the user's own forces."""
-    return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in own}
+    return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in user_terms}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
@@ -76,13 +76,13 @@ class Samples:
     """The samples of a run in order, kept as a row of float64 each.
 
     stages : names of all stages
-    own : names of the user's own forces, whose energies are columns too
+    user_terms : names of the user's own forces, whose energies are columns too
     table : of an earlier `table()`; raises ValueError if it is none
     """
 
-    def __init__(self, stages: Sequence[str], own: tuple[str, ...] = (), table: np.ndarray | None = None):
-        self.stages, self.own = tuple(stages), own
-        self._numbers = [*NUMBERS, *own]
+    def __init__(self, stages: Sequence[str], user_terms: tuple[str, ...] = (), table: np.ndarray | None = None):
+        self.stages, self.user_terms = tuple(stages), user_terms
+        self._numbers = [*NUMBERS, *user_terms]
         self._values = array("d")  # it grows in place, in the machine's memory as NumPy has it
         if table is not None:
             if table.ndim != 2 or table.shape[1] != len(self._numbers) or table.dtype != np.float64:
@@ -99,7 +99,7 @@ class Samples:
 
     def append(self, sample: Sample) -> None:
         """Add a sample at the end."""
-        self._values.extend((*_VALUES(sample), *sample.own))
+        self._values.extend((*_VALUES(sample), *sample.user_energies))
 
     def __len__(self) -> int:
         return len(self._values) // len(self._numbers)
@@ -125,8 +125,8 @@ class Samples:
         first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
         values: dict[str, Any] = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
         values |= {name: int(values[name]) for name in ("step", "stage")}
-        own = self._values[first + width : first + len(self._numbers)]
-        return Sample(**values, stage_name=self.stages[values["stage"]], own=tuple(own))
+        energies = self._values[first + width : first + len(self._numbers)]
+        return Sample(**values, stage_name=self.stages[values["stage"]], user_energies=tuple(energies))
 
     def latest(self, time: float, since: int) -> int:
         """The last row from `since` on that is not later than a time (ps); `since` if there is none."""
@@ -136,7 +136,7 @@ class Samples:
 
     def of_stage(self, k: int) -> "Samples":
         """The samples of stage k, which follow one another."""
-        found, width = Samples(self.stages, self.own), len(self._numbers)
+        found, width = Samples(self.stages, self.user_terms), len(self._numbers)
         if len(rows := np.flatnonzero(self._column("stage") == k)):
             found._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
         return found
@@ -151,7 +151,7 @@ class Samples:
 
     @property
     def described(self) -> dict[str, Column]:
-        return COLUMNS | own_columns(self.own)
+        return COLUMNS | user_columns(self.user_terms)
 
 
 _VALUES = attrgetter(*NUMBERS)

@@ -49,7 +49,7 @@ def motion_figures(
     """
     down = None if gravity is None or not np.any(gravity) else np.asarray(gravity) / np.linalg.norm(gravity)
     figures = {}
-    if len(columns["t"]) > 1:
+    if len(columns["time"]) > 1:
         if "q11" in columns:
             figures["axis"] = _axis_figure(columns, np.asarray(axis_body, float), down)
         if "phi" in columns:
@@ -121,7 +121,7 @@ def _tell_start(figure) -> None:
 
 def _angles_figure(columns: dict[str, np.ndarray]):
     """The Euler angles against time: φ and ψ continuous over whole turns, θ with at least a minimum span."""
-    time, theta = columns["t"], np.degrees(columns["theta"])
+    time, theta = columns["time"], np.degrees(columns["theta"])
     phi, psi = _apart(columns)
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = _new_figure("Euler angles (3-1-3)", 8, 6.4)
@@ -157,7 +157,7 @@ def _apart(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     """ω in the body frame on the ellipsoids of energy and momentum, seen from its side."""
-    time, omega = columns["t"], np.stack([columns[f"omega_body_{i}"] for i in "123"], axis=-1)
+    time, omega = columns["time"], np.stack([columns[f"omega_body_{i}"] for i in "123"], axis=-1)
     energies, fastest = omega**2 @ inertia, np.linalg.norm(omega, axis=1).max()
     if fastest == 0:
         return None
@@ -195,7 +195,7 @@ def _omega_figure(columns: dict[str, np.ndarray]):
     fastest = max(np.abs(part).max() for part in omega)
     figure = _new_figure("ω in the body frame", 8, 6.4)
     labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
-    _draw_series(figure, figure.add_gridspec(3, 1), columns["t"], omega, labels, 1e-9 * fastest, 2 * fastest or 1.0)
+    _draw_series(figure, figure.add_gridspec(3, 1), columns["time"], omega, labels, 1e-9 * fastest, 2 * fastest or 1.0)
     return figure
 
 
@@ -220,7 +220,7 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     figure = _new_figure("path of the centre of mass", 4.2 + 3.8 * len(planes), 4.6)
     cells = figure.add_gridspec(3, len(planes) + 1)
     labels, stack = ("x (m)", "y (m)", "z (m)"), cells[:, 0].subgridspec(3, 1)
-    _draw_series(figure, stack, columns["t"], place.T, labels, least, span)
+    _draw_series(figure, stack, columns["time"], place.T, labels, least, span)
     for column, (title, right, upward) in enumerate(planes, start=1):
         _draw_plane(figure.add_subplot(cells[:, column]), title, place, right, upward, least)
     _tell_start(figure)
@@ -260,11 +260,11 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
     if not errors:
         return None
     axis = (figure := _new_figure("errors of the invariants", 8, 4.6)).subplots()
-    size = -(-len(columns["t"]) // 300)
+    size = -(-len(columns["time"]) // 300)
     for color, (label, error) in zip(SERIES * len(errors), errors.items(), strict=False):
         largest = np.fmax.reduceat(error, np.arange(0, len(error), size))
         most = f"at most {np.nanmax(error):.1e}" if np.nanmax(error) > 0 else "exactly 0"
-        axis.plot(columns["t"][::size], np.maximum(largest, FLOOR), color=color, lw=1.0, label=f"{label}: {most}")
+        axis.plot(columns["time"][::size], np.maximum(largest, FLOOR), color=color, lw=1.0, label=f"{label}: {most}")
     axis.axhline(np.finfo(float).eps, color=FAINT, lw=0.8, ls=":")
     axis.set_yscale("log")
     axis.set_ylim(FLOOR / 2, max(1e-13, 5 * max(np.nanmax(error) for error in errors.values())))

@@ -16,7 +16,7 @@ from rigidmd.run.checks import BODY_PATIENCE, LOOKS, BodyCheck
 from rigidmd.run.moment import Moment
 from rigidmd.run.observers import Observer
 from rigidmd.run.resume import state_from
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     from rigidmd.run.body import BodySimulation
@@ -57,7 +57,7 @@ class BodyWatch(Observer):
 
     def __init__(self, run: "BodySimulation"):
         self.check = BodyCheck(run.system, run.scene.watch)
-        every = max(1, round(settled(run.scene.output.interval_s) / run.scene.run.timestep_s))
+        every = max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
         # at most half a second of computing and LOOKS samples
         self.steps = min(BODY_PATIENCE // getattr(run.system.method, "force_evaluations", 1), LOOKS * every)
         self._run = run
@@ -90,17 +90,17 @@ class MotionFiles(Observer):
     def end(self, run: "BodySimulation", results: "Results") -> None:
         if not isinstance(samples := results.samples, Motion):
             raise TypeError("these are samples of molecules")
-        write_columns(run.path(MOTION), samples.columns)
+        write_columns(run.path(MOTION), samples.written)
         results.files.append(run.path(MOTION))
         if self._npz:
-            write_npz(run.path(MOTION_NPZ), samples.columns)
+            write_npz(run.path(MOTION_NPZ), samples.written)
             results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "BodySimulation") -> str:
         """Save the motion so far, if there is any."""
         if not self._sampler.snapshots:
             return ""
-        write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).columns)
+        write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).written)
         return f". The motion so far: {run.path(MOTION)}"
 
 

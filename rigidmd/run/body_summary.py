@@ -16,12 +16,12 @@ def summarise_body(
     computing (steps).
     """
     run = system.scene.run
-    end = float(motion["t"][-1])
+    end = float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
     return {
         "interrupted": interrupted,
         "kind": system.kind,
-        "pinned": not system.flies,
+        "pinned": not system.translates,
         "degrees_of_freedom": system.degrees_of_freedom,
         "mass_kg": system.mass,
         "inertia_kg_m2": system.inertia.tolist(),
@@ -30,7 +30,7 @@ def summarise_body(
         "timestep_s": run.timestep_s,
         "steps": steps,
         "duration_s": end,
-        "samples": len(motion["t"]),
+        "samples": len(motion["time"]),
         "preparing_s": preparing,
         "wall_s": wall,
         "computing_s": computing,
@@ -39,9 +39,9 @@ def summarise_body(
         "energy_end_J": float(motion["energy"][-1]),
         "work_J": float(motion["work"][-1]),
         "largest_relative_error": {name: float(np.abs(motion[f"{name}_error"]).max()) for name in motion.invariants},
-        "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.turns else None,
+        "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.rotates else None,
         "theta_range_deg": np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist()
-        if system.turns
+        if system.rotates
         else None,
         "trajectory_A_per_m": system.scale,
         "notes": _notes(system, motion, interrupted),
@@ -55,9 +55,9 @@ def _notes(system: BodySystem, motion: Motion, interrupted: bool) -> list[str]:
         notes.append(
             f"the energy is wrong by {error:.1e} of the largest kinetic energy: timestep_s is too long for this motion"
         )
-    if system.turns:
+    if system.rotates:
         speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
-        if (speed[1:] * np.diff(motion["t"])).max(initial=0.0) > np.pi:
+        if (speed[1:] * np.diff(motion["time"])).max(initial=0.0) > np.pi:
             notes.append(
                 "the body turns by more than 180° between samples; shorten output.interval_s to follow its angles"
             )

@@ -26,7 +26,7 @@ from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.scene.limits import BodyWatch, Watch
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
@@ -187,8 +187,8 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
     energy at a thermostat's temperature if that is larger.
     """
-    if limits.orthogonality and not now.orthogonality <= limits.orthogonality:
-        seen = f"|QᵀQ - 1| is {now.orthogonality:.2g} (watch.orthogonality = {limits.orthogonality:g})"
+    if limits.orthogonality and not now.orthogonality_error <= limits.orthogonality:
+        seen = f"|QᵀQ - 1| is {now.orthogonality_error:.2g} (watch.orthogonality = {limits.orthogonality:g})"
         return Finding(f"a matrix Q is no longer a rotation: {seen}", unturned=True)
     if system.scene.stages[now.stage].is_minimisation:
         return None
@@ -350,7 +350,7 @@ class BodyCheck:
         self._start = self._energies(system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
-        self.moved = abs(self._start["kinetic"]) + (0.0 if system.flies else 2 * swing)
+        self.moved = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * swing)
 
     def _energies(self, state: State) -> dict[str, float]:
         columns = energies(self.system, state.time[:1], State(*(array[None] for array in state)))
@@ -360,11 +360,11 @@ class BodyCheck:
     def finding(self, state: State, dt: float) -> Finding | None:
         """What is wrong with a state of the run."""
         system, limits = self.system, self.limits
-        largest = settled(limits.orthogonality)
+        largest = not_none(limits.orthogonality)
         if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
             seen = f"Q is no longer a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
             return Finding(seen, unturned=True)
-        if system.turns and limits.turn_rad:
+        if system.rotates and limits.turn_rad:
             omega = system.pose(float(state.time[0]), state).angular_velocity_body
             angle = dt * float(np.linalg.norm(omega))
             if angle > limits.turn_rad:
@@ -405,7 +405,7 @@ class BodyCheck:
                 else "Q was changed from outside: a run only multiplies rotations",
                 f"integrator = 'srkn_6', which keeps Q, or {shorter}",
             )
-        elif system.turns and inertia[inertia > 0].min() < THIN * inertia.max():
+        elif system.rotates and inertia[inertia > 0].min() < THIN * inertia.max():
             least = inertia[inertia > 0].min()
             cause = Cause(
                 f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "

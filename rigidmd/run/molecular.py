@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field, PositiveFloat
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.stage_flows import row as row_of_stage
-from rigidmd.assemble.user_code.binding import told_plainly
+from rigidmd.assemble.stage_flows import integrator_of_stage
+from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.compile.cache import kept_in_words
 from rigidmd.compile.machine import threads_for
 from rigidmd.core.integrators import Scheme, Solver
@@ -108,7 +108,7 @@ class MolecularSimulation(Simulation):
         super().__init__(scene, folder, force, **options)
         given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         self._built = build(scene.with_own(given, thermostat))
-        if clash := [name for name in self._built.own if name in COLUMNS]:
+        if clash := [name for name in self._built.user_terms if name in COLUMNS]:
             raise SceneError(
                 scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
             )
@@ -171,7 +171,7 @@ class MolecularSimulation(Simulation):
     def _relieve(self) -> None:
         """Compile the forces, and relieve overlaps of a lattice."""
         self._say(f"compiling ({kept_in_words()})")
-        with told_plainly(self.system):
+        with user_errors_explained(self.system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
             raise SceneError(
@@ -204,10 +204,10 @@ class MolecularSimulation(Simulation):
 
     def _compile(self) -> None:
         """Compile the steps of every stage."""
-        with told_plainly(self.system):
+        with user_errors_explained(self.system):
             for k, stage in enumerate(self.scene.stages):
                 if not (stage.is_open or stage.is_minimisation):
-                    row = row_of_stage(self.system, k)
+                    row = integrator_of_stage(self.system, k)
                     self.engine.advance(self._begun(row), row, 0.0, 0)
 
     def _begun(self, row: Scheme | Solver) -> State:
@@ -277,7 +277,7 @@ class MolecularSimulation(Simulation):
         step = stage.timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
             return Stretch(stage.scheme, step, 0, act=None if k in self._record.minima else self._minimise)
-        return Stretch(row_of_stage(self.system, k), step, stage.steps)
+        return Stretch(integrator_of_stage(self.system, k), step, stage.steps)
 
     def _durations(self) -> list[float]:
         return [stage.duration for stage in self.scene.stages]
@@ -294,7 +294,7 @@ class MolecularSimulation(Simulation):
         # bit. Those of the start, if nothing has moved since, are what new ones would be.
         if k or was_open or self.scene.engine.is_other or (self._record.relief and self._record.relief.steps):
             self.engine = self._engine_of(k)
-        row, stage = row_of_stage(self.system, k), self.scene.stages[k]
+        row, stage = integrator_of_stage(self.system, k), self.scene.stages[k]
         self.state = self._begun(row)
         self.state.begin_stretch()
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
@@ -408,7 +408,7 @@ class MolecularSimulation(Simulation):
             pressure_bar=seen.pressure_bar,
             drift=conserved - self._sampler.origin(moment.stage, conserved) if known else nan,
             momentum=hypot(*seen.momentum.tolist()),
-            orthogonality=seen.orthogonality,
+            orthogonality_error=seen.orthogonality_error,
             a=a,
             b=b,
             c=c,
@@ -425,7 +425,7 @@ class MolecularSimulation(Simulation):
             pressure_yz=yz,
             conserved=conserved,
             stage=moment.stage,
-            own=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.own),
+            user_energies=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.user_terms),
         )
 
     def _own_observers(self) -> list[Observer]:
@@ -446,7 +446,7 @@ class MolecularSimulation(Simulation):
         if self.folder is not None:
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
-            files += [EnergyFigure()] if output.figure else []
+            files += [EnergyFigure()] if output.figures else []
         return [*files, *observers]
 
     def _samples(self) -> Samples:
@@ -473,7 +473,7 @@ class MolecularSimulation(Simulation):
         yield f"at step {good.step}, ", good.state
         steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.stretch.row
         short = 0 < steps * len(system.model.species) <= REPLAYED * checks.PATIENCE
-        if short and isinstance(self.engine, Engine) and not (self.stretch.act or system.told):
+        if short and isinstance(self.engine, Engine) and not (self.stretch.act or system.python_forces):
             state = good.state.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
                 state = self.engine.begin(state, row)

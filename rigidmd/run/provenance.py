@@ -17,7 +17,7 @@ from rigidmd.scene import MolecularScene, Scene
 #: Packages that may change the last bits of a result.
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
 #: Keys that change no bit of a run, or are compared otherwise: input files by their contents.
-APART = ("name", "threads", "output.checkpoint_minutes", "output.figure", "output.figures", "output.drawn_as", "watch")
+APART = ("name", "threads", "output.checkpoint_minutes", "output.figures", "output.drawn_as", "watch")
 
 
 def computed_with() -> dict[str, Any]:

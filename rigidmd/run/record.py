@@ -14,7 +14,7 @@ from rigidmd.core.state import State
 from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.columns import BODY
+from rigidmd.engines.columns import BODY, BODY_COLUMNS
 from rigidmd.engines.system import System
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.io.checkpoint import latest
@@ -25,6 +25,7 @@ from rigidmd.scene.stage import Stage
 
 #: Name of a column -> its header in log.csv, and back.
 HEADERS = {column.header: name for name, column in samples.COLUMNS.items() if column.header}
+BODY_HEADERS = {column.header: name for name, column in BODY_COLUMNS.items()}
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Record:
     """A run as its folder tells it.
 
     summary : None of a run that did not end
-    columns : (t,) each; of molecules by the names of `results[...]`, of a body by those of motion.csv
+    columns : (t,) each; of molecules by the names of `results[...]`, of a body by those of `BODY_COLUMNS`
     missing : sentences about what is not there, and why
     """
 
@@ -65,7 +66,7 @@ class Record:
     @property
     def time(self) -> np.ndarray:
         """Times of the samples, ps for molecules, s for a body."""
-        return self.columns["t" if self.is_body else "time"]
+        return self.columns["time"]
 
     @property
     def moving(self) -> np.ndarray:
@@ -140,7 +141,7 @@ def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> n
 def _columns_of(system: BodySystem) -> list[str]:
     """Columns that every motion of a body has."""
     families = ["time", "position", "kinetic", "potential", "energy", "work"]
-    if system.turns:
+    if system.rotates:
         families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
     return [name for family in families for name in BODY[family].names]
 
@@ -149,9 +150,10 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
     """Columns of motion.csv; of a run that did not write it, those of its last checkpoint."""
     if (found := read_columns(folder / MOTION)) is not None:
         needed = _columns_of(system)
-        if lacking := [name for name in needed if name not in found.cells]:
+        if lacking := [header for name in needed if (header := BODY_COLUMNS[name].header) not in found.cells]:
             raise OutputError(f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}")
-        return {header: found.numbers(header, finite=header in needed) for header in found.cells}
+        names = {header: BODY_HEADERS.get(header, header) for header in found.cells}
+        return {name: found.numbers(header, finite=name in needed) for header, name in names.items()}
     try:
         kept, _ = latest(folder)
     except CheckpointError:

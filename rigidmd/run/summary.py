@@ -86,11 +86,11 @@ def summarise(
         "relief_steps": relief_steps,
         "preparing_s": preparing,
         "wall_s": wall,
-        "largest_orthogonality_error": float(samples["orthogonality"].max()),
+        "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
         "momentum_u_A_ps": last.momentum,
         "momentum_relative": _relative_momentum(system, state, last.momentum),
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
-        "own_forces": dict(system.own),
+        "own_forces": dict(system.user_terms),
         "momentum_removed": _removed(system, state),
         "stages": stages,
         "notes": [
@@ -116,10 +116,7 @@ def _removed(system: System, state: State) -> dict | None:
     """Energy removed with the total momentum in the whole run; None without such removals."""
     if system.removes_momentum_every is None:
         return None
-    return {
-        "interval_ps": system.removes_momentum_every,
-        "energy_kJ_mol": -float(state.books[TAKEN]) / KJ_PER_MOL,
-    }
+    return {"interval_ps": system.removes_momentum_every, "energy_kJ_mol": -float(state.books[TAKEN]) / KJ_PER_MOL}
 
 
 def _drifting(system: System, state: State, last: Sample) -> list[str]:
@@ -275,7 +272,7 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
     """Figures of a minimisation, at its end; None for those of OF_MOTION."""
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
     own = samples.of_stage(k)
-    end = Samples(samples.stages, samples.own, own.table()[-1:])
+    end = Samples(samples.stages, samples.user_terms, own.table()[-1:])
     return dict.fromkeys(OF_MOTION) | {
         "name": stage.label,
         "ensemble": stage.ensemble,

@@ -16,15 +16,15 @@ from rigidmd.scene.limits import Watch
 from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
-from rigidmd.scene.start import BESIDE, NAMELESS, Box, Start, Structure
-from rigidmd.scene.user_code import Own, not_given
+from rigidmd.scene.start import TOPOLOGY_NAMES, NAMELESS, Box, Start, Structure
+from rigidmd.scene.user_code import UserCode, missing_user_code
 from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Section
 
 if TYPE_CHECKING:
     pass
 
 #: Name of the structure file of a scene that holds atoms.
-HELD = "atoms.xyz"
+STRUCTURE_NAME = "atoms.xyz"
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc", ".gsd", ".traj")
 TOPOLOGY_FORMATS = (".gro", ".pdb")
@@ -33,7 +33,7 @@ Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Minutes = Interval | Literal[False]
 
 
-class Throughout(Section):
+class RunSettings(Section):
     """Settings for all stages."""
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
@@ -63,7 +63,7 @@ class Output(Section):
     both"""
     velocities: Flag | None = None
     """Write velocities; default: if the format holds them"""
-    figure: Flag = True
+    figures: Flag = True
     """Draw energy.png"""
     checkpoint_minutes: Minutes = 5.0
     """Wall time between checkpoints, from which a run goes on after a stop; false for none"""
@@ -128,25 +128,25 @@ class MolecularScene(Scene):
     fields: Fields = Fields()
     start: Start = Start()
     stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
-    run: Throughout = Throughout()
+    run: RunSettings = RunSettings()
     output: Output = Output()
     watch: Watch = Watch()
     from_python: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
     """Set by a run from Python: names of forces and a thermostat that it was given and a scene cannot hold. Such a
     scene runs only from Python, with the same ones"""
 
-    _own: Own = PrivateAttr(Own())
+    _own: UserCode = PrivateAttr(UserCode())
 
     @property
-    def own(self) -> Own:
+    def own(self) -> UserCode:
         """What Python has added."""
         return self._own
 
     def with_own(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`. Raises SceneError."""
-        own = Own((*self._own.forces, *forces), thermostat if thermostat is not None else self._own.thermostat)
+        own = UserCode((*self._own.forces, *forces), thermostat if thermostat is not None else self._own.thermostat)
         if self.from_python not in ((), own.names):
-            raise SceneError(self.source, [not_given(self.from_python, own.names)])
+            raise SceneError(self.source, [missing_user_code(self.from_python, own.names)])
         scene = self.model_copy(update={"from_python": own.names})
         scene._own = own
         return scene
@@ -209,7 +209,7 @@ class MolecularScene(Scene):
         start = self.structure
         if start is None or start.topology is not None or not start.file.lower().endswith(NAMELESS):
             return None if start is None else start.topology
-        beside = [str(Path(start.file).with_name(name)) for name in BESIDE]
+        beside = [str(Path(start.file).with_name(name)) for name in TOPOLOGY_NAMES]
         return next((name for name in beside if self.path(name).is_file()), None)
 
     def _faults(self):
@@ -334,11 +334,11 @@ class MolecularScene(Scene):
         return [
             f"{key}: {shortened(file)} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
             for key, file in named
-            if isinstance(file, str) and not _lies_in(folder / file, folder)
+            if isinstance(file, str) and not _is_inside(folder / file, folder)
         ]
 
 
-def _lies_in(path: Path, folder: Path) -> bool:
+def _is_inside(path: Path, folder: Path) -> bool:
     """Whether a path leads to a place in a folder. True for what leads nowhere, which is found missing later."""
     try:
         return path.resolve().is_relative_to(folder.resolve())

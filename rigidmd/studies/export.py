@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from rigidmd.assemble.build import build
 from rigidmd.core.state import State
-from rigidmd.engines.force_field import Portrait, portrait
+from rigidmd.engines.force_field import ForceFieldView, force_field_of
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.io.folder import SCENE, check_names, write_marker, written_by_runs
@@ -26,8 +26,8 @@ class Writer(NamedTuple):
     """How scenes go to an engine."""
 
     title: str
-    faults: Callable[[Portrait], list[str]]  # what it cannot do
-    write: Callable[[Path, Portrait, State], list[str]]  # into a folder; the files
+    unsupported_features: Callable[[ForceFieldView], list[str]]  # what it cannot do
+    write: Callable[[Path, ForceFieldView, State], list[str]]  # into a folder; the files
     command: str  # that runs it there
 
 
@@ -50,14 +50,14 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     _check(folder, force)
     writer = writer_for(to)
     system = build(scene.model_copy(update={"engine": engine_named(to)}))
-    drawn = portrait(system)
-    faults = writer.faults(drawn) + [
+    drawn = force_field_of(system)
+    unsupported_features = writer.unsupported_features(drawn) + [
         f"stages.{k}: a minimisation after other stages stays with rigidmd"
         for k, stage in enumerate(system.scene.stages)
         if stage.is_minimisation and any(not before.is_minimisation for before in system.scene.stages[:k])
     ]
-    if faults:
-        raise SceneError(scene.source, [f"{writer.title}: {fault}" for fault in faults])
+    if unsupported_features:
+        raise SceneError(scene.source, [f"{writer.title}: {fault}" for fault in unsupported_features])
     state = start_of(system)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -87,17 +87,17 @@ def engine_named(to: str) -> EngineChoice:
 def writer_for(to: str) -> Writer:
     """How scenes go to "lammps", "openmm" or "gromacs"."""
     if to == "lammps":
-        from rigidmd.engines.lammps.files import INPUT, faults, write_lammps
+        from rigidmd.engines.lammps.files import INPUT, unsupported_features, write_lammps
 
-        return Writer("LAMMPS", faults, write_lammps, f"lmp -in {INPUT}")
+        return Writer("LAMMPS", unsupported_features, write_lammps, f"lmp -in {INPUT}")
     if to == "gromacs":
-        from rigidmd.engines.gromacs.files import faults, write_gromacs
+        from rigidmd.engines.gromacs.files import unsupported_features, write_gromacs
 
-        return Writer("GROMACS", faults, write_gromacs, "sh run.sh")
+        return Writer("GROMACS", unsupported_features, write_gromacs, "sh run.sh")
     from rigidmd.engines.openmm.files import write_openmm
-    from rigidmd.engines.openmm.system import faults
+    from rigidmd.engines.openmm.system import unsupported_features
 
-    return Writer("OpenMM", faults, write_openmm, "python run.py")
+    return Writer("OpenMM", unsupported_features, write_openmm, "python run.py")
 
 
 def _check(folder: Path, force: bool) -> None:

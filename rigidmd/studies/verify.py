@@ -15,7 +15,7 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.scene.engine import OTHERS
+from rigidmd.scene.engine import EXTERNAL
 from rigidmd.scene.stage import Stage
 from rigidmd.studies.export import start_of
 from rigidmd.units import FEMTOSECOND
@@ -64,7 +64,7 @@ def verify(scene: Scene) -> Verified:
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body has no other engine: verify is for molecules"])
     if not scene.engine.is_other:
-        raise SceneError(scene.source, [f"engine.name names no other engine; there are {', '.join(OTHERS)}"])
+        raise SceneError(scene.source, [f"engine.name names no other engine; there are {', '.join(EXTERNAL)}"])
     system = build(scene)
     state = start_of(system)
     short = Stage(ensemble="nve", duration_ps=STEPS * STEP * FEMTOSECOND, timestep_fs=STEP)

@@ -15,7 +15,7 @@ from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import run_figures
 from rigidmd.figures.style import INK
 from rigidmd.run.record import Record
-from rigidmd.scene.validation import meant
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.view.plots import Panel, draw_panel
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def record_of(
 ) -> Record:
     """A run in memory as a record, with all its columns or those of these names and their time."""
     if isinstance(samples, Motion):
-        columns = samples.columns if names is None else {name: samples.columns[name] for name in ["t", *names]}
+        columns = samples.columns if names is None else {name: samples.columns[name] for name in ["time", *names]}
     else:
         wanted = samples.described if names is None else dict.fromkeys(["time", "stage", *names])
         columns = {name: samples[name] for name in wanted}
@@ -65,7 +65,7 @@ def check_names(names: Sequence[str], described: dict[str, Column], figures: Any
             continue
         if name in described:
             raise KeyError(f"column {name!r} has {'matrices' if name == MATRIX else 'words'}, which are not plotted")
-        said = meant(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"
+        said = did_you_mean(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"
         raise KeyError(f"no column {name!r}{said}")
 
 

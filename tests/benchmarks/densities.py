@@ -37,7 +37,7 @@ def scene(model: str, *stages: dict) -> dict:
         "threads": 1,
         "start": {"temperature_K": TEMPERATURE},
         "stages": [common | stage for stage in stages],
-        "output": {"trajectory": False, "figure": False, "log_interval_ps": EVERY},
+        "output": {"trajectory": False, "figures": False, "log_interval_ps": EVERY},
     }
 
 

@@ -57,7 +57,7 @@ def of_molecules(name: str, target: float, duration: float) -> list[str]:
     temperature = SCENES[name]["start"]["temperature_K"]
     warm = {"ensemble": "nvt", "temperature_K": temperature, "duration_ps": 3.0}
     stages = [warm, {"duration_ps": duration, "integrator": "auto", "energy_error_kT": target}]
-    output = {"trajectory": False, "figure": False, "log_interval_ps": 0.02}
+    output = {"trajectory": False, "figures": False, "log_interval_ps": 0.02}
     scene = Scene.from_dict(SCENES[name] | {"stages": stages, "output": output})
     _, results, forces = counted(lambda: Simulation(scene))
     own = results["stage"] == 1

@@ -32,7 +32,7 @@ duration_ps = {duration}
 log_interval_ps = 100
 trajectory = false
 checkpoint_minutes = false
-figure = false
+figures = false
 [watch]
 stable_step = false
 """

@@ -24,7 +24,7 @@ def scene(model: str, count: int, density: float, duration: float, interval: flo
         "ensemble": "nvt", "temperature_K": TEMPERATURE, "duration_ps": duration, "timestep_fs": 2.0,
         "integrator": "baoab", "thermostat": "velocity_rescaling",
     }  # fmt: skip
-    output = {"trajectory_interval_ps": interval, "figure": False}
+    output = {"trajectory_interval_ps": interval, "figures": False}
     if not only or "viscosity" in only:
         output["pressure_tensor_interval_ps"] = 0.01
     return Scene.from_dict(

@@ -116,7 +116,7 @@ class Workload:
             "forces": {"cutoff_A": self.cutoff, "truncation": truncation, **start, **field},
             "structure": {"file": "start.npz", "velocities": True},
             "stages": [{"duration_ps": 1.0}],
-            "output": {"trajectory": False, "figure": False, "log_interval_ps": 1e3},
+            "output": {"trajectory": False, "figures": False, "log_interval_ps": 1e3},
         } | changes
         return {key: value for key, value in whole.items() if value is not None}
 

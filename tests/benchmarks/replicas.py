@@ -46,7 +46,7 @@ def data(name: str, duration: float, seed: int = 1) -> dict:
         "seed": seed,
         "molecules": [{"model": "spce", "count": int(name)}],
         "stages": [stage],
-        "output": {"trajectory": False, "figure": False},
+        "output": {"trajectory": False, "figures": False},
     }
 
 

@@ -117,7 +117,7 @@ class Trial:
     energy_rms: float = np.nan  # in the subject's unit
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
-    orthogonality: float = np.nan
+    orthogonality_error: float = np.nan
     kept: dict[str, float] = field(default_factory=dict)  # largest relative errors of other conserved quantities
     tolerance: float | None = None  # of a method that chooses its steps
     fault: str = ""  # why it failed or diverged
@@ -395,7 +395,7 @@ def look(subject: Subject, trial: Trial, exact: State | None, looks: int = LOOKS
     if exact is not None:
         trial.rotation_error, trial.position_error = gap(state, exact)
     if len(state.rotation):
-        trial.orthogonality = orthogonality_error(state.rotation)
+        trial.orthogonality_error = orthogonality_error(state.rotation)
     if isinstance(engine, OdeEngine) and trial.tolerance is not None:
         trial.forces = engine.evaluations
         trial.timestep = subject.span / engine.own_steps / subject.time_size

@@ -9,7 +9,7 @@ from rigidmd.run.force_errors import rounding
 from rigidmd.run.pilot.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
 from rigidmd.run.pilot.trials import Precision, Subject, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.validation import meant
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_is_at_home, start_of_last_stage
 
 #: Default integrators: the common one, the best of each kind, and for a body the textbook solvers.
@@ -47,7 +47,7 @@ def precision(
     known = (*SCHEMES, *COMPARATORS)
     integrators = list(dict.fromkeys(_named(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
-        faults = [f"there is no {name}{meant(name, known)} (known: {', '.join(known)})" for name in unknown]
+        faults = [f"there is no {name}{did_you_mean(name, known)} (known: {', '.join(known)})" for name in unknown]
         raise SceneError("--integrators", faults)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(0 < length < inf for length in lengths) or repeats < 1:

@@ -14,8 +14,8 @@ from rigidmd.run.molecular import MolecularSimulation
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.stage import ASKED, THERMOSTAT_TIMES, Stage
-from rigidmd.scene.validation import meant
+from rigidmd.scene.stage import ERROR_TARGETS, THERMOSTAT_TIMES, Stage
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.bias import AverageRun, Averages, Quantity
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
@@ -157,11 +157,11 @@ def _method(told: str, stage: Stage) -> tuple[str, str]:
     known = (*SCHEMES, *WITH_BATH)
     if integrator not in known:
         raise SceneError(
-            "--integrators", [f"there is no {integrator}{meant(integrator, known)} (known: {', '.join(known)})"]
+            "--integrators", [f"there is no {integrator}{did_you_mean(integrator, known)} (known: {', '.join(known)})"]
         )
     thermostat = thermostat or ("langevin" if integrator in WITH_BATH else stage.thermostat_kind)
     if thermostat not in THERMOSTATS:
-        fault = f"there is no thermostat {thermostat}{meant(thermostat, THERMOSTATS)} (known: {', '.join(THERMOSTATS)})"
+        fault = f"there is no thermostat {thermostat}{did_you_mean(thermostat, THERMOSTATS)} (known: {', '.join(THERMOSTATS)})"
         raise SceneError("--integrators", [fault])
     return integrator, thermostat
 
@@ -170,7 +170,7 @@ def _changed(stage: Stage, integrator: str, thermostat: str, step: float, sample
     """The stage by another method at another step; what it says of its own thermostat and rotor holds only for them."""
     changes = {"integrator": integrator, "thermostat": thermostat, "timestep_fs": step}
     changes |= {"duration_ps": (1 + SETTLING) * sample}
-    changes |= dict.fromkeys(ASKED)
+    changes |= dict.fromkeys(ERROR_TARGETS)
     if thermostat != stage.thermostat_kind:
         changes["thermostat_time_ps"] = None
     if integrator != stage.integrator:

@@ -15,7 +15,7 @@ from rigidmd.view.page import chips, code, items, page, section, table, wide
 FILES = ("precision.csv", "precision.png", "precision.html", "precision_averages.csv")
 #: Shorter titles, so that the table fits a terminal.
 SHORT_TITLES = {"error of ": "", "energy drift in the span": "drift", " per ": "/", "seconds": "s", "spread (%)": "± %",
-                "energy rms": "energy", "orthogonality": "QᵀQ"}  # fmt: skip
+                "energy rms": "energy", "orthogonality error": "QᵀQ"}  # fmt: skip
 #: Spread of repeated timings that causes a warning.
 DOUBTFUL = 0.2
 ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
@@ -28,7 +28,7 @@ def headers(found: Precision) -> list[str]:
     return [
         "integrator", f"step ({s.time_unit})", f"forces per {per}", f"seconds per {per}", "spread (%)", "error of Q",
         f"error of X ({s.length_unit})", "energy rms", "energy drift in the span", "±",
-        *(f"error of {name}" for name in _kept(found)), "orthogonality",
+        *(f"error of {name}" for name in _kept(found)), "orthogonality error",
     ]  # fmt: skip
 
 
@@ -46,7 +46,7 @@ def row(found: Precision, trial: Trial) -> list:
     values = [
         trial.integrator, trial.timestep, trial.forces / span, trial.time / span, spread, trial.rotation_error,
         trial.position_error, trial.energy_rms, trial.energy_drift, trial.energy_drift_error,
-        *(trial.kept.get(name) for name in kept), trial.orthogonality,
+        *(trial.kept.get(name) for name in kept), trial.orthogonality_error,
     ]  # fmt: skip
     return [None if isinstance(x, float) and np.isnan(x) else x for x in values]
 

@@ -4,7 +4,7 @@ import time as clock
 from collections.abc import Callable
 
 from rigidmd.errors import SceneError
-from rigidmd.scene.validation import meant
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.stability import bodies, boxes, collisions, resistance, tops, unfit, water  # noqa: F401  (cases)
 from rigidmd.studies.stability.outcomes import Finding
 from rigidmd.studies.stability.runs import CASES, Case
@@ -13,7 +13,7 @@ from rigidmd.studies.stability.runs import CASES, Case
 def chosen(names: list[str] | None) -> list[Case]:
     """The cases of these names, or all. Raises SceneError with a suggestion."""
     faults = [
-        f"there is no case {name!r}{meant(name, CASES)} (known: {', '.join(CASES)})"
+        f"there is no case {name!r}{did_you_mean(name, CASES)} (known: {', '.join(CASES)})"
         for name in names or []
         if name not in CASES
     ]

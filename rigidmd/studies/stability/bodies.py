@@ -129,7 +129,7 @@ def intermediate_axis(find: Finding, quick: bool) -> None:
             times = []
 
             def flips(results, times=times, first=first) -> float:
-                spin, t = results["omega_body_2"], results["t"]
+                spin, t = results["omega_body_2"], results["time"]
                 at = np.flatnonzero(np.diff(np.sign(spin)))
                 times += (t[at] + (t[at + 1] - t[at]) * spin[at] / (spin[at] - spin[at + 1])).tolist()
                 return abs(times[0] / first - 1) if times else np.inf
@@ -179,7 +179,7 @@ def long_run(find: Finding, quick: bool) -> None:
         kept = {}
 
         def errors(results, kept=kept) -> float:
-            kept.update({name: results[name] for name in ("t", "energy_error", "L_size_error", "orthogonality_error")})
+            kept.update({name: results[name] for name in ("time", "energy_error", "L_size_error", "orthogonality_error")})
             return np.abs(results["L_size_error"]).max()
 
         outcome = run_body(free((1.0, 1.7, 2.4)), step, steps * step, family, errors, samples=2000)

@@ -13,7 +13,7 @@ from rigidmd.errors import OutputError
 from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_empty, offsets_of, written_by_runs
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json, writing
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 from rigidmd.studies.sweep.names import point_name, short_keys
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
@@ -114,7 +114,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise OutputError(
             f"{path}: was written by a later rigidmd (version {schema.schema_} of the format; this one reads {SCHEMA})"
         )
-    found = settled(read_json(path, Manifest, remedy))
+    found = not_none(read_json(path, Manifest, remedy))
     names = [point.folder for point in found.points]
     fault = ""
     if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):

@@ -11,7 +11,7 @@ from rigidmd.core.toml import shortened
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.base import name_of_file, read_tables
+from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.axes import Axis, axes_of, checked
 from rigidmd.studies.sweep.cluster import Cluster
 from rigidmd.studies.sweep.figure import draw_sweep
@@ -86,7 +86,7 @@ def opened(wanted: Wanted, stack: ExitStack) -> Opened:
     if wanted.trust and not any("module" in str(told) for told in (data.get("forces"), keys)):
         raise SceneError("--trust", [f"{wanted.path} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
-    folder = wanted.folder or Path("runs") / f"{named or name_of_file(wanted.path)}-sweep"
+    folder = wanted.folder or Path("runs") / f"{named or default_name(wanted.path)}-sweep"
     check_sweep_folder(folder)
     axes = checked(axes if wanted.force else known_axes(folder, axes))
     asked, is_body = points_of(wanted.path, axes)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pandas
 
 #: Columns of the log whose means say nothing.
-LEFT_OUT = {"step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality", "heat", "work", "conserved"}
+LEFT_OUT = {"step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality_error", "heat", "work", "conserved"}
 POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per degree of freedom)"
 #: Columns that a person reads, where there are any: of molecules, of a body.
 MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
@@ -33,7 +33,7 @@ MAIN_OF_BODY = (
 #: What they are called where there is little room.
 SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}
 #: Columns of a body that the table leaves out: rotation in its other forms.
-NOT_OF_BODY = ("t", "q", "orthogonality_error")
+NOT_OF_BODY = ("time", "orthogonality_error")
 
 #: A value and its error; None without one.
 Measured = tuple[float, float | None]
