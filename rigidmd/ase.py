@@ -18,21 +18,21 @@ from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.from_atoms import SOURCE, atoms_faults, scene_from_atoms
-from rigidmd.assemble.matching import Matched, again, massive, match
+from rigidmd.assemble.matching import MatchedMolecules, massive_sites, match, refit
 from rigidmd.assemble.species import species_of
 from rigidmd.core.state import State, state_of
 from rigidmd.engines.cpu import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
-from rigidmd.io.cells import basis_of, roomiest, standard_rotation
+from rigidmd.io.cells import basis_of, least_skewed_cell, standard_rotation
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.run.atom_forces import Form, in_ase_units
 from rigidmd.run.minimise import minimise
-from rigidmd.run.minimum import minimum_figures, minimum_in_words
+from rigidmd.run.summary import minimum_figures, minimum_in_words
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.validation import meant, settled
+from rigidmd.scene.validation import did_you_mean, not_none
 
 __all__ = ["RigidMD"]
 
@@ -64,7 +64,7 @@ class RigidMD(Calculator):
     Parameters
     ----------
     models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file; or a scene,
-        whose species, [forces], [fields] and precision count, and forces that Python added to it (`with_own`)
+        whose species, [forces], [fields] and precision count, and forces that Python added to it (`with_user_code`)
     atom_forces : "gradient" or "sites", see above
     bend : largest distance of an atom from its place in a rigid molecule without a warning, over the molecule's radius
     tolerance : the same without an error
@@ -98,15 +98,15 @@ class RigidMD(Calculator):
         own = {"precision": precision, "fields": fields, "forces": forces or None}
         given = {key: value for key, value in own.items() if value is not None}
         known = list(Forces.model_fields)
-        faults += [f"unknown keyword {key}{meant(key, known)}" for key in forces if key not in known]
-        self._own: tuple[Any, ...] = ()
+        faults += [f"unknown keyword {key}{did_you_mean(key, known)}" for key in forces if key not in known]
+        self._user_forces: tuple[Any, ...] = ()
         if isinstance(models, Scene):
             if not isinstance(models, MolecularScene):
                 faults.append(f"the scene {models.name} is of a single body, which has no atoms")
             elif given:
                 faults.append(f"{', '.join(given)}: the scene says them; change the scene")
             else:
-                given, self._own = _tables(models), models.own.forces
+                given, self._user_forces = _tables(models), models.user_code.forces
                 models = [_entry(models, k) for k in range(len(models.molecules))]
         if faults:
             raise SceneError("RigidMD", faults)
@@ -116,12 +116,12 @@ class RigidMD(Calculator):
         self._bend, self._tolerance = bend, tolerance
         self._warned = False
         self._assembly: _Assembly | None = None
-        settled(self.parameters).update(models=models, atom_forces=atom_forces, **given)
+        not_none(self.parameters).update(models=models, atom_forces=atom_forces, **given)
 
     def calculate(self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes) -> None:
         """Energy, forces and, in a box, stress; called by ASE."""
         super().calculate(atoms, properties, system_changes)
-        placed = self._placed(settled(self.atoms))
+        placed = self._placed(not_none(self.atoms))
         if not self._warned and placed.bent > self._bend:
             self._warned = True
             warnings.warn(
@@ -133,7 +133,7 @@ class RigidMD(Calculator):
             )
         assembly, turn = placed.assembly, placed.turn
         found = in_ase_units(assembly.system, assembly.engine, placed.state, self._form, placed.atoms)
-        forces = np.zeros((len(settled(self.atoms)), 3))
+        forces = np.zeros((len(not_none(self.atoms)), 3))
         forces[assembly.order] = found["forces"] @ turn
         self.results = {"energy": found["energy"], "free_energy": found["energy"], "forces": forces}
         if "stress" in found:
@@ -195,11 +195,11 @@ class RigidMD(Calculator):
             "stages": [{"ensemble": "minimise", **limits}],
         }
         scene = scene_from_atoms(bare, self._models, **settings)
-        if self._own:
-            scene = scene.with_own(self._own)
+        if self._user_forces:
+            scene = scene.with_user_code(self._user_forces)
         system = build(scene)
         species = species_of(scene)
-        held = scene.held["structure.file"]
+        held = scene.embedded_files["structure.file"]
         cell = atoms.cell.array if atoms.pbc.all() else None
         matched = match(read_atoms(Path("atoms.xyz"), held=held), species, cell, self._tolerance)
         if isinstance(matched, list):
@@ -207,7 +207,7 @@ class RigidMD(Calculator):
         basis = np.eye(3)
         if cell is not None:
             upright, _ = standard_rotation(cell)
-            other, turn = roomiest(upright)
+            other, turn = least_skewed_cell(upright)
             basis = basis_of(other @ turn, upright)
         own = bare.cell.array.copy()
         return _Assembly(system, system.engine(), species, matched, bare.numbers, bare.pbc.copy(), own, basis)
@@ -247,7 +247,7 @@ class _Assembly(NamedTuple):
     system: System
     engine: Engine
     species: list[Molecule]
-    matched: Matched
+    matched: MatchedMolecules
     numbers: np.ndarray
     pbc: np.ndarray
     cell: np.ndarray  # (3, 3) for which its numbers were chosen
@@ -275,14 +275,14 @@ class _Assembly(NamedTuple):
             cell, second = standard_rotation(self.basis @ upright)
             turn = second @ first
         position = atoms.positions @ turn.T
-        found = again(position, self.matched, self.species, cell)
+        found = refit(position, self.matched, self.species, cell)
         turning = len(self.system.state.rotation) > 0
         state = state_of(found.centre, None, found.rotation if turning else None, None, cell)
         given = position[self.order]
         whole = given
         if cell is not None:
             whole = given - np.rint((given - self.rigid(state)) @ np.linalg.inv(cell)) @ cell
-        radius = np.array([m.radius if len(massive(m)) > 1 else np.inf for m in self.species])[found.species]
+        radius = np.array([m.radius if len(massive_sites(m)) > 1 else np.inf for m in self.species])[found.species]
         bent = found.deviation / radius
         return _Placed(self, state, turn, whole, given, float(found.deviation.max()), float(bent.max()))
 

@@ -304,7 +304,7 @@ class Case:
         self.scene.write_text(tomli_w.dumps(data))
         self.victim = root / "victim"
         self.damage: list[str] = []  # names of files that are not as the run left them
-        self.is_other = False  # a checkpoint was forged that may be of another run
+        self.is_external = False  # a checkpoint was forged that may be of another run
         self.has_failed = False  # an attempt
         self.has_previous = False  # a whole checkpoint before the damaged one, so that the run must be resumed
         self.said = ""
@@ -428,7 +428,7 @@ class Case:
         self.has_failed |= code == 2 and fault is not None
         is_refusable = self.damage and not self.has_previous
         self.has_previous = False  # from now on there may be no checkpoint before the damaged one
-        allowed = codes | ({2} if is_refusable else set()) | ({1} if self.is_other else set())
+        allowed = codes | ({2} if is_refusable else set()) | ({1} if self.is_external else set())
         if code not in allowed:
             raise Found(f"exit code {code}, not one of {sorted(allowed)}")
         if code == 2 and not re.search("^rigidmd: ", self.said, re.MULTILINE):
@@ -449,7 +449,7 @@ class Case:
             if "notes.txt" in before:
                 raise Found("notes.txt is gone")
             (self.folder / "notes.txt").write_text("of the user")
-        if code == 0 and not self.is_other:
+        if code == 0 and not self.is_external:
             self._compare()
         if self.damage and fault is None:
             self._restore()
@@ -482,7 +482,7 @@ class Case:
                 words = forge(self.folder, rng)
             except CheckpointError as error:
                 raise Found(f"a checkpoint that was not damaged cannot be read: {error}") from None
-            self.is_other = bool(FREE.match(words))
+            self.is_external = bool(FREE.match(words))
         elif not path.is_file():
             return
         elif how in ("flip", "cut"):
@@ -511,7 +511,7 @@ class Case:
         """Give the run its files back."""
         shutil.rmtree(self.folder)
         shutil.copytree(self.kept, self.folder, symlinks=True)
-        self.damage, self.is_other = [], False
+        self.damage, self.is_external = [], False
         self.show("files are restored")
 
 

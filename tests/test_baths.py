@@ -5,33 +5,33 @@ import pytest
 from scipy import stats
 from support import (
     BATCH,
-    BATH,
     HEAT,
     SCHEMES,
-    WITH_BATH,
+    THERMOSTAT,
+    WITH_THERMOSTAT,
     Andersen,
     Engine,
     Langevin,
     NoseHoover,
     Ramp,
+    apply_langevin_group,
     build,
     built,
+    integrator_of_stage,
     kernel,
     key_of,
     move,
     observe,
-    relieve,
-    row_of_stage,
+    remove_overlaps,
     small_scene,
     steady,
-    stir_group,
 )
 
 from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
-VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_BATH["baoab"]
+VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_THERMOSTAT["baoab"]
 THERMAL = 300 * BOLTZMANN
 MIXTURE = {"argon": 300, "nitrogen": 300, "benzene_opls": 300, "spce": 300}  # point, linear, symmetric, asymmetric
 
@@ -46,8 +46,8 @@ def kinetic(system, state):
     return 0.5 * moving.sum() + 0.5 * np.nansum(turning), moving, turning
 
 
-@pytest.mark.parametrize("bath", [Langevin(steady(THERMAL), 3.0, 7.0, key_of(2, BATH)),
-                                  Andersen(steady(THERMAL), 0.3, key_of(2, BATH))])  # fmt: skip
+@pytest.mark.parametrize("bath", [Langevin(steady(THERMAL), 3.0, 7.0, key_of(2, THERMOSTAT)),
+                                  Andersen(steady(THERMAL), 0.3, key_of(2, THERMOSTAT))])  # fmt: skip
 def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
     system = build(small_scene(MIXTURE, 150.0, start={"temperature_K": 30.0}))
     state, engine = system.state.copy(), Engine(system.model, {})
@@ -68,7 +68,7 @@ def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
 
 @kernel(outer=True)
 def stir(model, state, keep, keep_turning, new, numbers, first, end):
-    return stir_group(model, state, keep, keep_turning, new, numbers, first, end)
+    return apply_langevin_group(model, state, keep, keep_turning, new, numbers, first, end)
 
 
 @pytest.mark.parametrize("first", [0, 3])
@@ -92,7 +92,7 @@ def test_friction_and_noise_of_many_molecules_are_those_of_each(first):
 def test_friction_is_that_of_each_motion():
     """Without noise, at 0 K, momenta fall by exactly exp(-friction t)."""
     system = build(small_scene({"spce": 5}, 40.0))
-    row = BAOAB.with_bath(Langevin(steady(0.0), 2.0, 5.0, key_of(1, BATH)))
+    row = BAOAB.with_bath(Langevin(steady(0.0), 2.0, 5.0, key_of(1, THERMOSTAT)))
     state = system.state.copy()
     move(Engine(system.model, {}), state, row, 0.01, 10)
     assert state.velocity == pytest.approx(system.state.velocity * np.exp(-0.2), rel=1e-13)
@@ -102,7 +102,7 @@ def test_friction_is_that_of_each_motion():
 
 def test_collisions_come_after_their_mean_time():
     system = build(small_scene({"argon": 4000}, 200.0))
-    row = VERLET.with_bath(Andersen(steady(THERMAL), 0.5, key_of(4, BATH)), halved=True)
+    row = VERLET.with_bath(Andersen(steady(THERMAL), 0.5, key_of(4, THERMOSTAT)), halved=True)
     state = system.state.copy()
     move(Engine(system.model, {}), state, row, 0.1, 3)
     kept = (state.velocity == system.state.velocity).all(axis=1).mean()
@@ -114,8 +114,8 @@ def liquid():
     """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
     system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
         "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
-    relieve(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
-    move(engine, state, BAOAB.with_bath(Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, BATH))), 0.001, 500)
+    remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    move(engine, state, BAOAB.with_bath(Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))), 0.001, 500)
     return system, state._replace(books=np.zeros(3))
 
 
@@ -165,7 +165,7 @@ def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermost
 
 def test_a_ramp_goes_from_its_begin_to_its_end():
     system = build(small_scene({"argon": 3000}, 150.0))
-    row = BAOAB.with_bath(Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, BATH)))
+    row = BAOAB.with_bath(Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, THERMOSTAT)))
     state, engine = system.state.copy(), Engine(system.model, {})
     for part in (0.5, 1.0):
         move(engine, state, row, 0.02, 50)
@@ -181,7 +181,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
     simulation = Simulation(scene)
     system = simulation.system
     assert [system.freedom_in(k).total for k in range(3)] == [120, 117, 117]
-    assert row_of_stage(system, 1).bath.degrees_of_freedom == 117
+    assert integrator_of_stage(system, 1).bath.degrees_of_freedom == 117
     results = simulation.run()
     own = results["stage"] == 0
     mass = system.model.mass[system.model.species].sum()

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy import stats
 from support import (
-    BATH,
-    BOX,
+    BAROSTAT,
     COMPONENTS,
     COUPLINGS,
     NOW,
     SCHEMES,
-    WITH_BATH,
+    THERMOSTAT,
+    WITH_THERMOSTAT,
     WORK,
     CellRescaling,
     Langevin,
@@ -23,11 +23,11 @@ from support import (
     boxes,
     build,
     built,
+    integrator_of_stage,
     key_of,
     move,
     observe,
-    relieve,
-    row_of_stage,
+    remove_overlaps,
     small_scene,
     steady,
 )
@@ -75,7 +75,7 @@ def liquid(request):
     system, engine, state = built(
         {"spce": 20, "nitrogen": 12}, 12.0, 3, spread=0.1, forces=forces, stages=[stage], box=box
     )
-    relieve(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
     return system, engine, state
 
 
@@ -175,9 +175,9 @@ def gas(count, thermostat, box_for):
     system = build(scene)
     pressure = (count + 1) * THERMAL / system.state.volume
     asked = Pressure((pressure,) * 3 + (0.0,) * 3, (pressure,) * 3 + (0.0,) * 3, 1.0)
-    bath = VelocityRescaling(steady(THERMAL), 0.05, system.freedom.total, key_of(1, BATH))
+    bath = VelocityRescaling(steady(THERMAL), 0.05, system.freedom.total, key_of(1, THERMOSTAT))
     if thermostat == "langevin":
-        bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, BATH))
+        bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
     row = VERLET.with_bath(bath).with_box(box_for(asked, pressure), 2)
     engine = system.engine()
     state = engine.begin(system.state, row)
@@ -194,7 +194,7 @@ def gas(count, thermostat, box_for):
 ])  # fmt: skip
 def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
     """p(V) ~ V^N exp(-p V/kT): a Gamma distribution, whatever the thermostat does to the total momentum."""
-    n, key = 8, key_of(3, BOX)
+    n, key = 8, key_of(3, BAROSTAT)
 
     def box_for(asked, pressure):
         if barostat == "monte_carlo":
@@ -219,7 +219,7 @@ def test_a_rejected_move_leaves_no_trace(liquid):
     system, _, state = liquid
     dear = CellRescaling(
         steady(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * barostat_of(system, 0).rate,
-        COUPLINGS["flexible"], (1.0, 1.0, 1.0), (0.0, 0.0), key_of(1, BOX),
+        COUPLINGS["flexible"], (1.0, 1.0, 1.0), (0.0, 0.0), key_of(1, BAROSTAT),
     )  # fmt: skip
     fresh = system.engine()
     still, moved = state.copy(), state.copy()
@@ -235,9 +235,9 @@ def compressed():
     stage = {"ensemble": "nph", "pressure_bar": 2000.0, "duration_ps": 0.1, "barostat_time_ps": 0.3}
     forces = {"cutoff_A": 4.5, "truncation": "smooth_switch", "tail_correction": True}
     system, engine, state = built({"nitrogen": 32}, 11.5, 2, spread=0.1, forces=forces, stages=[stage])
-    relieve(system.model, engine, state, np.array([m.radius for m in system.species]), 3.3, THERMAL, 0.002)
-    bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, BATH))
-    move(engine, state, WITH_BATH["baoab"].with_bath(bath), 0.002, 300)
+    remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.3, THERMAL, 0.002)
+    bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
+    move(engine, state, WITH_THERMOSTAT["baoab"].with_bath(bath), 0.002, 300)
     state.velocity[:] -= state.velocity.mean(axis=0)
     state.begin_stretch()
     return system, state._replace(books=np.zeros(3))
@@ -353,6 +353,6 @@ def test_a_compressibility_in_another_unit_is_said():
 def test_pressures_become_components():
     stage = NPT | {"pressure_coupling": "flexible", "pressure_bar": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
     system = build(small_scene({"argon": 20}, 30.0, stages=[stage]))
-    box = row_of_stage(system, 0).box
+    box = integrator_of_stage(system, 0).box
     assert box.pressure.first == pytest.approx(np.arange(1, 7) * BAR)
-    assert row_of_stage(system, 0).flows[-1].every == 25
+    assert integrator_of_stage(system, 0).flows[-1].every == 25

@@ -5,15 +5,15 @@ from math import inf, pi, sqrt
 import numpy as np
 import pytest
 from support import (
+    REMOVED,
     SCHEMES,
-    TAKEN,
     BehindWallError,
     Engine,
     build,
     describe,
     draw_momenta,
     from_vector,
-    molecular_subject,
+    molecular_trial_system,
     move,
     observe,
     random_rotations,
@@ -327,7 +327,7 @@ def test_conserved_components_of_momentum_are_known_and_not_counted(counts, fiel
     for velocity in (state.velocity, other.velocity):
         assert mass @ velocity == pytest.approx(np.where(keeps, 0.0, momentum), abs=1e-12 * size)
     assert taken == pytest.approx((momentum[keeps] ** 2).sum() / (2 * mass.sum()), abs=1e-12 * size)
-    assert state.books[TAKEN] == pytest.approx(-taken, rel=1e-10)
+    assert state.books[REMOVED] == pytest.approx(-taken, rel=1e-10)
 
 
 def test_the_errors_of_precision_are_those_of_what_is_conserved():
@@ -338,8 +338,8 @@ def test_the_errors_of_precision_are_those_of_what_is_conserved():
         (SPRINGS | {"restraints": [{"stiffness_kJ_mol_A2": 1.0}]}, set()),
     ):
         system, _, state = alone({"dumbbell": 3}, fields)
-        subject = molecular_subject(system, state, None, 0.1)
-        assert set(subject.kept(state)) == names
+        trial_system = molecular_trial_system(system, state, None, 0.1)
+        assert set(trial_system.conserved_errors(state)) == names
 
 
 def test_threads_change_no_bit():
@@ -510,10 +510,10 @@ def test_fields_that_are_tied_to_places_say_so():
     def scene(fields):
         return small_scene({"spce": 4}, 36.0, fields=fields)
 
-    assert scene({"walls": [LJ]}).fields.holds_in_place
-    assert scene({"restraints": [HELD]}).fields.holds_in_place
-    assert scene({"gravity_m_s2": [0.0, 0.0, -1.0], "walls": [LJ]}).fields.holds_in_place
-    assert not scene(OSCILLATING).fields.holds_in_place
+    assert scene({"walls": [LJ]}).fields.depends_on_position
+    assert scene({"restraints": [HELD]}).fields.depends_on_position
+    assert scene({"gravity_m_s2": [0.0, 0.0, -1.0], "walls": [LJ]}).fields.depends_on_position
+    assert not scene(OSCILLATING).fields.depends_on_position
     assert build(scene(OSCILLATING)).position_dependent == []
     assert alone({"kite": 1, "etik": 1}, STEADY)[0].position_dependent == ["electric_field"]
     assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).position_dependent == ["walls_0", "restraints_0"]

@@ -343,7 +343,7 @@ def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
         for i, name in enumerate(m.site_names)
         if m.epsilon[i] > 0
     }
-    own = build(scene.with_own([(law or rigidmd.pair_law)(given)]))
+    own = build(scene.with_user_code([(law or rigidmd.pair_law)(given)]))
     load, tallies = own.engine_of({name: own.terms[name] for name in own.user_terms}, "double").evaluate(state)
     (tally,) = tallies.values()
     assert tally.energy == pytest.approx(expected["lennard_jones"].energy, rel=tolerance)
@@ -379,7 +379,7 @@ def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
 
 def test_who_interacts_with_which_parameters():
     def numbers(law, counts={"argon": 3, "krypton": 3}, **forces):  # noqa: B006
-        law = build(small_scene(counts, 25.0, forces=forces).with_own([law])).terms["pair_law"].law
+        law = build(small_scene(counts, 25.0, forces=forces).with_user_code([law])).terms["pair_law"].law
         return law.parameters, law.acts
 
     both = {"Ar": {"k": 1.0}, "Kr": {"k": 4.0}}
@@ -396,7 +396,7 @@ def test_who_interacts_with_which_parameters():
     parameters, acts = numbers(rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}}))
     assert parameters[0] == pytest.approx(200)
     assert acts.shape == (1, 1)
-    one = build(small_scene({"argon": 3}, 25.0).with_own([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms["pair_law"]
+    one = build(small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms["pair_law"]
     assert one.law.acts.shape == (1, 1)
     with pytest.raises(SceneError, match=r"have no geometric mean"):
         numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
@@ -480,7 +480,7 @@ class Spring(rigidmd.Force):
 
 def test_a_field_on_sites_is_the_built_in_one():
     forces = {"electrostatics": "none"}
-    own = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces).with_own([Field()]))
+    own = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces).with_user_code([Field()]))
     theirs = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces, fields={"electric_V_per_nm": [0, 0, 1]}))
     load, tallies = own.engine_of({"field": own.terms["field"]}, "double").evaluate(own.state)
     expected, told = theirs.engine_of({"e": theirs.terms["electric_field"]}, "double").evaluate(own.state)
@@ -511,7 +511,7 @@ def test_a_run_with_forces_from_python_is_repeated_by_python_only(tmp_path, caps
     scene = rigidmd.Scene.read(folder / "scene.toml")
     with pytest.raises(SceneError, match="this has field"):
         rigidmd.Simulation(scene, forces=[Field()])
-    results = rigidmd.Simulation(scene.lasting(0.04), folder, forces=[Spring()], resume=True).run()
+    results = rigidmd.Simulation(scene.with_end(0.04), folder, forces=[Spring()], resume=True).run()
     assert np.array_equal(results.state.position, whole.state.position)
     assert np.array_equal(results["spring"], whole["spring"])
     assert main(["report", str(folder)]) == 0  # what has ended can be looked at without the code
@@ -614,7 +614,7 @@ class Halfway(Spring):
 def test_a_force_that_is_not_what_its_energy_says_stops_the_run_with_the_numbers(force, word):
     scene = small_scene({"spce": 8}, 20.0, forces={"electrostatics": "none"})
     with pytest.raises((SceneError, SimulationError), match=word):
-        system = build(scene.with_own([force]))
+        system = build(scene.with_user_code([force]))
         check_forces(system, system.state)
 
 

@@ -454,7 +454,7 @@ def test_a_callback_that_changes_the_directory(again, monkeypatch):
     assert {path.name for path in results.files} <= set(everything(again / "new"))
     assert all(path.is_file() for path in results.files) and results.universe().trajectory.n_frames == 2
     monkeypatch.chdir(again)
-    Simulation(Scene.from_dict(data | {"name": "new"}).lasting(0.03), "new", observers=moved, resume=True).run()
+    Simulation(Scene.from_dict(data | {"name": "new"}).with_end(0.03), "new", observers=moved, resume=True).run()
     monkeypatch.chdir(again)
     run_together([Simulation(Scene.from_dict(data | {"seed": k}), f"of{k}", observers=moved) for k in (1, 2)])
     assert [path.name for path in elsewhere.iterdir()] == ["run"] and everything(elsewhere / "run") == before

@@ -19,9 +19,9 @@ from support import (
     COLUMNS,
     MOLECULES,
     NOW,
+    REMOVED,
     ROOT,
     SCHEMES,
-    TAKEN,
     Engine,
     Figures,
     Sample,
@@ -34,6 +34,7 @@ from support import (
     columns,
     compare_at,
     describe,
+    integrator_of_stage,
     log,
     minimise,
     molecular_observers,
@@ -41,7 +42,6 @@ from support import (
     observe,
     progress,
     rigidmd_command,
-    row_of_stage,
     shaken,
     small_scene,
     summarise,
@@ -125,11 +125,11 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
     )  # fmt: skip
     seen = []
 
-    def look(moment):
+    def observe(moment):
         system = simulation.system
         seen.append((moment.time, moment.site_positions, system.site_velocities(moment.state)))
 
-    simulation = Simulation(scene, tmp_path / "out", observers=[Every(0.01, look)])
+    simulation = Simulation(scene, tmp_path / "out", observers=[Every(0.01, observe)])
     universe = simulation.run().universe()
     assert len(universe.trajectory) == len(seen) == 5
     exact = {".xtc": 6e-3, ".pdb": 6e-4, ".xyz": 6e-5}.get(name[1:], 1e-4)
@@ -354,7 +354,7 @@ def test_energy_that_goes_with_the_total_momentum_is_booked():
         engine.advance(state, row, 1e-3, int(state.step[NOW]) + steps)
         momentum = system.model.mass[system.model.species] @ state.velocity
         assert momentum == pytest.approx([left * mass, 0, 0], abs=1e-9 * mass)
-    assert state.books[TAKEN] == pytest.approx(-0.5 * mass * 0.1**2, rel=1e-9)
+    assert state.books[REMOVED] == pytest.approx(-0.5 * mass * 0.1**2, rel=1e-9)
     seen = observe(system, engine, state)
     assert seen.energy - state.books.sum() == pytest.approx(energy, rel=1e-5)
 
@@ -675,7 +675,7 @@ def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
     """What a kill would leave: the file is read back while the run still holds it open."""
     seen = []
 
-    def look(moment):
+    def observe(moment):
         if moment.step and moment.step % 4 == 0:
             universe = mda.Universe(str(tmp_path / "out" / "topology.gro"), str(tmp_path / "out" / name))
             seen.append(sum(1 for _ in universe.trajectory))
@@ -686,7 +686,7 @@ def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
         stages=[{"duration_ps": 0.04}],
         output={"trajectory": name, "trajectory_interval_ps": 0.008},
     )
-    Simulation(scene, tmp_path / "out", observers=[Every(0.008, look)]).run()
+    Simulation(scene, tmp_path / "out", observers=[Every(0.008, observe)]).run()
     assert seen == [2, 3, 4, 5, 6]
 
 
@@ -758,11 +758,11 @@ def arrays_of(moment):
 def test_what_an_observer_keeps_does_not_change(scene_of_both):
     kept, copies = [], []
 
-    def look(moment):
+    def observe(moment):
         kept.append(arrays_of(moment))
         copies.append([part.copy() for part in kept[-1]])
 
-    Simulation(scene_of_both[1], observers=Every(0.002, look), warn=str).run()
+    Simulation(scene_of_both[1], observers=Every(0.002, observe), warn=str).run()
     assert len(kept) > 2
     for now, then in zip(kept, copies, strict=True):
         for array, copy in zip(now, then, strict=True):
@@ -1135,16 +1135,16 @@ def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch
         {"spce": 20, "nitrogen": 12}, 12.0, 3, spread=0.05, forces=forces, stages=[stage], precision=precision,
         fields={"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 3.0},
     )  # fmt: skip
-    row, other, evaluated = row_of_stage(system, 0), system.engine(), []
+    row, other, evaluated = integrator_of_stage(system, 0), system.engine(), []
     looked, alone = engine.begin(start, row), other.begin(start, row)
     evaluate = Engine.evaluate
     monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(self) or evaluate(self, state))
     for until in (7, 20, 21, 30):
-        engine.advance(looked, row, 1e-3, until, looked=True)
+        engine.advance(looked, row, 1e-3, until, observed=True)
         other.advance(alone, row, 1e-3, until)
-        load, tallies = engine.look(looked)
+        load, tallies = engine.evaluate_current(looked)
         assert all(np.array_equal(a, b) for a, b in zip(looked, alone, strict=True))
-        expected, expected_tallies = other.look(alone)
+        expected, expected_tallies = other.evaluate_current(alone)
         assert all(np.array_equal(a, b) for a, b in zip(load, expected, strict=True))
         for term, tally in expected_tallies.items():
             assert tallies[term].energy == tally.energy
@@ -1165,12 +1165,12 @@ class Spring(rigidmd.Force):
 
 
 def test_a_look_asks_a_force_in_python_once():
-    system = build(small_scene({"argon": 10}, 25.0).with_own([spring := Spring()]))
+    system = build(small_scene({"argon": 10}, 25.0).with_user_code([spring := Spring()]))
     engine, row = system.engine(), SCHEMES["velocity_verlet"]
     state = engine.begin(system.state, row)
     engine.advance(state, row, 1e-3, 5, looked=True)
     asked = spring.asked
-    found = engine.look(state)[1]["spring"].energy
+    found = engine.evaluate_current(state)[1]["spring"].energy
     assert spring.asked == asked
     assert found == engine.evaluate(state)[1]["spring"].energy
     assert spring.asked == asked + 1
@@ -1184,7 +1184,7 @@ def test_a_look_at_another_state_is_an_evaluation():
     other.position[:] += 0.1 * np.arange(20)[:, None]
     engine.advance(other, row, 1e-3, 0, looked=True)  # no step
     expected = system.engine().evaluate(other)[1]
-    assert engine.look(other)[1]["lennard_jones"].energy == pytest.approx(expected["lennard_jones"].energy, rel=1e-12)
+    assert engine.evaluate_current(other)[1]["lennard_jones"].energy == pytest.approx(expected["lennard_jones"].energy, rel=1e-12)
 
 
 def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
@@ -1202,11 +1202,11 @@ def test_a_look_at_a_state_that_was_changed_from_outside_is_anew():
     _, engine, state = built({"argon": 20}, 25.0)
     row = SCHEMES["velocity_verlet"]
     engine.advance(state, row, 1e-3, 5, looked=True)
-    known = engine.look(state)[1]["lennard_jones"].energy
-    assert engine.look(state.copy())[1]["lennard_jones"].energy == known
+    known = engine.evaluate_current(state)[1]["lennard_jones"].energy
+    assert engine.evaluate_current(state.copy())[1]["lennard_jones"].energy == known
     state.position[0, 0] += 0.5
     engine.forget()
-    assert engine.look(state)[1]["lennard_jones"].energy != known
+    assert engine.evaluate_current(state)[1]["lennard_jones"].energy != known
 
 
 def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):

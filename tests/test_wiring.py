@@ -5,15 +5,13 @@ from math import pi
 import numba
 import numpy as np
 import pytest
-from support import BATH_STEP as BATH
 from support import (
-    BOX,
+    BAROSTAT,
     NOW,
     ORIGIN,
-    REST,
-    TAKEN,
+    REMOVE_MOMENTUM,
+    REMOVED,
     advance,
-    thermostat_of,
     barostat_of,
     boxes,
     build,
@@ -22,8 +20,10 @@ from support import (
     ramps,
     remove_momentum,
     small_scene,
+    thermostat_of,
 )
-from support import row_of_stage as row
+from support import BATH_STEP as THERMOSTAT
+from support import integrator_of_stage as row
 
 #: In u, Å and ps, from SI: 1 u = 1.66053906660e-27 kg.
 KILOGRAM = 1 / 1.66053906660e-27
@@ -94,7 +94,7 @@ def test_temperatures_count_the_total_momentum_where_the_thermostat_changes_it(k
 def test_every_thermostat_acts_for_a_whole_step():
     for kind in ("velocity_rescaling", "nose_hoover", "langevin", "andersen"):
         flows = row(system_of(NVT | {"thermostat": kind, "integrator": "velocity_verlet"}), 0).flows
-        own = [flow for flow in flows if flow.kind == BATH]
+        own = [flow for flow in flows if flow.kind == THERMOSTAT]
         assert sum(flow.fraction / flow.every for flow in own) == pytest.approx(1), kind
 
 
@@ -176,7 +176,7 @@ def test_a_piston_has_the_period_that_was_asked_for():
 
 def test_moves_of_the_box_come_at_their_interval():
     scheme = row(system_of(NPT | {"barostat_interval_ps": 0.02}), 0)
-    moves = [flow for flow in scheme.flows if flow.kind == BOX]
+    moves = [flow for flow in scheme.flows if flow.kind == BAROSTAT]
     assert [flow.every for flow in moves] == [10]
     assert sum(flow.fraction for flow in moves) == pytest.approx(10)
 
@@ -184,7 +184,7 @@ def test_moves_of_the_box_come_at_their_interval():
 @pytest.mark.parametrize("thermostat", ["velocity_rescaling", "langevin"])
 def test_the_total_momentum_is_taken_out_at_its_interval_where_it_is_kept(thermostat):
     own = row(system_of(NVT | {"thermostat": thermostat}, run={"remove_momentum_interval_ps": 0.05}), 0)
-    rests = [flow.every for flow in own.flows if flow.kind == REST]
+    rests = [flow.every for flow in own.flows if flow.kind == REMOVE_MOMENTUM]
     assert rests == ([25] if thermostat == "velocity_rescaling" else [])
 
 
@@ -251,7 +251,7 @@ def _rest(model, state):
     advance.rest(model, state)
 
 
-def pushed(system, seed=1):
+def resisted_motion(system, seed=1):
     """Thermal momenta of a mixture, and a push along each axis."""
     rng, state = np.random.default_rng(seed), system.state.copy()
     mass = system.model.mass[system.model.species]
@@ -264,7 +264,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     """The common velocity is P/M; its energy P²/2M is accounted for. A field along x leaves what is along x."""
     field = {"fields": {"electric_V_per_nm": [0.1, 0.0, 0.0]}} if "na_spce" in counts else {}
     system = system_of(NVT, counts=counts, **field)
-    state, mass = pushed(system)
+    state, mass = resisted_motion(system)
     before = state.velocity.copy()
     momentum = mass @ before
     kept = np.array([not field, True, True])
@@ -272,7 +272,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     assert (mass @ state.velocity)[kept] == pytest.approx(np.zeros(kept.sum()), abs=1e-12)
     assert before - state.velocity == pytest.approx(np.tile(kept * momentum / mass.sum(), (len(mass), 1)))
     energies = [0.5 * mass @ (v**2).sum(axis=1) for v in (before, state.velocity)]
-    assert state.books[TAKEN] == pytest.approx(energies[1] - energies[0])
+    assert state.books[REMOVED] == pytest.approx(energies[1] - energies[0])
 
 
 def test_a_mixture_starts_at_rest_and_at_its_temperature():
@@ -307,7 +307,7 @@ def test_a_start_has_a_thermal_energy_about_each_axis():
 def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     """`remove_momentum` keeps all relative velocities, and returns the energy that it takes."""
     system = system_of(NVT)
-    state, mass = pushed(system)
+    state, mass = resisted_motion(system)
     before = state.velocity.copy()
     taken = remove_momentum(system.model, state.velocity)
     assert np.ptp(before - state.velocity, axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
@@ -321,7 +321,7 @@ def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
 def test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces():
     """2K/(f k) of K + dt²/12 (sum F²/m), and of K + dt²/12 (sum n²/I), over the axes that have inertia."""
     system = system_of({"duration_ps": 0.1})
-    state, mass = pushed(system)
+    state, mass = resisted_motion(system)
     rng, dt = np.random.default_rng(3), 0.02
     inertia = system.model.inertia[system.model.species]
     state.angular_momentum_body[:] = rng.standard_normal(inertia.shape) * np.sqrt(inertia * 300 * KELVIN)

@@ -11,7 +11,7 @@ from rigidmd.errors import OutputError
 from rigidmd.run.rigid_fit import Bodies, Kind, Rebuilt, kinds_of
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import meant
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.units import BOLTZMANN
 
 #: Two intervals between frames that differ by less than this fraction are equal.
@@ -127,7 +127,9 @@ class History:
                 molecules.append(np.repeat(kind.index, len(chosen)))
         if not at:
             known = names_of(self.system)
-            raise OutputError(f"there is no site {name!r}{meant(name, known) or ';'} there are {', '.join(known)}")
+            raise OutputError(
+                f"there is no site {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}"
+            )
         return np.concatenate(at, axis=1), np.concatenate(molecules)
 
     def part(self, first: int, end: int) -> "History":

@@ -9,10 +9,10 @@ import numpy as np
 
 from rigidmd.analysis.findings import Curve, Finding, Value, settled
 from rigidmd.analysis.history import History
-from rigidmd.core.files import file_fault
+from rigidmd.core.files import unreadable_reason
 from rigidmd.core.statistics import correlation_time, mean
 from rigidmd.errors import OutputError
-from rigidmd.scene.validation import meant
+from rigidmd.scene.validation import did_you_mean
 
 
 class Analysis(NamedTuple):
@@ -69,7 +69,9 @@ def selected(names: list[str]) -> list[Analysis]:
     known = sorted(KNOWN, key=place)
     for name in names:
         if name not in KNOWN:
-            raise OutputError(f"there is no analysis {name!r}{meant(name, known) or ';'} there are {', '.join(known)}")
+            raise OutputError(
+                f"there is no analysis {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}"
+            )
     return [KNOWN[name] for name in names or known]
 
 
@@ -80,7 +82,7 @@ def place(name: str) -> int:
 
 def trusted(path: Path) -> None:
     """Run a Python file that defines analyses: it is code, and the user said that it may run. Raises OutputError."""
-    if fault := file_fault(path):
+    if fault := unreadable_reason(path):
         raise OutputError(f"{path}: {fault}")
     before = dict(KNOWN)
     try:

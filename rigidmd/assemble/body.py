@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigidmd.assemble.body_faults import order_faults, unfit, unresisted
+from rigidmd.assemble.body_faults import integrator_errors, body_errors, torque_errors
 from rigidmd.assemble.body_parts import (
     carried_fluid,
     frame_of,
@@ -14,20 +14,20 @@ from rigidmd.assemble.body_parts import (
     rotor_of,
     terms_of,
 )
-from rigidmd.assemble.defaults import resolve_body
-from rigidmd.assemble.memory_check import check_samples
+from rigidmd.assemble.defaults import body_with_defaults
+from rigidmd.assemble.memory_check import check_memory_of_samples
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.errors import SceneError
-from rigidmd.forces.body.applied import Told
-from rigidmd.forces.body.frame import Inertial
+from rigidmd.forces.body.applied import PythonForce
+from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor
-from rigidmd.mechanics.time_functions import value_at
-from rigidmd.mechanics.translation import Free, Immersed, Pinned
+from rigidmd.mechanics.time_functions import values_at
+from rigidmd.mechanics.translation import FreeTranslation, FluidTranslation, NoTranslation
 from rigidmd.scene import BodyScene
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 LARGEST_IN = {".gro": 9e4, ".pdb": 990.0}  # Å: columns of text
 
@@ -47,13 +47,13 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         moments, axes = principal(tensor)
     moments = moments + added_inertia
     turning = bool(moments.any())
-    faults += unfit(scene, centre, moments, axes, added_mass)
+    faults += body_errors(scene, centre, moments, axes, added_mass)
     attitude, spin = scene.start.attitude, scene.start.angular_velocity
     own_spin = axes.T @ spin
     idle = (moments == 0) & (np.abs(own_spin) > 1e-12 * np.abs(own_spin).max(initial=0.0))
     if turning and idle.any():
         faults.append("start: the body has no inertia about an axis about which it is to turn")
-    faults += order_faults(scene, bool(added_mass.any()), bool(applied))
+    faults += integrator_errors(scene, bool(added_mass.any()), bool(applied))
     taken = {"gravity", "buoyancy", "origin_acceleration", *(f"applied_{k}" for k in range(len(scene.applied)))}
     faults += [
         f"applied: {name!r} is the name of a force of the scene; choose another"
@@ -61,24 +61,24 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         if name in taken
     ]
     for k, entry in enumerate(scene.applied):
-        faults += unresisted(entry, k, axes, moments, turning)
+        faults += torque_errors(entry, k, axes, moments, turning)
     if faults:
         raise SceneError(scene.source, faults)
 
-    scene = resolve_body(scene, turning, float(np.linalg.norm(points, axis=1).max()))
-    check_samples(scene)
+    scene = body_with_defaults(scene, turning, float(np.linalg.norm(points, axis=1).max()))
+    check_memory_of_samples(scene)
     rotor = rotor_of(scene, moments, added_inertia, axes) if turning else NoRotor()
     frame = frame_of(scene)
     if scene.body.pinned:
-        flight = Pinned(mass)
+        flight = NoTranslation(mass)
     elif added_mass.any():
-        flight = Immersed(mass, mass + added_mass)
+        flight = FluidTranslation(mass, mass + added_mass)
     else:
-        flight = Free(mass)
+        flight = FreeTranslation(mass)
     body = Body(flight, rotor, frame, resistance_of(scene))
     applied = applied or {}
     terms = terms_of(scene, mass, axes, centre, displaced)
-    terms |= {name: Told() for name in applied}
+    terms |= {name: PythonForce() for name in applied}
     system = BodySystem(
         scene=scene,
         body=body,
@@ -93,9 +93,9 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         applied=applied,
     )
     system.left_out = _left_out(system)
-    if scene.output.trajectory and system.flies:
+    if scene.output.trajectory and system.translates:
         reach = system.scale * np.abs(system.state.position).max()
-        if not reach < LARGEST_IN[settled(scene.output.topology)[-4:]]:
+        if not reach < LARGEST_IN[not_none(scene.output.topology)[-4:]]:
             raise SceneError(
                 scene.source,
                 [
@@ -109,7 +109,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
 def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> State:
     start = scene.start
     time = np.zeros(1)
-    frame = np.zeros(3) if isinstance(body.frame, Inertial) else value_at(body.frame.angular_velocity, time)[0]
+    frame = np.zeros(3) if isinstance(body.frame, InertialFrame) else values_at(body.frame.angular_velocity, time)[0]
     position = velocity = np.zeros((0, 3))
     rotation, momentum = np.zeros((0, 3, 3)), np.zeros((0, 3))
     own_rotation = attitude @ axes
@@ -117,11 +117,11 @@ def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> Sta
         rotation = own_rotation[None].copy()
         momentum = (moments * (own_spin + own_rotation.T @ frame))[None].copy()
         if isinstance(body.rotor, DrivenRotor):
-            momentum += value_at(body.rotor.momentum, time)
+            momentum += values_at(body.rotor.momentum, time)
     if not scene.body.pinned:
         position = np.array([start.position_m or (0.0, 0.0, 0.0)])
         velocity = np.array([start.velocity_m_s or (0.0, 0.0, 0.0)]) + np.cross(frame, position)
-        if isinstance(body.flight, Immersed):
+        if isinstance(body.flight, FluidTranslation):
             share = body.flight.inertial_mass / body.flight.mass
             velocity = (own_rotation @ (share * (own_rotation.T @ velocity[0])))[None]
     return state_of(position, velocity, rotation, momentum)
@@ -130,12 +130,12 @@ def _first_state(scene, body, moments, axes, attitude, own_spin, turning) -> Sta
 def _left_out(system: BodySystem) -> list[str]:
     """What is not compiled for this body, and why."""
     out = ["box, neighbour lists, pair forces, threads: there is one body"]
-    if not system.flies:
+    if not system.translates:
         out.append("translation: the body is pinned")
-    if not system.turns:
+    if not system.rotates:
         out.append("rotation: the body is a point")
     body = system.body
-    if isinstance(body.frame, Inertial):
+    if isinstance(body.frame, InertialFrame):
         out.append("frame: its axes do not turn")
     if isinstance(body.resistance, NoResistance):
         out.append("resistance: there is none")

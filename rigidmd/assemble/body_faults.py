@@ -4,14 +4,14 @@ import numpy as np
 
 from rigidmd.assemble.body_parts import frame_of, inertia_at_centre, principal, resistance_of
 from rigidmd.core.integrators import SCHEMES, SOLVERS
-from rigidmd.forces.body.frame import Turning
+from rigidmd.forces.body.frame import RotatingFrame
 from rigidmd.forces.body.resistance import NoResistance
-from rigidmd.mechanics.time_functions import keeps_direction
+from rigidmd.mechanics.time_functions import has_constant_direction
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import axis_of_symmetry
 
 
-def unfit(
+def body_errors(
     scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
 ) -> list[str]:
     """Keys that this body cannot follow, or that would have no effect on it."""
@@ -90,7 +90,7 @@ def _needs_principal_axes(scene: BodyScene) -> list[str]:
     return faults
 
 
-def unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bool) -> list[str]:
+def torque_errors(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bool) -> list[str]:
     """Torques about axes without inertia."""
     if entry.torque_N_m is None and entry.at_m is None:
         return []
@@ -104,11 +104,11 @@ def unresisted(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bo
     return []
 
 
-def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
+def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
     """Integrators that cannot move this body, or not to their order. has_functions : Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
     braked = not isinstance(resistance, NoResistance)
-    if run.is_open:
+    if run.is_auto:
         return []
     if run.integrator in SOLVERS:
         if braked and resistance.rotation_dry.any():
@@ -131,7 +131,7 @@ def order_faults(scene: BodyScene, immersed: bool, has_functions: bool) -> list[
             f"have; use one of {', '.join(plain)}"
         ]
     frame = frame_of(scene)
-    wandering = isinstance(frame, Turning) and not keeps_direction(frame.angular_velocity)
+    wandering = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
     why = {
         "wheels": scene.wheels,
         "changing_inertia": scene.changing_inertia,

@@ -4,17 +4,17 @@ from itertools import permutations
 
 import numpy as np
 
-from rigidmd.forces.body.applied import Drive, SteadyForce
-from rigidmd.forces.body.frame import Inertial, Turning
+from rigidmd.forces.body.applied import TimeDependentForce, SteadyForce
+from rigidmd.forces.body.frame import InertialFrame, RotatingFrame
 from rigidmd.forces.body.resistance import NoResistance, Resistance
 from rigidmd.mechanics.free_rotor import DrivenRotor, split_rotor
-from rigidmd.mechanics.inertia import inertia_tensor, shifted
-from rigidmd.mechanics.rotation import direction
+from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
+from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
-from rigidmd.mechanics.time_functions import Course, integral, is_steady, steady, table, total, window
+from rigidmd.mechanics.time_functions import TimeFunction, integrate_function, is_constant_function, constant_function, interpolated_function, sum_functions, pulse_function
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body_forces import Timed
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 #: Principal moments of a tensor are equal if they differ by less than this fraction of the largest.
 ROUNDING = 1e-13
@@ -39,13 +39,13 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
     else:
         about_centre = np.zeros((3, 3)) if tensor is None else tensor
         if table_.inertia_about == "pivot":
-            about_centre = shifted(about_centre, -mass, centre)
+            about_centre = shifted_inertia(about_centre, -mass, centre)
         points = _equal_ellipsoid(mass, about_centre)
     if tensor is None:
         tensor = np.zeros((3, 3))
     if table_.pinned:
         if table_.inertia_about == "centre_of_mass":
-            tensor = shifted(tensor, mass, centre)
+            tensor = shifted_inertia(tensor, mass, centre)
         points = np.vstack([np.zeros(3), centre + points])
         return mass, tensor, centre, points, ("PIVOT", *(f"P{k}" for k in range(1, len(points))))
     return mass, tensor, np.zeros(3), points, tuple(f"P{k}" for k in range(1, len(points) + 1))
@@ -56,7 +56,7 @@ def inertia_at_centre(scene: BodyScene) -> np.ndarray:
     if scene.changing_inertia is not None:
         return np.diag(scene.changing_inertia.inertia_kg_m2[0])
     mass, tensor, centre, _, _ = inertia_of(scene)
-    return shifted(tensor, -mass, centre) if scene.body.pinned else tensor
+    return shifted_inertia(tensor, -mass, centre) if scene.body.pinned else tensor
 
 
 def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
@@ -74,17 +74,17 @@ def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rounding = ROUNDING * np.abs(tensor).max()
     if (np.abs(tensor - np.diag(np.diag(tensor))) <= rounding).all():
         moments, axes = np.diag(tensor).copy(), np.eye(3)
-        return _even(moments), axes
+        return _without_rounding(moments), axes
     moments, axes = np.linalg.eigh(tensor)
     best = max(permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3)))
     moments, axes = np.maximum(moments, 0.0)[list(best)], axes[:, best]
     axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
     if np.linalg.det(axes) < 0:
         axes[:, np.abs(np.diag(axes)).argmin()] *= -1
-    return _even(moments), axes
+    return _without_rounding(moments), axes
 
 
-def _even(moments: np.ndarray) -> np.ndarray:
+def _without_rounding(moments: np.ndarray) -> np.ndarray:
     """Moments with differences by rounding removed: equal to the last bit, so that the rotor is exact, or zero."""
     rounding = ROUNDING * moments.max()
     moments = np.where(moments < rounding, 0.0, moments)
@@ -106,7 +106,7 @@ def carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
             np.array(fluid.added_inertia_kg_m2 or zero),
             fluid.displaced_mass_kg or 0.0,
         )
-    shape = settled(scene.body.solid)
+    shape = not_none(scene.body.solid)
     half = np.array(shape.semi_axes_m or (shape.radius_m,) * 3)
     return *added_mass_of_ellipsoid(half, fluid.density_kg_m3), fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod()
 
@@ -115,36 +115,36 @@ def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, a
     if not scene.wheels and scene.changing_inertia is None:
         return split_rotor(moments[None])
     changing = scene.changing_inertia
-    inertia = steady(moments)
+    inertia = constant_function(moments)
     if changing is not None:
-        inertia = table(changing.times_s, np.array(changing.inertia_kg_m2) + added_inertia)
+        inertia = interpolated_function(changing.times_s, np.array(changing.inertia_kg_m2) + added_inertia)
     momenta = []
     for wheel in scene.wheels:
-        axis = axes.T @ direction(wheel.axis)
+        axis = axes.T @ unit_vector(wheel.axis)
         motor = wheel.motor_torque_N_m
         values = 0.0 if motor is None else motor
-        torque = _course(wheel, np.multiply.outer(values, axis))
-        momenta.append(integral(torque, wheel.momentum_kg_m2_s * axis))
-    return DrivenRotor(inertia, total(momenta) if momenta else steady(np.zeros(3)))
+        torque = _time_function(wheel, np.multiply.outer(values, axis))
+        momenta.append(integrate_function(torque, wheel.momentum_kg_m2_s * axis))
+    return DrivenRotor(inertia, sum_functions(momenta) if momenta else constant_function(np.zeros(3)))
 
 
-def _course(timed: Timed, values) -> Course:
+def _time_function(timed: Timed, values) -> TimeFunction:
     """The course of a value: constant, within a window of time, or from a table."""
     if timed.times_s is not None:
-        return table(timed.times_s, values)
+        return interpolated_function(timed.times_s, values)
     if timed.from_s is not None or timed.to_s is not None:
-        return window(values, *timed.window)
-    return steady(values)
+        return pulse_function(values, *timed.window)
+    return constant_function(values)
 
 
 def frame_of(scene: BodyScene):
     frame = scene.frame
     if frame is None or (frame.angular_velocity_rad_s is None and frame.angular_acceleration_rad_s2 is None):
-        return Inertial()
+        return InertialFrame()
     rate = np.array(frame.angular_velocity_rad_s or (0.0, 0.0, 0.0))
     if frame.angular_acceleration_rad_s2 is not None:
-        return Turning(integral(steady(frame.angular_acceleration_rad_s2), rate))
-    return Turning(_course(frame, rate))
+        return RotatingFrame(integrate_function(constant_function(frame.angular_acceleration_rad_s2), rate))
+    return RotatingFrame(_time_function(frame, rate))
 
 
 def resistance_of(scene: BodyScene):
@@ -168,31 +168,31 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
         g = np.array(scene.gravity.acceleration_m_s2)
         terms["gravity"] = SteadyForce(mass * g, where)
         if displaced:
-            buoyed = settled(scene.fluid).centre_of_buoyancy_m
+            buoyed = not_none(scene.fluid).centre_of_buoyancy_m
             at = centre if buoyed is None else np.array(buoyed)
             terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ at)
     if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
-        course = _course(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
-        terms["origin_acceleration"] = _force(course, steady(np.zeros(3)), where, False)
+        course = _time_function(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
+        terms["origin_acceleration"] = _force(course, constant_function(np.zeros(3)), where, False)
     for k, entry in enumerate(scene.applied):
         force, torque = (
-            steady(np.zeros(3)) if given is None else _course(entry, given)
+            constant_function(np.zeros(3)) if given is None else _time_function(entry, given)
             for given in (entry.force_N, entry.torque_N_m)
         )
         if entry.axes == "body":
-            force, torque = _turned(force, axes.T), _turned(torque, axes.T)
+            force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)
         terms[f"applied_{k}"] = _force(
             force, torque, axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0)), entry.axes == "body"
         )
     return terms
 
 
-def _turned(course: Course, matrix: np.ndarray) -> Course:
-    return Course(course.times, *(part @ matrix.T for part in course[1:]))
+def _rotated(course: TimeFunction, matrix: np.ndarray) -> TimeFunction:
+    return TimeFunction(course.times, *(part @ matrix.T for part in course[1:]))
 
 
-def _force(force: Course, torque: Course, point: np.ndarray, follows_body: bool):
+def _force(force: TimeFunction, torque: TimeFunction, point: np.ndarray, follows_body: bool):
     """The term of a force: a constant one in the lab has a potential energy, of any other the work is recorded."""
-    if not follows_body and is_steady(force) and is_steady(torque) and not torque.constant.any():
+    if not follows_body and is_constant_function(force) and is_constant_function(torque) and not torque.constant.any():
         return SteadyForce(force.constant[0], point)
-    return Drive(force, torque, point, follows_body)
+    return TimeDependentForce(force, torque, point, follows_body)

@@ -5,14 +5,14 @@ from math import inf
 
 import numpy as np
 
-from rigidmd.assemble.defaults import Facts, resolve, resolve_momentum
-from rigidmd.assemble.engine_defaults import handed_over
-from rigidmd.assemble.fields import Parts, between_walls, field_notes, field_terms, fields_left_out
-from rigidmd.assemble.memory_check import check_room
+from rigidmd.assemble.defaults import Composition, with_defaults, with_momentum_removal
+from rigidmd.assemble.engine_defaults import with_engine_defaults
+from rigidmd.assemble.fields import SystemParts, wrapped_between_walls, field_notes, field_terms, fields_left_out
+from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.overlaps import overlaps
-from rigidmd.assemble.species import frozen_apart, species_of
+from rigidmd.assemble.species import split_frozen, species_of
 from rigidmd.assemble.stage_description import stage_notes
-from rigidmd.assemble.start import arrange, residue_numbers, set_momenta
+from rigidmd.assemble.start import starting_configuration, residue_numbers, set_momenta
 from rigidmd.assemble.terms import interactions, left_out
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.momenta import freedom_of, kept_momentum, mobile
@@ -24,7 +24,7 @@ from rigidmd.forces.potentials.lennard_jones import sum_of
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.user_code import not_given
+from rigidmd.scene.user_code import missing_user_code
 
 
 def build(scene: MolecularScene, bare: bool = False) -> System:
@@ -32,27 +32,27 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
 
     bare : leave out what users add, their code too; for looking at a run that has ended
     """
-    scene, handover_notes = handed_over(scene)
+    scene, handover_notes = with_engine_defaults(scene)
     species = species_of(scene)
-    arrangement = arrange(scene, species)
+    arrangement = starting_configuration(scene, species)
     space, number = space_of(arrangement.cell), residue_numbers(arrangement)
-    species, index, frozen, faults = frozen_apart(scene, species, arrangement.species, number)
+    species, index, frozen, faults = split_frozen(scene, species, arrangement.species, number)
     counts = np.bincount(index, minlength=len(species))
-    resolved = resolve(scene, Facts(species, counts, space, arrangement.basis))
+    resolved = with_defaults(scene, Composition(species, counts, space, arrangement.basis))
     if faults := [*faults, *resolved.faults]:
         raise SceneError(scene.source, faults)
     scene = resolved.scene
     model = _model(species, index, frozen)
     turning = any(m.inertia.any() for m in species)
     state = state_of(
-        position=between_walls(scene, space, arrangement.position),
+        position=wrapped_between_walls(scene, space, arrangement.position),
         rotation=arrangement.rotation if turning else None,
         cell=arrangement.cell,
     )
     acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
-    acting.terms.update(field_terms(scene, Parts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
+    acting.terms.update(field_terms(scene, SystemParts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
     model = model._replace(keeps_momentum=kept_momentum(model, acting.terms))
-    scene = resolve_momentum(scene, model.keeps_momentum)
+    scene = with_momentum_removal(scene, model.keeps_momentum)
     system = System(
         scene=scene,
         species=species,
@@ -71,12 +71,12 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
         notes=[*handover_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )
     if not bare:
-        if scene.from_python != scene.own.names:
-            raise SceneError(scene.source, [not_given(scene.from_python, scene.own.names)])
+        if scene.from_python != scene.user_code.names:
+            raise SceneError(scene.source, [missing_user_code(scene.from_python, scene.user_code.names)])
         if scene.forces.custom or scene.from_python:
-            system = with_own(system)
+            system = with_user_code(system)
             scene, model = system.scene, system.model
-    if tied := system.tied_to_places:
+    if tied := system.position_dependent:
         words = ", ".join(name.replace("_", " ") for name in tied)
         faults = [
             f"stages.{k}: {stage.ensemble} changes the box, and {words} depend on places in it: keep the volume"
@@ -85,7 +85,7 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
         ]
         if faults:
             raise SceneError(scene.source, faults)
-    check_room(system)
+    check_memory(system)
     system.notes.extend(scene.rounded_times())
     system.notes.extend(
         f"stages.{k}: the total momentum is conserved and zero, so that nothing moves and there is no temperature; "
@@ -114,23 +114,23 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
     return system
 
 
-def with_own(system: System) -> System:
+def with_user_code(system: System) -> System:
     """The system with what users add. Raises SceneError with every fault."""
-    from rigidmd.assemble.user_code.binding import own_terms
+    from rigidmd.assemble.user_code.binding import user_terms
 
-    added = own_terms(system)
+    added = user_terms(system)
     model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.moves)
     return replace(
         system,
-        scene=resolve_momentum(system.scene, model.keeps_momentum),
+        scene=with_momentum_removal(system.scene, model.keeps_momentum),
         # those that Python computes come first: until they are told, nothing else need be computed
-        terms={name: added.terms[name] for name in added.told} | system.terms | added.terms,
+        terms={name: added.terms[name] for name in added.python_forces} | system.terms | added.terms,
         model=model,
         freedom=freedom_of(model),
-        told=added.told,
+        python_forces=added.python_forces,
         thermostat=added.thermostat,
         tail=sum_of([*([system.tail] if system.tail is not None else []), *added.tails]),
-        own=added.words,
+        user_terms=added.words,
         notes=[*system.notes, *added.notes],
     )
 

@@ -2,7 +2,7 @@
 
 A resolved scene runs to the same bits as the scene that it came from. Three things stay open in it: an integrator that
 is "auto", which a pilot run chooses; the number of threads, on which results do not depend; and the grid of PME where
-the cell of the scene leans so much that another cell of the same lattice stands for it (see `Resolved.pme_grid`).
+the cell of the scene leans so much that another cell of the same lattice stands for it (see `SceneWithDefaults.pme_grid`).
 """
 
 from math import inf, pi, prod, sqrt
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from rigidmd.assemble.engine_defaults import resolved_stage
+from rigidmd.assemble.engine_defaults import stage_with_defaults
 from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.engines.system import charges_in
 from rigidmd.forces.ewald.errors import (
@@ -28,7 +28,7 @@ from rigidmd.forces.neighbors.space import Space, Triclinic, cell_of
 from rigidmd.io.cells import basis_in_words, edges_in_words
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
-from rigidmd.scene.forces import Forces, usual_start
+from rigidmd.scene.forces import Forces, default_switch_start
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import WITH_VELOCITIES, Output
 
@@ -49,7 +49,7 @@ FARTHEST_IN_PDB = 900.0
 ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
 
-class Facts(NamedTuple):
+class Composition(NamedTuple):
     """What the defaults of a scene of molecules depend on, besides the scene."""
 
     species: list[Molecule]
@@ -73,7 +73,7 @@ class Facts(NamedTuple):
         return np.array_equal(self.basis, AS_GIVEN)
 
 
-class Resolved(NamedTuple):
+class SceneWithDefaults(NamedTuple):
     """A scene with its defaults filled in, and what is wrong with its numbers. With faults some may still be open."""
 
     scene: MolecularScene
@@ -83,8 +83,8 @@ class Resolved(NamedTuple):
     pme_grid: tuple[int, int, int] | None
 
 
-def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
-    """A scene of molecules with every number that a run of it uses, but for that of `resolve_momentum`."""
+def with_defaults(scene: MolecularScene, facts: Composition) -> SceneWithDefaults:
+    """A scene of molecules with every number that a run of it uses, but for that of `with_momentum_removal`."""
     numbers, faults = _range_of_forces(scene.forces, facts)
     grid = None
     if not faults and scene.forces.electrostatics in ("ewald", "pme"):
@@ -95,7 +95,7 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
     tables = {
         "forces": scene.forces.model_copy(update=numbers),
         "output": _output(scene.output),
-        "stages": tuple(resolved_stage(scene, stage) for stage in scene.stages),
+        "stages": tuple(stage_with_defaults(scene, stage) for stage in scene.stages),
     }
     # A file is copied under another name, which must not rename the species.
     tables["molecules"] = tuple(
@@ -109,10 +109,10 @@ def resolve(scene: MolecularScene, facts: Facts) -> Resolved:
         first = scene.first_moving
         temperature = first.temperatures[0] if first else 0.0
         tables["start"] = scene.start.model_copy(update={"temperature_K": temperature})
-    return Resolved(scene.model_copy(update=tables), faults, grid)
+    return SceneWithDefaults(scene.model_copy(update=tables), faults, grid)
 
 
-def resolve_momentum(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
+def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
     """A scene with the time between removals of the total momentum.
 
     keeps_momentum (3,) : which components of it the terms conserve
@@ -131,7 +131,7 @@ def _output(output: Output) -> Output:
     return output.model_copy(update={"velocities": holds})
 
 
-def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list[str]]:
+def _range_of_forces(forces: Forces, facts: Composition) -> tuple[dict[str, Any], list[str]]:
     """Cut-off and start of a switch as keys of [forces], and faults."""
     space = facts.space
     given = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
@@ -155,7 +155,7 @@ def _range_of_forces(forces: Forces, facts: Facts) -> tuple[dict[str, Any], list
         faults.append("forces.tail_correction needs a periodic box: without one there is no liquid beyond the cut-off")
     faults += _electrostatic_faults(forces, space, cutoff)
     if start is None and cutoff < inf and "switch" in forces.truncation:
-        start = usual_start(forces.truncation, cutoff)
+        start = default_switch_start(forces.truncation, cutoff)
     return {"cutoff_A": given, "switch_start_A": start}, faults
 
 
@@ -184,7 +184,7 @@ def _electrostatic_faults(forces: Forces, space: Space, cutoff: float) -> list[s
 
 
 def _ewald(
-    forces: Forces, facts: Facts, cutoff: float
+    forces: Forces, facts: Composition, cutoff: float
 ) -> tuple[dict[str, Any], list[str], tuple[int, int, int] | None]:
     """Numbers of an Ewald sum as keys of [forces], faults, and the grid of PME along the edges of the box.
 
@@ -204,7 +204,7 @@ def _ewald(
     numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
     if forces.electrostatics == "ewald":
         radius = forces.ewald_k_radius_per_A
-        if not forces.gives_waves:
+        if not forces.sets_k_vectors:
             radius = float(wave_radius_for(charges, alpha, facts.reciprocal, share))
         longest = np.linalg.norm(cell_of(facts.space), axis=1).max()
         if radius is not None and forces.ewald_k_max is None and radius * longest > 2 * pi * MOST_WAVES:
@@ -255,7 +255,7 @@ def _waves_at_most(forces: Forces, radius: float | None, volume: float) -> float
     return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
 
 
-def resolve_body(scene: BodyScene, turns: bool, radius: float) -> BodyScene:
+def body_with_defaults(scene: BodyScene, turns: bool, radius: float) -> BodyScene:
     """A scene of a single body with every number that a run of it uses.
 
     turns : whether the body has an orientation. radius : of the points that its trajectory shows, m

@@ -7,9 +7,9 @@ import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.assemble.fields import fields_in_words
+from rigidmd.assemble.fields import describe_fields
 from rigidmd.assemble.memory_check import bytes_of
-from rigidmd.assemble.stage_description import stage_in_words
+from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.compile.machine import threads_for
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.dynamics.body_step_loop import Body
@@ -22,7 +22,7 @@ from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.user_code import name_of
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 #: The arithmetic of forces, in words. Times: docs/benchmarks.md; the error is what tests/test_lanes.py allows.
 PRECISIONS = {
@@ -39,7 +39,7 @@ def describe(scene: MolecularScene | BodyScene, bare: bool = False) -> str:
     if isinstance(scene, MolecularScene):
         return _molecules(build(scene, bare))
     text = _body(build_body(scene))
-    if scene.run.is_open:
+    if scene.run.is_auto:
         text += "\nthe integrator is chosen before the run, and its step, at most this one"
     return text
 
@@ -47,20 +47,20 @@ def describe(scene: MolecularScene | BodyScene, bare: bool = False) -> str:
 def _body(system: BodySystem) -> str:
     """Kind, inertia, terms, steps."""
     scene, run = system.scene, system.scene.run
-    pinned = "" if system.flies else ", pinned"
+    pinned = "" if system.translates else ", pinned"
     moments = " ".join(f"{x:.9g}" for x in system.inertia)
-    about = "the centre of mass" if system.flies else "the pivot"
+    about = "the centre of mass" if system.translates else "the pivot"
     lines = [
         f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, "
         f"{system.degrees_of_freedom} degrees of freedom"
     ]
-    if system.turns:
+    if system.rotates:
         lines.append(f"  principal moments about {about}: {moments} kg m²")
     if not np.array_equal(system.axes, np.eye(3)):
         lines.append(f"  principal axes (columns, body's axes): {np.array2string(system.axes, precision=6)}")
     if system.centre.any():
         lines.append(f"  centre of mass from the pivot: {' '.join(f'{x:g}' for x in system.centre)} m")
-    if system.turns:
+    if system.rotates:
         pose = system.pose(0.0, system.state)
         angles = " ".join(f"{x:.6g}" for x in np.degrees(to_euler_angles(pose.rotation)))
         spin = float(np.linalg.norm(pose.angular_velocity_body))
@@ -77,7 +77,7 @@ def _body(system: BodySystem) -> str:
     lines += [f"  {reason}" for reason in system.left_out]
     how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
     lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
-    every = max(1, round(settled(scene.output.interval_s) / run.timestep_s))
+    every = max(1, round(not_none(scene.output.interval_s) / run.timestep_s))
     lines += [f"a sample every {every * run.timestep_s:g} s", *system.notes]
     return "\n".join(lines)
 
@@ -89,7 +89,7 @@ def _molecules(system: System) -> str:
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
         freely = "frozen" if system.model.inverse_mass[k] == 0 else f"{m.degrees_of_freedom} degrees of freedom each"
-        lines.append(f"  {count} {m.name}: {m.words}, {freely}")
+        lines.append(f"  {count} {m.name}: {m.description}, {freely}")
     charges = np.array([m.charge for m in system.species])[system.model.species]
     if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
         lines.append(f"  net charge of all of them: {charges.sum():+.6g} e")
@@ -105,7 +105,7 @@ def _molecules(system: System) -> str:
         lines.append("  no box")
     lines += [f"  {note}" for note in system.notes]
     lines.append("\ncompiled in:")
-    words = fields_in_words(scene, system.terms) | system.own
+    words = describe_fields(scene, system.terms) | system.user_terms
     for name, term in system.terms.items():
         lines.append(f"  {name.replace('_', ' ')}: {words.get(name) or _term(system, name, term)}")
     if not isinstance(system.model.rotor, NoRotor):
@@ -121,16 +121,16 @@ def _molecules(system: System) -> str:
     if (interval := system.removes_momentum_every) is not None:
         part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
         lines.append(f"  total momentum: taken out{part} every {interval:g} ps")
-    if (system.external or system.own) and len(kept) < 3:
+    if (system.external or system.user_terms) and len(kept) < 3:
         lines.append(f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")
     for k, stage in enumerate(scene.stages):
-        how, law = stage_in_words(stage)
+        how, law = describe_stage(stage)
         lines += [f"  {k}: {how}", f"     {law}"]
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
-    if not scene.engine.is_other:
+    if not scene.engine.is_external:
         threads = threads_for(scene.threads)
         lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {PRECISIONS[scene.precision]}")
     return "\n".join(lines)

@@ -18,8 +18,8 @@ from rigidmd.forces.potentials.coulomb import reaction_field, self_energy
 from rigidmd.forces.potentials.lennard_jones import Tail
 from rigidmd.forces.potentials.screened_coulomb import damped_self_energy, damped_shifted_force, screened_coulomb
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.models import Molecule, of_each
-from rigidmd.scene.validation import settled
+from rigidmd.scene.models import Molecule, gather_per_molecule
+from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 #: A net charge below this fraction of the sum of |q| is rounding.
@@ -31,7 +31,7 @@ FIT_SHARE = 0.02
 Grid = tuple[int, int, int]
 
 
-class Charged(NamedTuple):
+class ChargedSites(NamedTuple):
     """The charged sites of a system."""
 
     species: list[Molecule]
@@ -44,7 +44,7 @@ class Charged(NamedTuple):
     @property
     def charge_e(self) -> np.ndarray:
         """Charges (s,) in e."""
-        return of_each([m.charges[c] for m, c in zip(self.species, self.chosen, strict=True)], self.species_index)
+        return gather_per_molecule([m.charges[c] for m, c in zip(self.species, self.chosen, strict=True)], self.species_index)
 
     @property
     def summed(self) -> Charges:
@@ -72,7 +72,7 @@ class Interactions(NamedTuple):
 
 
 def electrostatics(
-    scene: MolecularScene, charged: Charged, space: Space, state: State, basis: np.ndarray, grid: Grid | None
+    scene: MolecularScene, charged: ChargedSites, space: Space, state: State, basis: np.ndarray, grid: Grid | None
 ) -> Interactions:
     """The contributions of the charges of a resolved scene. Raises SceneError.
 
@@ -105,14 +105,14 @@ class _Ewald(NamedTuple):
     waves: k_vectors.Waves | None  # with PME only for the interactions of frozen molecules
 
 
-def _waves(scene: MolecularScene, charged: Charged, space: Space, basis: np.ndarray, grid: Grid | None) -> _Ewald:
+def _waves(scene: MolecularScene, charged: ChargedSites, space: Space, basis: np.ndarray, grid: Grid | None) -> _Ewald:
     """Waves and truncation errors of a resolved scene."""
     forces, volume, cell = scene.forces, space.volume, cell_of(space)
-    alpha, cutoff, charges = settled(forces.ewald_alpha_per_A), settled(forces.cutoff_A), charged.summed
+    alpha, cutoff, charges = not_none(forces.ewald_alpha_per_A), not_none(forces.cutoff_A), charged.summed
     beyond = real_error(charges, alpha, cutoff, volume)
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     if grid is not None:
-        left = mesh_error(charges, alpha, cell, grid, settled(forces.pme_order))
+        left = mesh_error(charges, alpha, cell, grid, not_none(forces.pme_order))
         over = None
         if charged.frozen.any():
             over = k_vectors.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
@@ -121,7 +121,7 @@ def _waves(scene: MolecularScene, charged: Charged, space: Space, basis: np.ndar
     if isinstance(most, int):
         most = (most, most, most)
     if radius is None:
-        over = k_vectors.waves(settled(most), forces.ewald_k2_max, basis)
+        over = k_vectors.waves(not_none(most), forces.ewald_k2_max, basis)
     else:
         over = k_vectors.waves_within(reciprocal, radius, most, basis)
     if over.total == 0:
@@ -131,7 +131,7 @@ def _waves(scene: MolecularScene, charged: Charged, space: Space, basis: np.ndar
 
 def _ewald(
     scene: MolecularScene,
-    charged: Charged,
+    charged: ChargedSites,
     space: Space,
     between_pairs: Callable[[NamedTuple], NamedTuple],
     state: State,
@@ -139,12 +139,12 @@ def _ewald(
     grid: Grid | None,
 ) -> Interactions:
     forces, found = scene.forces, _waves(scene, charged, space, basis, grid)
-    alpha, cutoff = settled(forces.ewald_alpha_per_A), settled(forces.cutoff_A)
+    alpha, cutoff = not_none(forces.ewald_alpha_per_A), not_none(forces.cutoff_A)
     charge = charged.charge_e * COULOMB_CHARGE
     shifted = forces.ewald_truncation == "shift"
     law = screened_coulomb(charged.charge_e, cutoff, alpha, shifted, FIT_SHARE * found.real_error)
     if grid is None:
-        waves = settled(found.waves)
+        waves = not_none(found.waves)
         over = direct_sum.EwaldSum(alpha, charge, charged.sites, waves)
         how = f"{waves.total} waves, |n| up to {' '.join(map(str, waves.most))}"
         if forces.ewald_k_max is not None and not np.array_equal(basis, k_vectors.AS_GIVEN):
@@ -152,7 +152,7 @@ def _ewald(
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
-        order = settled(forces.pme_order)
+        order = not_none(forces.pme_order)
         over = Pme(alpha, charge, charged.sites, grid, order)
         how = f"grid {' x '.join(map(str, grid))}, splines of order {order}"
     terms = {"coulomb_real": between_pairs(law), "coulomb_reciprocal": over}
@@ -187,14 +187,14 @@ def _ewald(
         terms["coulomb_surface"] = corrections.surface_dipole(charge, permittivity, charged.sites)
     pressure = 0.0
     if still.any():
-        constants["coulomb_frozen"], pressure = _of_frozen(
-            charged, charge * still, space, alpha, settled(found.waves), permittivity, state
+        constants["coulomb_frozen"], pressure = _frozen_correction(
+            charged, charge * still, space, alpha, not_none(found.waves), permittivity, state
         )
     return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
 
 
-def _of_frozen(
-    charged: Charged,
+def _frozen_correction(
+    charged: ChargedSites,
     charge: np.ndarray,
     space: Space,
     alpha: float,

@@ -11,17 +11,17 @@ THERMOSTAT = "nose_hoover"
 BAROSTATS = {"lammps": None, "openmm": "monte_carlo"}
 
 
-def handed_over(scene: MolecularScene) -> tuple[MolecularScene, list[str]]:
+def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[str]]:
     """A scene with what it leaves open decided for its engine, before other defaults; and notes on it.
 
     A scene for rigidmd itself stays as it is.
     """
-    if not scene.engine.is_other:
+    if not scene.engine.is_external:
         return scene, []
     notes = [f"computed by {scene.engine.title}"]
     stages = []
     for k, stage in enumerate(scene.stages):
-        if stage.has_thermostat and stage.thermostat is None and not stage.leaves_thermostat:
+        if stage.has_thermostat and stage.thermostat is None and not stage.thermostat_is_open:
             notes.append(f"stages.{k}: thermostat {THERMOSTAT}, because {scene.engine.name} has no velocity_rescaling")
             stage = stage.model_copy(update={"thermostat": THERMOSTAT})
         if stage.ensemble == "npt" and stage.barostat is None:
@@ -36,9 +36,9 @@ def handed_over(scene: MolecularScene) -> tuple[MolecularScene, list[str]]:
     return scene.model_copy(update=changed), notes
 
 
-def resolved_stage(scene: MolecularScene, stage: Stage) -> Stage:
+def stage_with_defaults(scene: MolecularScene, stage: Stage) -> Stage:
     """A stage with every number that it uses; LAMMPS' barostat has none but the time."""
-    found = stage.resolved
+    found = stage.with_defaults
     if scene.engine.name == "lammps" and stage.ensemble == "npt" and stage.barostat is None:
         found = found.model_copy(update={"barostat": None, "barostat_interval_ps": None})
     return found

@@ -18,14 +18,14 @@ from rigidmd.forces.neighbors.space import Orthorhombic, Space, Unbounded
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES, Walls
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 from rigidmd.units import KJ_PER_MOL, METRE_PER_S2, VOLT_PER_NM
 
 #: The least distance of a lattice's molecules from a Lennard-Jones wall, in sigma: that of its well.
 WELL = (2 / 5) ** (1 / 6)
 
 
-class Parts(NamedTuple):
+class SystemParts(NamedTuple):
     """The parts of a system that fields depend on."""
 
     species: list[Molecule]
@@ -36,7 +36,7 @@ class Parts(NamedTuple):
     number: np.ndarray  # (n,) numbers by which a scene may select molecules
 
 
-def field_terms(scene: MolecularScene, parts: Parts) -> dict[str, NamedTuple]:
+def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTuple]:
     """The terms of a scene's fields, by name. Raises SceneError with every fault."""
     faults: list[str] = []
     terms: dict[str, NamedTuple] = {}
@@ -66,7 +66,7 @@ def field_terms(scene: MolecularScene, parts: Parts) -> dict[str, NamedTuple]:
     return terms
 
 
-def _electric_field(scene: MolecularScene, parts: Parts, moves: np.ndarray, faults: list[str]) -> NamedTuple:
+def _electric_field(scene: MolecularScene, parts: SystemParts, moves: np.ndarray, faults: list[str]) -> NamedTuple:
     fields, species = scene.fields, parts.species
     charge = np.where(moves, [m.charge for m in species], 0.0)
     dipole = np.where(moves[:, None], [m.charges @ m.positions_body for m in species], 0.0)
@@ -80,7 +80,7 @@ def _electric_field(scene: MolecularScene, parts: Parts, moves: np.ndarray, faul
     return OscillatingField(*steady, 2 * pi * fields.electric_frequency_per_ps, radians(fields.electric_phase_deg))
 
 
-def _walls(walls: Walls, k: int, parts: Parts, moves: np.ndarray, faults: list[str]) -> NamedTuple:
+def _walls(walls: Walls, k: int, parts: SystemParts, moves: np.ndarray, faults: list[str]) -> NamedTuple:
     chosen = _acted_on(walls, parts.species, moves)
     faults += [
         f"fields.walls.{k}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls; "
@@ -91,8 +91,8 @@ def _walls(walls: Walls, k: int, parts: Parts, moves: np.ndarray, faults: list[s
     sites = sites_of(parts.model.species, chosen, parts.model.inverse_inertia)
     where = (walls.direction, *walls.positions_A)
     if walls.kind == "harmonic":
-        return HarmonicWalls(*where, settled(walls.stiffness_kJ_mol_A2) * KJ_PER_MOL, sites)
-    sigma, epsilon = settled(walls.sigma_A), settled(walls.epsilon_kJ_mol) * KJ_PER_MOL
+        return HarmonicWalls(*where, not_none(walls.stiffness_kJ_mol_A2) * KJ_PER_MOL, sites)
+    sigma, epsilon = not_none(walls.sigma_A), not_none(walls.epsilon_kJ_mol) * KJ_PER_MOL
     return LennardJonesWalls(*where, sigma, epsilon, walls.cutoff_A or inf, sites)
 
 
@@ -102,7 +102,7 @@ def _acted_on(walls: Walls, species: list[Molecule], moves: np.ndarray) -> list[
     return [own if free else own[:0] for own, free in zip(offsets, moves, strict=True)]
 
 
-def _gap_faults(scene: MolecularScene, parts: Parts, moves: np.ndarray) -> list[str]:
+def _gap_faults(scene: MolecularScene, parts: SystemParts, moves: np.ndarray) -> list[str]:
     """Faults: walls that do not fit into a periodic box, or do not keep molecules apart from their images."""
     fields, space = scene.fields, parts.space
     if not fields.walls or isinstance(space, Unbounded):
@@ -138,7 +138,7 @@ def _protrusion(walls: Walls, species: list[Molecule], moves: np.ndarray) -> flo
     return found
 
 
-def _restraints(scene: MolecularScene, k: int, parts: Parts, faults: list[str]) -> Restraints | None:
+def _restraints(scene: MolecularScene, k: int, parts: SystemParts, faults: list[str]) -> Restraints | None:
     entry, index, number = scene.fields.restraints[k], parts.model.species, parts.number
     names = list(dict.fromkeys(m.name for m in parts.species))
     where = f"fields.restraints.{k}"
@@ -185,7 +185,7 @@ def start_lattice(
         own = [walls for walls in scene.fields.walls if walls.direction == axis]
         if not own:
             continue
-        ends = [_free(walls, species) for walls in own]
+        ends = [_range_of_centres(walls, species) for walls in own]
         low[axis], high[axis] = max(end[0] for end in ends), min(end[1] for end in ends)
         if low[axis] == -inf:
             low[axis] = high[axis] - edges[axis]
@@ -207,7 +207,7 @@ def lattice(n: int, edges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
 
 
-def _free(walls: Walls, species: list[Molecule]) -> tuple[float, float]:
+def _range_of_centres(walls: Walls, species: list[Molecule]) -> tuple[float, float]:
     """Range of positions of centres of mass that is free for every orientation, Å."""
     reach = max(
         np.linalg.norm(own, axis=1).max(initial=0.0) for own in _acted_on(walls, species, np.ones(len(species), bool))
@@ -216,7 +216,7 @@ def _free(walls: Walls, species: list[Molecule]) -> tuple[float, float]:
     return walls.positions_A[0] + margin, walls.positions_A[1] - margin
 
 
-def between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:
+def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:
     """Positions (n, 3) moved by whole edges to between the walls; unchanged without walls or box."""
     if not isinstance(space, Orthorhombic):
         return position
@@ -227,18 +227,18 @@ def between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> 
     return moved
 
 
-def fields_in_words(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict[str, str]:
+def describe_fields(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict[str, str]:
     """Description of each term of the fields, by its name."""
     fields, words = scene.fields, {}
     if "electric_field" in terms:
-        words["electric_field"] = f"{_vector(settled(fields.electric_V_per_nm))} V/nm"
+        words["electric_field"] = f"{_vector(not_none(fields.electric_V_per_nm))} V/nm"
         if fields.electric_frequency_per_ps is not None:
             words["electric_field"] += (
                 f" cos(2 pi f t + {fields.electric_phase_deg:g}°), f = {fields.electric_frequency_per_ps:g}/ps; its "
                 "work is booked"
             )
     if "gravity" in terms:
-        words["gravity"] = f"{_vector(settled(fields.gravity_m_s2))} m/s²"
+        words["gravity"] = f"{_vector(not_none(fields.gravity_m_s2))} m/s²"
     for k, walls in enumerate(fields.walls):
         lower, upper = walls.positions_A
         kind = (

@@ -12,7 +12,7 @@ from rigidmd.errors import RigidMDWarning, SceneError
 from rigidmd.io.cells import cell_fault
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.molecules import HELD, Settings
+from rigidmd.scene.molecules import STRUCTURE_NAME, Settings
 from rigidmd.scene.species import SPECIES_FILES
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def scene_from_atoms(
         raise SceneError(SOURCE, faults)
     has_momenta = atoms.has("momenta")
     draws = start.get("temperature_K") is not None
-    structure["file"] = HELD
+    structure["file"] = STRUCTURE_NAME
     structure.setdefault("velocities", has_momenta and not draws)
     if not atoms.pbc.any():
         box.setdefault("periodic", False)
@@ -58,7 +58,7 @@ def scene_from_atoms(
     data["molecules"] = _entries(models)
     data.setdefault("name", atoms.get_chemical_formula()[:40])
     _warn_of_constraints(atoms)
-    found = MolecularScene.from_dict(data, source=SOURCE, held={"structure.file": text_of(atoms).encode()})
+    found = MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
     return cast(MolecularScene, found)
 
 

@@ -26,7 +26,7 @@ MOST_NEAREST, NEAREST = 5, 3
 MOST_LISTED = 6  # atoms of a molecule that a message lists
 
 
-class Fit(NamedTuple):
+class TemplateFit(NamedTuple):
     """Rigid templates fitted to m molecules of s massive sites."""
 
     centre: np.ndarray  # (m, 3) Å
@@ -35,7 +35,7 @@ class Fit(NamedTuple):
     square: np.ndarray  # (m,) mean square of these distances, Å²
 
 
-class Matched(NamedTuple):
+class MatchedMolecules(NamedTuple):
     """The molecules of a file, in the order of the file."""
 
     species: np.ndarray  # (n,)
@@ -49,25 +49,25 @@ class Matched(NamedTuple):
     number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
 
 
-def massive(molecule: Molecule) -> np.ndarray:
+def massive_sites(molecule: Molecule) -> np.ndarray:
     """The sites of a molecule that have mass, and so are atoms."""
     return np.flatnonzero(molecule.masses > 0)
 
 
-def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float) -> Matched | list[str]:
+def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float) -> MatchedMolecules | list[str]:
     """The molecules that the atoms form, or every reason why they form none.
 
     cell: lattice (3, 3) across whose faces molecules may be split, or None. tolerance: see Scene.structure.
     """
     kinds = _kinds(atoms, species)
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
-    by_residue = _attempt(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
-    if isinstance(by_residue, Matched):
+    by_residue = _match_groups(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
+    if isinstance(by_residue, MatchedMolecules):
         numbers = [atoms.residue[run[0]][0] for run in runs]
         return by_residue if None in numbers else by_residue._replace(number=np.array(numbers))
     runs_by_bonds = _bonded(atoms, kinds, species, cell)
-    by_bonds = _attempt(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
-    if isinstance(by_bonds, Matched):
+    by_bonds = _match_groups(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
+    if isinstance(by_bonds, MatchedMolecules):
         if by_residue:
             by_bonds.notes.append("its residues are no molecules of the scene; they were told by bonding distance")
         return by_bonds
@@ -82,13 +82,13 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
     return by_bonds
 
 
-def again(position: np.ndarray, matched: Matched, species: list[Molecule], cell: np.ndarray | None) -> Matched:
+def refit(position: np.ndarray, matched: MatchedMolecules, species: list[Molecule], cell: np.ndarray | None) -> MatchedMolecules:
     """The same molecules where their atoms are now, position (a, 3), whatever their deviation."""
     centre, rotation = np.zeros_like(matched.centre), np.zeros_like(matched.rotation)
     deviation, square = np.zeros_like(matched.deviation), np.zeros_like(matched.square)
     for k in np.unique(matched.species):
         own = np.flatnonzero(matched.species == k)
-        points = _whole(position[np.array([matched.atoms[m] for m in own])], cell)
+        points = _make_whole(position[np.array([matched.atoms[m] for m in own])], cell)
         centre[own], rotation[own], deviation[own], square[own] = _fit(points, species[k])
     return matched._replace(centre=centre, rotation=rotation, deviation=deviation, square=square)
 
@@ -176,7 +176,7 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
     numbers = {kind: k for k, kind in enumerate({*kinds}.union(*map(_labels, species)))}
     reach = np.zeros((len(numbers), len(numbers)))
     for molecule in species:
-        sites = massive(molecule)
+        sites = massive_sites(molecule)
         points = molecule.positions_body[sites]
         number = [numbers[_labels(molecule)[s]] for s in sites]
         tree = minimum_spanning_tree(cdist(points, points)).tocoo()
@@ -202,9 +202,9 @@ class _Candidate(NamedTuple):
     nameless: bool
 
 
-def _attempt(
+def _match_groups(
     atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
-) -> Matched | list[str]:
+) -> MatchedMolecules | list[str]:
     """Each run of atoms as one molecule. Runs of one composition are fitted together. how: words for messages."""
     alike = {}
     for number, run in enumerate(runs):
@@ -212,7 +212,7 @@ def _attempt(
         key = (residue[1] if residue else "", tuple(atoms.names[i] for i in run), tuple(kinds[i] for i in run))
         alike.setdefault(key, []).append(number)
     n = len(runs)
-    found = Matched(
+    found = MatchedMolecules(
         species=np.full(n, -1),
         atoms=[np.zeros(0, int)] * n,
         centre=np.zeros((n, 3)),
@@ -232,19 +232,19 @@ def _attempt(
             wanted = " or ".join(f"{species[k].name} ({_composition(species[k])})" for k in eligible)
             faults |= {m: f"has atoms {has}, expected {wanted}" for m in members}
             continue
-        _place(atoms, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
+        _fit_group(atoms, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
         if any(c.nameless for c in candidates) and not faults:
             listed = ", ".join(name or "(no name)" for name in names)
             by_shape = species[found.species[members[0]]].name
             found.notes.append(f"atoms called {listed} tell no element: {by_shape} by shape")
     if faults:
-        return [f"{_address(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
+        return [f"{_describe_group(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
     others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
     found.massless.update(atoms.names[i] for i in others)
     return found
 
 
-def _address(atoms: Atoms, run: list[int], number: int, how: str) -> str:
+def _describe_group(atoms: Atoms, run: list[int], number: int, how: str) -> str:
     listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
     if run == list(range(run[0], run[-1] + 1)):
         listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
@@ -257,7 +257,7 @@ def _formula(elements) -> str:
 
 
 def _composition(molecule: Molecule) -> str:
-    return _formula(_labels(molecule)[i] for i in massive(molecule))
+    return _formula(_labels(molecule)[i] for i in massive_sites(molecule))
 
 
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
@@ -266,7 +266,7 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     Atoms are first assigned by the names that occur as often among the atoms as among the sites, and by element among
     the rest. Names that occur several times leave the order of their atoms to the geometry.
     """
-    sites = massive(molecule)
+    sites = massive_sites(molecule)
     labels = _labels(molecule)
     wanted = [(molecule.site_names[s], labels[s]) for s in sites]
     if names == molecule.site_names and all(kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites):
@@ -300,7 +300,7 @@ def _same(keys: Iterable[Hashable]) -> np.ndarray:
     return number[:, None] == number
 
 
-def _place(atoms, runs, members, candidates, species, cell, tolerance, found: Matched, faults: dict) -> None:
+def _fit_group(atoms, runs, members, candidates, species, cell, tolerance, found: MatchedMolecules, faults: dict) -> None:
     """Fit runs of one composition to their candidates; write into `found` or `faults`."""
     fits = []
     for c in candidates:
@@ -321,9 +321,9 @@ def _place(atoms, runs, members, candidates, species, cell, tolerance, found: Ma
         else:
             off = [fit.deviation[row] for _, fit in fits]
             if len(faults) < MOST_NEAREST:  # of the best order
-                points = [_whole(atoms.position[order[row]][None], cell)[0] for order, _ in fits]
+                points = [_make_whole(atoms.position[order[row]][None], cell)[0] for order, _ in fits]
                 tried = zip(points, candidates, limits, off, strict=True)
-                off = [_nearest(p, species[c.species], c.allowed[-1], limit, there) for p, c, limit, there in tried]
+                off = [_least_deviation(p, species[c.species], c.allowed[-1], limit, there) for p, c, limit, there in tried]
             k = int(np.argmin(np.array(off) / limits))
             faults[m] = (
                 f"is no {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, more "
@@ -333,26 +333,26 @@ def _place(atoms, runs, members, candidates, species, cell, tolerance, found: Ma
 
 def _fit_in_any_order(
     position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: list[np.ndarray], tolerance: float
-) -> Fit:
+) -> TemplateFit:
     """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits.
 
     allowed: see _Candidate; each is tried where those before it give no fit
     """
     limit = tolerance * molecule.radius
-    points = _whole(position[order], cell)
+    points = _make_whole(position[order], cell)
     fit = _fit(points, molecule)
     for way in allowed:
         bad = np.flatnonzero(fit.deviation > limit)
         if len(bad) and way.sum() > len(way):
-            bad = bad[_may_fit(points[bad], molecule, way, limit)]
+            bad = bad[_distances_agree(points[bad], molecule, way, limit)]
             while len(bad):
-                better = _search(points[bad[0]], molecule, way, limit)
+                better = _search_order(points[bad[0]], molecule, way, limit)
                 if better is None:
                     bad = bad[1:]
                     continue
-                again = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
-                mended = again.deviation <= limit
-                for old, new in zip(fit, again, strict=True):
+                refit = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
+                mended = refit.deviation <= limit
+                for old, new in zip(fit, refit, strict=True):
                     old[bad[mended]] = new[mended]
                 order[bad[mended]] = order[bad[mended]][:, better]
                 mended[0] = True  # even if rounding puts it just above the limit
@@ -360,19 +360,19 @@ def _fit_in_any_order(
     return fit
 
 
-def _nearest(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float) -> float:
+def _least_deviation(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float) -> float:
     """The deviation of the atoms (s, 3) of a molecule in the best order that is found, for messages."""
-    order = _search(points, molecule, allowed, NEAREST * limit, MOST_TRIES // 10)
+    order = _search_order(points, molecule, allowed, NEAREST * limit, MOST_TRIES // 10)
     return deviation if order is None else min(deviation, float(_fit(points[None, order], molecule).deviation[0]))
 
 
-def _may_fit(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:
+def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:
     """Which molecules (m, s, 3) have the distances of the template, without regard to which atoms they are between.
 
     In a molecule that fits, every distance is that of the template to twice the limit; so are then those between two
     kinds of atoms in order of their length.
     """
-    template = molecule.positions_body[massive(molecule)]
+    template = molecule.positions_body[massive_sites(molecule)]
     i, j = np.triu_indices(len(template), 1)
     kind = allowed.argmax(axis=1)
     pair = np.minimum(kind[i], kind[j]) * len(kind) + np.maximum(kind[i], kind[j])
@@ -386,7 +386,7 @@ def _may_fit(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit:
     return np.concatenate([(np.abs(sorted_distances(b) - wanted) <= 2 * limit).all(axis=1) for b in blocks])
 
 
-def _whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
+def _make_whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
     """Molecules (m, s, 3) with every atom at its image nearest to the first atom."""
     if cell is None or points.shape[1] == 1:
         return points
@@ -396,18 +396,18 @@ def _whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
     return points[:, :1] + step.reshape(points.shape)
 
 
-def _fit(points: np.ndarray, molecule: Molecule) -> Fit:
+def _fit(points: np.ndarray, molecule: Molecule) -> TemplateFit:
     """Best rigid fit of a template to whole molecules (m, s, 3), with coinciding centres of mass."""
-    sites = massive(molecule)
+    sites = massive_sites(molecule)
     masses, template = molecule.masses[sites], molecule.positions_body[sites]
     centre = points[:, 0] + np.einsum("s,nsk->nk", masses, points - points[:, :1]) / masses.sum()
     relative = points - centre[:, None]
     rotation = align(template, relative, masses)
     off = np.linalg.norm(relative - np.einsum("nij,sj->nsi", rotation, template), axis=2)
-    return Fit(centre, rotation, off.max(axis=1), (off**2).mean(axis=1))
+    return TemplateFit(centre, rotation, off.max(axis=1), (off**2).mean(axis=1))
 
 
-def _search(
+def _search_order(
     points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, most: int = MOST_TRIES
 ) -> list[int] | None:
     """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
@@ -415,7 +415,7 @@ def _search(
     A depth-first search assigns atoms to sites one by one so that all distances agree: first closely, then up to twice
     the limit, beyond which no fit within the limit exists.
     """
-    template = molecule.positions_body[massive(molecule)]
+    template = molecule.positions_body[massive_sites(molecule)]
     wanted = np.linalg.norm(template[:, None] - template, axis=2)
     there = np.linalg.norm(points[:, None] - points, axis=2)
     tries = 0

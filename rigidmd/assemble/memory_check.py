@@ -10,64 +10,64 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.memory import free_memory, in_words, memory_fault
+from rigidmd.core.memory import free_memory, format_gigabytes, memory_shortage
 from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 from rigidmd.units import FEMTOSECOND
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
 
 #: Bytes that a system takes while it is built; measured: 310 of argon, 500 of nitrogen, 640 of SPC/E, 690 of TIP4P.
-FOR_MOLECULE, FOR_SITE = 200, 130
+BYTES_PER_MOLECULE, BYTES_PER_SITE = 200, 130
 #: Of a site where a trajectory is written, by MDAnalysis for the most part; measured: 430 of SPC/E.
-FOR_TRAJECTORY = 430
+BYTES_PER_TRAJECTORY_SITE = 430
 #: Of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85 kB.
-FOR_SAMPLE = 2700
+BYTES_PER_SAMPLE = 2700
 #: Of a line of log.csv, which the run keeps as numbers; measured: 300 while it runs, 870 when it is summarised. Of a
 #: frame in a file, whose time is kept.
-FOR_LINE, FOR_FRAME = 870, 150
-FEWER = "take fewer molecules, a smaller box or a shorter cut-off"
+BYTES_PER_LOG_LINE, BYTES_PER_FRAME = 870, 150
+ADVICE = "take fewer molecules, a smaller box or a shorter cut-off"
 
 
-def check_molecules(source: str, molecules: int, sites: int) -> None:
+def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
     """Raise SceneError if there is no room for so many molecules with so many sites in all."""
-    needed = FOR_MOLECULE * molecules + FOR_SITE * sites
-    if fault := memory_fault(needed, f"a system of {molecules} molecules with {sites} sites"):
+    needed = BYTES_PER_MOLECULE * molecules + BYTES_PER_SITE * sites
+    if fault := memory_shortage(needed, f"a system of {molecules} molecules with {sites} sites"):
         raise SceneError(source, [f"not enough memory: {fault}: take fewer molecules"])
 
 
-def check_samples(scene: BodyScene) -> None:
+def check_memory_of_samples(scene: BodyScene) -> None:
     """Raise SceneError if there is no room for the samples of a resolved scene of a body."""
-    run, interval = scene.run, settled(scene.output.interval_s)
-    samples = run.duration_s / (interval if run.is_open else max(interval, run.timestep_s))
-    if fault := memory_fault(FOR_SAMPLE * samples, f"a run with {samples:.3g} samples"):
+    run, interval = scene.run, not_none(scene.output.interval_s)
+    samples = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
+    if fault := memory_shortage(BYTES_PER_SAMPLE * samples, f"a run with {samples:.3g} samples"):
         raise SceneError(scene.source, [f"not enough memory: {fault}: lengthen output.interval_s"])
 
 
-def check_room(system: "System") -> None:
+def check_memory(system: "System") -> None:
     """Raise SceneError if there is no room for a run of a system: states, forces, lists, grids, sums."""
     try:
         needed = bytes_of(system)
     except MemoryError as error:  # NumPy's says which array the system refused
         shape, dtype = getattr(error, "shape", ()), getattr(error, "dtype", np.uint8)
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
-        fault = f"a single array of it needs {in_words(needed)}, and this machine has {in_words(free_memory())} free"
-        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {FEWER}"]) from None
-    kept, count = bytes_of_samples(system), count_of(system, system.scene.output.log_interval_ps)
-    if fault := memory_fault(kept, f"a run with {count:.3g} lines in its log"):
+        fault = f"a single array of it needs {format_gigabytes(needed)}, and this machine has {format_gigabytes(free_memory())} free"
+        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {ADVICE}"]) from None
+    kept, count = bytes_of_samples(system), observation_count(system, system.scene.output.log_interval_ps)
+    if fault := memory_shortage(kept, f"a run with {count:.3g} lines in its log"):
         longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
         raise SceneError(system.scene.source, [f"not enough memory: {fault}: {longer}"])
-    if fault := memory_fault(needed, "the run"):
-        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {FEWER}"])
+    if fault := memory_shortage(needed, "the run"):
+        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {ADVICE}"])
 
 
-def count_of(system: "System", interval: float) -> float:
+def observation_count(system: "System", interval: float) -> float:
     """How often a run is observed at an interval (ps) and at the ends of its stages."""
     return sum(
-        2 + stage.duration / (interval if stage.is_open else max(interval, stage.timestep_fs * FEMTOSECOND))
+        2 + stage.duration / (interval if stage.is_auto else max(interval, stage.timestep_fs * FEMTOSECOND))
         for stage in system.scene.stages
     )
 
@@ -75,16 +75,16 @@ def count_of(system: "System", interval: float) -> float:
 def bytes_of_samples(system: "System") -> float:
     """Bytes that the lines of the log and the times of frames take by the end of a run."""
     output = system.scene.output
-    frames = count_of(system, output.trajectory_interval_ps) if output.trajectory else 0
-    return FOR_LINE * count_of(system, output.log_interval_ps) + FOR_FRAME * frames
+    frames = observation_count(system, output.trajectory_interval_ps) if output.trajectory else 0
+    return BYTES_PER_LOG_LINE * observation_count(system, output.log_interval_ps) + BYTES_PER_FRAME * frames
 
 
 def bytes_of(system: "System") -> int:
     """Bytes of the arrays of a run. There are three states, the start, the one that moves and the last good one, and
     two loads, of steps and of looks; and there are the samples."""
     state = system.state
-    written = FOR_TRAJECTORY * system.site_count if system.scene.output.trajectory else 0
-    fixed = (system.engine().room(state), system.model)
+    written = BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0
+    fixed = (system.engine().new_workspaces(state), system.model)
     return (
         3 * array_bytes(state)
         + 2 * array_bytes(no_load(state))

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.species import sites_of_geometry
-from rigidmd.core.files import file_fault
+from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import MoleculeError, StructureError
 from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene.models import Molecule, MoleculeFile, Site, find_site, molecule, read_table
-from rigidmd.scene.validation import ValidationError, faults_of
+from rigidmd.scene.validation import ValidationError, validation_messages
 
 #: Factor on the sum of covalent radii up to which two atoms are bonded.
 SLACK = 1.25
@@ -21,7 +21,7 @@ SLACK = 1.25
 NEARLY, EXACTLY = 0.05, 1e-9
 
 
-class OwnModel(NamedTuple):
+class GeometryModel(NamedTuple):
     """A model as its file would tell it, the molecule that it is, and what to know about it."""
 
     file: MoleculeFile
@@ -29,7 +29,7 @@ class OwnModel(NamedTuple):
     notes: list[str]
 
 
-def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnModel:
+def model_from_geometry(geometry: Path, parameters: Path | None, name: str | None) -> GeometryModel:
     """The model of a structure file with one molecule, its positions as they are there.
 
     parameters : a table of parameters by atom name or element; without one there are masses and no interactions
@@ -37,7 +37,7 @@ def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnM
     """
     name = geometry.stem if name is None else name
     notes, told = [], [f"geometry of {geometry.name}"]
-    if fault := file_fault(geometry):
+    if fault := unreadable_reason(geometry):
         raise StructureError(str(geometry), [fault])
     if parameters is None:
         names, elements, *_ = read_geometry(geometry)
@@ -59,7 +59,7 @@ def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnM
     try:
         file = MoleculeFile.model_validate(data)
     except ValidationError as error:
-        raise MoleculeError(str(geometry), faults_of(error, MoleculeFile)) from None
+        raise MoleculeError(str(geometry), validation_messages(error, MoleculeFile)) from None
     found = molecule(file.name, file.sites, file.title, file.source, file.residue_names)
     notes += _one_molecule(geometry, atoms, elements)
     whole = round(found.charge)
@@ -67,7 +67,7 @@ def own_model(geometry: Path, parameters: Path | None, name: str | None) -> OwnM
     if off > EXACTLY:
         nearly = f"nearly but not exactly {f'{whole:+d}' if whole else 0}" if off < NEARLY else "not a whole number"
         notes.append(f"the charges sum to {found.charge:+.6g} e, {nearly}")
-    return OwnModel(file, found, notes)
+    return GeometryModel(file, found, notes)
 
 
 def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:

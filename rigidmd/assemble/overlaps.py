@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.core.state import State
 from rigidmd.dynamics.momenta import mobile
 from rigidmd.io.cells import pairs_within
-from rigidmd.scene.models import Molecule, of_each
+from rigidmd.scene.models import Molecule, gather_per_molecule
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
@@ -28,7 +28,7 @@ def overlaps(system: "System") -> list[str]:
     widest = max((sigma.max() for sigma in cores), default=0.0)
     wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     near = close_pairs(system, system.state, *wanted)
-    sigma = of_each(cores, system.model.species) if near else np.zeros(0)
+    sigma = gather_per_molecule(cores, system.model.species) if near else np.zeros(0)
     faults = []
     for i, j, distance in near:
         both = sigma[i] > 0 and sigma[j] > 0
@@ -74,8 +74,8 @@ def _close_among(
     """The pairs of `close_pairs` among some molecules, of the sites chosen[k] (indices) of species k."""
     kinds, counts = system.model.species[molecules], system.own_sites
     owner = np.repeat(molecules, np.array([len(own) for own in chosen])[kinds])
-    site = (np.cumsum(counts) - counts)[owner] + of_each(chosen, kinds)
-    offset = of_each([m.positions_body[own] for m, own in zip(system.species, chosen, strict=True)], kinds)
+    site = (np.cumsum(counts) - counts)[owner] + gather_per_molecule(chosen, kinds)
+    offset = gather_per_molecule([m.positions_body[own] for m, own in zip(system.species, chosen, strict=True)], kinds)
     i, j, distance = pairs_within(system.positions_of(state, owner, offset), _cell(state), radius)
     a, b, free = owner[i], owner[j], mobile(system.model)
     kept = (a != b) & (free[a] | free[b])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.errors import Faults, SceneError, StructureError
+from rigidmd.errors import InputError, SceneError, StructureError
 from rigidmd.io.structure_file import read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (
@@ -19,7 +19,7 @@ from rigidmd.scene.models import (
     with_parameters,
 )
 from rigidmd.scene.species import Molecules
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 
 def species_of(scene: MolecularScene) -> list[Molecule]:
@@ -28,7 +28,7 @@ def species_of(scene: MolecularScene) -> list[Molecule]:
     for k, entry in enumerate(scene.molecules):
         try:
             found.append(_one_species(scene, entry))
-        except Faults as error:
+        except InputError as error:
             faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.faults]
     names = [m.name for m in found]
     faults += [
@@ -47,7 +47,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     else:
         table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters))
         if entry.file is None:
-            sites = with_parameters(settled(entry.sites), table)
+            sites = with_parameters(not_none(entry.sites), table)
         else:
             sites = _sites_from_file(scene, entry, table)
         found = molecule(entry.label, sites)
@@ -59,7 +59,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
 
 def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
     where = "sites or of parameters" if entry.parameters is not None else "sites"
-    return sites_of_geometry(scene.path(settled(entry.file)), entry.sites or (), table, where)
+    return sites_of_geometry(scene.path(not_none(entry.file)), entry.sites or (), table, where)
 
 
 def sites_of_geometry(path: Path, own: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
@@ -87,7 +87,7 @@ def sites_of_geometry(path: Path, own: tuple[Site, ...], table: tuple[Site, ...]
     return with_parameters(tuple(sites), table)
 
 
-def frozen_apart(
+def split_frozen(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
 ) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
     """Species, index (n,) into them, which of them are frozen, and faults. A partly frozen species becomes two."""

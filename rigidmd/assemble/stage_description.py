@@ -6,7 +6,7 @@ from rigidmd.units import FEMTOSECOND
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
 STIFFEST, SOFTEST = 2e-7, 100.0
 #: Of each ensemble, the distribution that it samples and what it conserves.
-LAWS = {
+DISTRIBUTIONS = {
     "nve": ("the microcanonical distribution", "energy"),
     "nph": ("the isoenthalpic distribution", "enthalpy with the energy of the piston"),
     "nvt": ("the canonical distribution, exp(-H/kT)", "energy less heat"),
@@ -17,14 +17,14 @@ LAWS = {
 }
 
 
-def stage_in_words(stage: Stage) -> list[str]:
+def describe_stage(stage: Stage) -> list[str]:
     """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved. For a minimisation: what is
     minimised, and the limits of convergence."""
     if stage.is_minimisation:
         return _minimisation(stage)
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
     text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
-    if stage.is_open:
+    if stage.is_auto:
         asked = f"{stage.trajectory_error or 0:g} of Q or X"
         if stage.energy_error_kT:
             asked = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
@@ -87,7 +87,7 @@ def _ramp(ends: tuple[float, float]) -> str:
 
 def _sampled(stage: Stage) -> str:
     """The distribution, up to the error of the step."""
-    law = LAWS[stage.ensemble][0]
+    law = DISTRIBUTIONS[stage.ensemble][0]
     if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
         law += ", with the invariant measure of the shape"
     first, last = stage.pressures if stage.has_barostat else (0, 0)
@@ -98,7 +98,7 @@ def _sampled(stage: Stage) -> str:
 
 def _conserved(stage: Stage) -> str:
     """The conserved quantities, up to the error of the step."""
-    kept = LAWS[stage.ensemble][1]
+    kept = DISTRIBUTIONS[stage.ensemble][1]
     return f"{kept}, total momentum" if stage.keeps_momentum else f"{kept}, not the total momentum"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from rigidmd.core.integrators import Scheme
 from rigidmd.dynamics.barostats import COUPLINGS, CellRescaling, Pressure, VolumeMoves, piston
 from rigidmd.dynamics.momenta import mobile
-from rigidmd.dynamics.noise import BATH, BOX, key_of
+from rigidmd.dynamics.noise import THERMOSTAT, BAROSTAT, key_of
 from rigidmd.dynamics.ramps import Ramp, steady
 from rigidmd.dynamics.thermostats import Andersen, Langevin, NoseHoover, VelocityRescaling
 from rigidmd.engines.system import System
@@ -19,7 +19,7 @@ from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
 WIDTH = 2.0
 
 
-def row(system: System, k: int) -> Scheme:
+def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
     scene, stage = system.scene, system.scene.stages[k]
     found = stage.scheme
@@ -27,24 +27,24 @@ def row(system: System, k: int) -> Scheme:
         bath = own.for_stage(system, k) if hasattr(own, "for_stage") else own
         found = found.with_bath(bath, halved=getattr(bath, "halved", True))
     elif stage.has_thermostat:
-        found = found.with_bath(bath_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
+        found = found.with_bath(thermostat_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
     elif not stage.has_barostat and any(other.thermostat_kind == "velocity_rescaling" for other in scene.stages):
         # a stage without a thermostat among others with one has one that rests: all then run the same machine code
-        idle = VelocityRescaling(steady(0.0), inf, system.freedom.total, key_of(scene.seed, BATH, k))
+        idle = VelocityRescaling(steady(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
         found = found.with_bath(idle)
     if stage.ensemble == "npt":
-        found = found.with_box(box_of(system, k), stage.moves_every)
+        found = found.with_box(barostat_of(system, k), stage.moves_every)
     elif stage.ensemble == "nph":
-        found = found.with_piston(box_of(system, k))
+        found = found.with_piston(barostat_of(system, k))
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         found = found.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
     return found
 
 
-def bath_of(system: System, k: int) -> NamedTuple:
+def thermostat_of(system: System, k: int) -> NamedTuple:
     """The thermostat of stage k."""
     stage, freedom = system.scene.stages[k], system.freedom_in(k)
-    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, k)
+    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)
     match stage.thermostat_kind:
         case "langevin":
             return Langevin(thermal, *stage.frictions, key)
@@ -56,9 +56,9 @@ def bath_of(system: System, k: int) -> NamedTuple:
     return VelocityRescaling(thermal, stage.thermostat_time, freedom.total, key)
 
 
-def box_of(system: System, k: int) -> NamedTuple:
+def barostat_of(system: System, k: int) -> NamedTuple:
     """The barostat of stage k."""
-    stage, key = system.scene.stages[k], key_of(system.scene.seed, BOX, k)
+    stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
     first, last = stage.pressures
     pressure = Pressure(_scaled(first, BAR), _scaled(last, BAR), float(stage.steps))

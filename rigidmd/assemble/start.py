@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.assemble.fields import start_lattice
-from rigidmd.assemble.memory_check import check_molecules
-from rigidmd.assemble.structure import Arrangement, leaning_less, read_structure
+from rigidmd.assemble.memory_check import check_memory_of_molecules
+from rigidmd.assemble.structure import Configuration, with_reduced_cell, read_structure
 from rigidmd.core.state import State
 from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
@@ -16,14 +16,14 @@ from rigidmd.io.cells import cell_fault
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 from rigidmd.units import GRAM_PER_CM3
 
 
-def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
+def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Configuration:
     """Positions and orientations from the structure file, or else on a lattice. Raises SceneError, StructureError."""
     if scene.structure is not None:
-        start, held = scene.structure, scene.held.get("structure.file")
+        start, held = scene.structure, scene.embedded_files.get("structure.file")
         path = scene.path(start.file) if held is None else Path(start.file)
         if scene.box.cell is not None and (fault := cell_fault(scene.box.cell)):
             raise SceneError(scene.source, [f"box: {fault}"])
@@ -53,18 +53,18 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         if faults:
             raise StructureError(scene.structure_source, faults)
         return found
-    counts = [settled(entry.count) for entry in scene.molecules]
+    counts = [not_none(entry.count) for entry in scene.molecules]
     of_sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
-    check_molecules(scene.source, sum(counts), of_sites)
+    check_memory_of_molecules(scene.source, sum(counts), of_sites)
     mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
     cell = scene.box.cell
     if cell is None:
-        cell = np.eye(3) * np.cbrt(mass / (settled(scene.box.density_g_cm3) * GRAM_PER_CM3))
+        cell = np.eye(3) * np.cbrt(mass / (not_none(scene.box.density_g_cm3) * GRAM_PER_CM3))
     if fault := cell_fault(cell):
         raise SceneError(scene.source, [f"box: {fault}"])
     rng = np.random.default_rng([scene.seed, LATTICE])
     n = sum(counts)
-    found = Arrangement(
+    found = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
         position=start_lattice(scene, species, n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
@@ -74,10 +74,10 @@ def arrange(scene: MolecularScene, species: list[Molecule]) -> Arrangement:
         residual_rms=0.0,
         residual_max=0.0,
     )
-    return leaning_less(found, "its", may_turn=False)
+    return with_reduced_cell(found, "its", may_turn=False)
 
 
-def residue_numbers(arrangement: Arrangement) -> np.ndarray:
+def residue_numbers(arrangement: Configuration) -> np.ndarray:
     """Residue numbers (n,) of the file, or else 1, 2, ... within each species."""
     if arrangement.number is not None:
         return arrangement.number
@@ -88,16 +88,16 @@ def residue_numbers(arrangement: Arrangement) -> np.ndarray:
     return found
 
 
-def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: Arrangement) -> list[str]:
+def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: Configuration) -> list[str]:
     """Set the momenta of a state, in place: from the structure file, or drawn at a temperature. Returns notes."""
     if scene.structure is not None and scene.structure.velocities:
         state.velocity[:] = arrangement.velocity
-        state.angular_momentum_body[:] = settled(arrangement.angular_momentum_body)[: len(state.angular_momentum_body)]
+        state.angular_momentum_body[:] = not_none(arrangement.angular_momentum_body)[: len(state.angular_momentum_body)]
         held = ~mobile(model)
         state.velocity[held] = 0.0
         state.angular_momentum_body[held[: len(state.rotation)]] = 0.0
         removed = remove_momentum(model, state.velocity)
         return ["the total momentum of the file's velocities was taken out"] if removed else []
-    temperature = settled(scene.start.temperature_K)
+    temperature = not_none(scene.start.temperature_K)
     draw_momenta(model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))
     return []

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.matching import NO_MASS, Matched, massive, match
-from rigidmd.assemble.memory_check import check_molecules
+from rigidmd.assemble.matching import NO_MASS, MatchedMolecules, massive_sites, match
+from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.k_vectors import AS_GIVEN
@@ -20,13 +20,13 @@ from rigidmd.io.cells import (
     edges_in_words,
     reduced,
     right_angled,
-    roomiest,
+    least_skewed_cell,
     same_lattice,
     standard_rotation,
 )
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.validation import meant, settled
+from rigidmd.scene.validation import did_you_mean, not_none
 
 MOST_NAMED = 5  # molecules that a message names; of more it gives the number
 ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge
@@ -38,7 +38,7 @@ OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
 CLOSE = 1.2  # factor by which nearest distances may differ from the bonds of the templates
 
 
-class Arrangement(NamedTuple):
+class Configuration(NamedTuple):
     """Positions, orientations and momenta of molecules at the start."""
 
     species: np.ndarray  # (n,) index into the scene's molecules
@@ -65,7 +65,7 @@ def read_structure(
     atom_types: dict[str, str] | None = None,
     topology: Path | None = None,
     held: bytes | None = None,
-) -> Arrangement:
+) -> Configuration:
     """The molecules of a structure file. Raises StructureError.
 
     wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types,
@@ -94,19 +94,19 @@ def read_structure(
     if repeat != (1, 1, 1):
         count = prod(repeat) * np.bincount(found.species, minlength=len(species)).astype(object)
         of_sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
-        check_molecules(str(path), sum(count), of_sites)
+        check_memory_of_molecules(str(path), sum(count), of_sites)
         found = _repeated(found, repeat)
-    return leaning_less(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
+    return with_reduced_cell(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
 
 
-def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
+def with_reduced_cell(found: Configuration, whose: str, may_turn: bool) -> Configuration:
     """The same crystal or liquid in a cell with small tilts; rotated, if that allows a longer cut-off.
 
     whose : owner of the lattice, for the note
     """
     if found.cell is None:
         return found
-    cell, turn = roomiest(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
+    cell, turn = least_skewed_cell(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
     if np.array_equal(cell, found.cell):
         return found
     basis = basis_of(cell @ turn, found.cell)
@@ -126,9 +126,9 @@ def leaning_less(found: Arrangement, whose: str, may_turn: bool) -> Arrangement:
     )
 
 
-def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
+def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configuration:
     """The cell and its molecules, repeated along each edge."""
-    cell = settled(found.cell)
+    cell = not_none(found.cell)
     shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
 
     def tiled(values):
@@ -148,7 +148,7 @@ def _repeated(found: Arrangement, repeat: tuple[int, int, int]) -> Arrangement:
 
 def _read_molecules(
     path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology, held
-) -> Arrangement:
+) -> Configuration:
     _check_types(path, atom_types or {}, species)
     atoms = read_atoms(path, frame, atom_types, topology, held)
     notes = list(atoms.notes)
@@ -182,8 +182,8 @@ def _read_molecules(
         raise StructureError(str(path), ["holds no atoms with mass, so no molecules"])
     notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
-    sizes = np.array([len(massive(molecule)) for molecule in species])[matched.species]
-    return Arrangement(
+    sizes = np.array([len(massive_sites(molecule)) for molecule in species])[matched.species]
+    return Configuration(
         species=matched.species,
         position=matched.centre,
         rotation=matched.rotation,
@@ -202,7 +202,7 @@ def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
     faults = [
         f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
-        f"{', '.join(known)}{meant(name, known)}"
+        f"{', '.join(known)}{did_you_mean(name, known)}"
         for number, name in atom_types.items()
         if name not in (*known, "X")
     ]
@@ -214,7 +214,7 @@ def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     """Faults: atoms of the file whose mass is that of no site of the scene."""
     if atoms.masses is None:
         return []
-    masses = np.unique([mass for m in species for mass in m.masses[massive(m)]])
+    masses = np.unique([mass for m in species for mass in m.masses[massive_sites(m)]])
     strange = [
         f"{name} ({mass:g} u)"
         for name, mass in sorted(set(zip(atoms.names, atoms.masses.tolist(), strict=True)))
@@ -229,13 +229,13 @@ def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     ]
 
 
-def _other_masses(atoms: Atoms, matched: Matched, species: list[Molecule]) -> list[str]:
+def _other_masses(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
     """A note if masses of the file differ from those of the sites."""
     if atoms.masses is None:
         return []
     other = {}
     for k, molecule in enumerate(species):
-        for s, site in enumerate(massive(molecule)):
+        for s, site in enumerate(massive_sites(molecule)):
             own = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
             mass = float(molecule.masses[site])
             for i in own[np.abs(atoms.masses[own] - mass) > SAME_MASS * mass]:
@@ -252,9 +252,9 @@ def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
         raise StructureError(str(path), [f"has no box{told}: give [box] lengths_A, or periodic = false"])
 
 
-def _massless(matched: Matched, species: list[Molecule]) -> list[str]:
+def _massless(matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
     """Notes on massless sites, which are placed by the template whatever the file says."""
-    lacking = [len(molecule.masses) - len(massive(molecule)) for molecule in species]
+    lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
     expected = int(np.array(lacking)[matched.species].sum())
     there = sum(matched.massless.values())
     if there > expected:
@@ -265,7 +265,7 @@ def _massless(matched: Matched, species: list[Molecule]) -> list[str]:
     return []
 
 
-def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: list[str]):
+def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], notes: list[str]):
     """Velocities (n, 3) and body angular momenta (n, 3) with the momenta of the atoms, or None.
 
     About axes without inertia (linear bodies, points) the angular momentum is 0.
@@ -282,7 +282,7 @@ def _momenta(atoms: Atoms, matched: Matched, species: list[Molecule], notes: lis
         members = np.flatnonzero(matched.species == k)
         if len(members) == 0:
             continue
-        sites = massive(molecule)
+        sites = massive_sites(molecule)
         masses = molecule.masses[sites]
         v = atoms.velocity[np.array([matched.atoms[m] for m in members])]
         velocity[members] = np.einsum("s,nsk->nk", masses, v) / masses.sum()
@@ -298,7 +298,7 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
     from scipy.spatial import KDTree
     from scipy.spatial.distance import pdist
 
-    bonds = [pdist(m.positions_body[massive(m)]).min() for m in species if len(massive(m)) > 1]
+    bonds = [pdist(m.positions_body[massive_sites(m)]).min() for m in species if len(massive_sites(m)) > 1]
     if not bonds or len(atoms.position) < 2:
         return []
     nearest = float(np.median(KDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
@@ -311,8 +311,8 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _other_model(molecule: Molecule, marks: np.ndarray) -> str:
-    """What tells a molecule from the one of a saved state with these `Molecule.marks`; empty if nothing does."""
-    own = np.array(molecule.marks)
+    """What tells a molecule from the one of a saved state with these `Molecule.fingerprint`; empty if nothing does."""
+    own = np.array(molecule.fingerprint)
     names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
     size = np.array([own[0], *[max(own[1:4].max(), marks[1:4].max())] * 3, 1.0])
     differs = [
@@ -323,7 +323,7 @@ def _other_model(molecule: Molecule, marks: np.ndarray) -> str:
     return f"holds another {molecule.name} than the scene ({'; '.join(differs)})" if differs else ""
 
 
-def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
+def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     """The final state of an earlier run, bit for bit."""
     saved = read_state(path)
     known = [molecule.name for molecule in species]
@@ -341,7 +341,7 @@ def _read_state(path: Path, species: list[Molecule]) -> Arrangement:
         faults.append(f"holds no rotations, but {', '.join(turned)} can turn")
     if faults := [fault for fault in faults if fault]:
         raise StructureError(str(path), faults)
-    return Arrangement(
+    return Configuration(
         species=np.array([known.index(name) for name in saved.names])[saved.species],
         position=state.position,
         rotation=state.rotation if turning else np.tile(np.eye(3), (n, 1, 1)),

@@ -4,7 +4,7 @@ from math import inf
 
 import numpy as np
 
-from rigidmd.assemble.electrostatics import Charged, Interactions, electrostatics
+from rigidmd.assemble.electrostatics import ChargedSites, Interactions, electrostatics
 from rigidmd.core.state import State
 from rigidmd.dynamics.step_loop import Model
 from rigidmd.errors import SceneError
@@ -14,12 +14,12 @@ from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.potentials.lennard_jones import LennardJones, lennard_jones, tail
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.forces import ROUNDED, short_cutoff
-from rigidmd.scene.models import Molecule, named_sites, of_each
+from rigidmd.scene.forces import MINIMUM_TOLERANCE, short_cutoff_note
+from rigidmd.scene.models import Molecule, sites_named, gather_per_molecule
 from rigidmd.units import KJ_PER_MOL
 
 
-def _taking_part(species: list[Molecule], model: Model, chosen: list[np.ndarray]):
+def _sites_of(species: list[Molecule], model: Model, chosen: list[np.ndarray]):
     """Sites of a law: chosen[k] lists the sites of species k that have it."""
     offsets = [m.positions_body[c] for m, c in zip(species, chosen, strict=True)]
     return sites_of(model.species, offsets, model.inverse_inertia)
@@ -34,7 +34,7 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
     faults = []
     for n, entry in enumerate(scene.forces.pairs):
         for side, text in enumerate(entry.sites):
-            meant = named_sites(species, text)
+            meant = sites_named(species, text)
             for k, of in enumerate(meant):
                 found[k][n, side] = of
             if not any(of.any() for of in meant):
@@ -64,16 +64,16 @@ def interactions(
     chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
     if scene.forces.lennard_jones and any(len(c) for c in chosen):
         law = _lennard_jones(scene, species, index, named, chosen)
-        sites = _taking_part(species, model, chosen)
+        sites = _sites_of(species, model, chosen)
         found.terms["lennard_jones"] = pair_forces(law, sites, groups(sites, frozen))
         found = found._replace(
-            tail=tail(law) if scene.forces.tail_correction else None, notes=_short(law, species, index, chosen)
+            tail=tail(law) if scene.forces.tail_correction else None, notes=_short_cutoff_notes(law, species, index, chosen)
         )
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
         return found
-    sites = _taking_part(species, model, chosen)
-    charged = Charged(species, index, frozen, chosen, sites, groups(sites, frozen))
+    sites = _sites_of(species, model, chosen)
+    charged = ChargedSites(species, index, frozen, chosen, sites, groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(
         found.terms | added.terms,
@@ -100,7 +100,7 @@ def _lennard_jones(
     ]
     kinds = sorted({pair for of_species in pairs for pair in of_species})
     of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
-    kind = of_each(of_species, index)
+    kind = gather_per_molecule(of_species, index)
     sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
     special = {
         (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
@@ -117,17 +117,17 @@ def _lennard_jones(
     return law
 
 
-def _short(law: LennardJones, species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]) -> tuple[str, ...]:
+def _short_cutoff_notes(law: LennardJones, species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]) -> tuple[str, ...]:
     """A note if the cutoff is within the minimum of an energy, on the pair with the most distant one."""
     with np.errstate(divide="ignore", invalid="ignore"):
         minimum = np.nan_to_num((2 * law.c12 / law.c6) ** (1 / 6), posinf=0.0)
     i, j = np.unravel_index(minimum.argmax(), minimum.shape)
-    if not law.cutoff < (1 - ROUNDED) * minimum[i, j]:
+    if not law.cutoff < (1 - MINIMUM_TOLERANCE) * minimum[i, j]:
         return ()
     names = [np.array([f"{m.name}.{m.site_names[k]}" for k in c], object) for m, c in zip(species, chosen, strict=True)]
-    of_sites = of_each(names, index)
+    of_sites = gather_per_molecule(names, index)
     first, second = (of_sites[np.flatnonzero(law.kind == kind)[0]] for kind in (i, j))
-    return (short_cutoff(law.cutoff, f"{first} and {second}", float(minimum[i, j])),)
+    return (short_cutoff_note(law.cutoff, f"{first} and {second}", float(minimum[i, j])),)
 
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:

@@ -65,7 +65,7 @@ def _verify(options: argparse.Namespace) -> int:
     if options.engine == "openmm" and options.platform is None:
         options.platform = "Reference"
     scene = options.read_scene(options)
-    if options.engine is None and isinstance(scene, MolecularScene) and not scene.engine.is_other:
+    if options.engine is None and isinstance(scene, MolecularScene) and not scene.engine.is_external:
         options.engine = "lammps"
         scene = options.read_scene(options)
     found = verify(scene)

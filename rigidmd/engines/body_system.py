@@ -13,15 +13,15 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.engines.ode import OdeEngine
 from rigidmd.engines.system import Sites
 from rigidmd.errors import SimulationError
-from rigidmd.forces.body.frame import Inertial
+from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.neighbors.space import Unbounded
 from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.inertia import Kind, kind_of_body
-from rigidmd.mechanics.time_functions import Course, during, value_at
-from rigidmd.mechanics.translation import Immersed
+from rigidmd.mechanics.time_functions import TimeFunction, piece_at, values_at
+from rigidmd.mechanics.translation import FluidTranslation
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 Part = TypeVar("Part", bound=NamedTuple)
 
@@ -66,23 +66,23 @@ class BodySystem:
     def notes(self) -> list[str]:
         """A sentence for duration and interval of samples that are not whole numbers of steps."""
         run, found = self.scene.run, []
-        interval = settled(self.scene.output.interval_s)
+        interval = not_none(self.scene.output.interval_s)
         given = interval != run.duration_s / SAMPLES
         for key, wanted in (("run.duration_s", run.duration_s), ("output.interval_s", given and interval)):
             taken = wanted and max(1, round(wanted / run.timestep_s)) * run.timestep_s
-            if not run.is_open and wanted and abs(taken - wanted) > 1e-9 * wanted:
+            if not run.is_auto and wanted and abs(taken - wanted) > 1e-9 * wanted:
                 found.append(
                     f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: it is {taken:g} s"
                 )
         return found
 
     @property
-    def turns(self) -> bool:
+    def rotates(self) -> bool:
         """Whether it has an orientation."""
         return len(self.state.rotation) > 0
 
     @property
-    def flies(self) -> bool:
+    def translates(self) -> bool:
         """Whether it is not pinned."""
         return len(self.state.position) > 0
 
@@ -94,12 +94,12 @@ class BodySystem:
     @property
     def degrees_of_freedom(self) -> int:
         """Three of translation unless pinned, and those of rotation."""
-        return 3 * self.flies + int((self.inertia > 0).sum())
+        return 3 * self.translates + int((self.inertia > 0).sum())
 
     @property
     def method(self) -> Scheme | Solver:
         run = self.scene.run
-        if run.is_open:
+        if run.is_auto:
             return SCHEMES["velocity_verlet"]
         if run.integrator in SCHEMES:
             return SCHEMES[run.integrator].with_rotor(run.rotor)
@@ -107,7 +107,7 @@ class BodySystem:
         if run.integrator == RK4:
             return found
         return found._replace(
-            relative_tolerance=settled(run.relative_tolerance), absolute_tolerance=settled(run.absolute_tolerance)
+            relative_tolerance=not_none(run.relative_tolerance), absolute_tolerance=not_none(run.absolute_tolerance)
         )
 
     def engine(self) -> Engine:
@@ -118,11 +118,11 @@ class BodySystem:
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""
         parts = (*self.body, *self.terms.values())
-        times = {float(t) for part in parts for value in part if isinstance(value, Course) for t in value.times}
+        times = {float(t) for part in parts for value in part if isinstance(value, TimeFunction) for t in value.times}
         run = self.scene.run
         return sorted(t for t in times if 0 < t < run.steps * run.timestep_s)
 
-    def during(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
+    def piece_at(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
         """Body and terms as they are from a time to the next break."""
         flight, rotor, frame, resistance = self.body
         body = Body(_at(flight, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
@@ -137,7 +137,7 @@ class BodySystem:
                 raise SimulationError(
                     f"t = {time:g} s: an applied function gave {told!r}, must give force and torque of 3 numbers each"
                 ) from None
-            if not self.flies:  # the force acts at the centre of mass, the torque is about the pivot
+            if not self.translates:  # the force acts at the centre of mass, the torque is about the pivot
                 torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
             if not (np.isfinite(force).all() and np.isfinite(torque).all()):
                 raise SimulationError(f"t = {time:g} s: an applied function gave what is no finite number: {told!r}")
@@ -154,7 +154,7 @@ class BodySystem:
         """(position, velocity, rotation, angular_velocity_body) over times (t,) of states stacked along axis 0."""
         n = len(times)
         frame = self.frame_rates(times)
-        if self.turns:
+        if self.rotates:
             engine_rotation = states.rotation.reshape(n, 3, 3)
             rotation = engine_rotation @ self.axes.T
             inertia, carried = self.moments(times)
@@ -164,9 +164,9 @@ class BodySystem:
         else:
             engine_rotation = rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
             omega = np.zeros((n, 3))
-        if self.flies:
+        if self.translates:
             position, velocity = states.position.reshape(n, 3), states.velocity.reshape(n, 3)
-            if isinstance(self.body.flight, Immersed):
+            if isinstance(self.body.flight, FluidTranslation):
                 share = self.mass / self.body.flight.inertial_mass
                 velocity = np.einsum("tij,j,tkj,tk->ti", engine_rotation, share, engine_rotation, velocity)
             velocity = velocity - np.cross(frame, position)
@@ -177,15 +177,15 @@ class BodySystem:
 
     def frame_rates(self, times: np.ndarray) -> np.ndarray:
         """Angular velocity (t, 3) of the frame along its axes."""
-        if isinstance(self.body.frame, Inertial):
+        if isinstance(self.body.frame, InertialFrame):
             return np.zeros((len(times), 3))
-        return value_at(self.body.frame.angular_velocity, times)
+        return values_at(self.body.frame.angular_velocity, times)
 
     def moments(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Principal moments and the momentum of rotors (t, 3) each, principal axes."""
         rotor = self.body.rotor
         if isinstance(rotor, DrivenRotor):
-            return value_at(rotor.inertia, times), value_at(rotor.momentum, times)
+            return values_at(rotor.inertia, times), values_at(rotor.momentum, times)
         return np.broadcast_to(self.inertia, (len(times), 3)), np.zeros((len(times), 3))
 
     # The interface for trajectories: points as sites, Å for metres, ps for seconds.
@@ -193,7 +193,7 @@ class BodySystem:
     @property
     def scale(self) -> float:
         """Å in the trajectory for a metre."""
-        return settled(self.scene.output.trajectory_A_per_m)
+        return not_none(self.scene.output.trajectory_A_per_m)
 
     @property
     def sites(self) -> Sites:
@@ -209,17 +209,17 @@ class BodySystem:
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (k, 3) of the points, Å of the trajectory."""
         pose = self.pose(float(state.time[0]), state)
-        origin = pose.position if self.flies else np.zeros(3)
+        origin = pose.position if self.translates else np.zeros(3)
         return self.scale * (origin + self.points @ pose.rotation.T)
 
     def site_velocities(self, state: State) -> np.ndarray:
         """Velocities (k, 3) of the points, Å/ps of the trajectory."""
         pose = self.pose(float(state.time[0]), state)
-        origin = pose.velocity if self.flies else np.zeros(3)
+        origin = pose.velocity if self.translates else np.zeros(3)
         return self.scale * (origin + np.cross(pose.angular_velocity_body, self.points) @ pose.rotation.T)
 
 
 def _at(part: Part, time: float) -> Part:
     """A part of a body with each of its courses continued from a time."""
-    courses = {key: during(value, time) for key, value in part._asdict().items() if isinstance(value, Course)}
+    courses = {key: piece_at(value, time) for key, value in part._asdict().items() if isinstance(value, TimeFunction)}
     return part._replace(**courses)

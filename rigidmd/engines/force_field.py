@@ -1,7 +1,7 @@
 """A system as other engines see it: kinds of sites, parameters between kinds, laws in words and numbers.
 
 Everything is taken from the terms that rigidmd itself runs, so that mixing rules, special pairs and endings are decided
-once. `strange` names what no other engine can express.
+once. `unsupported_terms` names what no other engine can express.
 """
 
 from math import inf
@@ -14,7 +14,7 @@ from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.scene.models import of_each
+from rigidmd.scene.models import gather_per_molecule
 
 #: Terms that the portrait has a place for; all others are fields and forces of the user's own.
 KNOWN = (
@@ -33,7 +33,7 @@ class SiteKind(NamedTuple):
     charge: float  # e
 
 
-class Portrait(NamedTuple):
+class ForceFieldView(NamedTuple):
     """A system without anything of the engine that runs it. s sites, in the order of the system."""
 
     system: System
@@ -56,12 +56,12 @@ class Portrait(NamedTuple):
         return "none" if self.coulomb is None else self.system.scene.forces.electrostatics
 
     @property
-    def has_waves(self) -> bool:
+    def is_periodic_coulomb(self) -> bool:
         """Whether Coulomb forces act on all periodic images."""
         return isinstance(self.coulomb, ScreenedCoulomb)
 
     @property
-    def boxed(self) -> bool:
+    def is_periodic(self) -> bool:
         """Whether there is a periodic box."""
         return self.system.space.volume < inf
 
@@ -82,8 +82,8 @@ class Portrait(NamedTuple):
         return turning[self.system.model.species] & ~self.frozen
 
 
-def portrait(system: System) -> Portrait:
-    """The portrait of a system. Raises nothing; `strange` tells what it leaves out."""
+def force_field_of(system: System) -> ForceFieldView:
+    """The portrait of a system. Raises nothing; `unsupported_terms` tells what it leaves out."""
     index = system.model.species
     marks = [
         list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), depth, strict=True))
@@ -100,10 +100,10 @@ def portrait(system: System) -> Portrait:
     of_species = [np.array([order[mark] for mark in own]) for own in marks]
     law = _law(system, "lennard_jones", LennardJones)
     sigma, epsilon = _pairs([mark[3] for mark in known], law)
-    return Portrait(
+    return ForceFieldView(
         system=system,
         kinds=kinds,
-        kind=of_each(of_species, index),
+        kind=gather_per_molecule(of_species, index),
         frozen=(system.model.inverse_mass == 0)[index],
         sigma=sigma,
         epsilon=epsilon,
@@ -114,10 +114,10 @@ def portrait(system: System) -> Portrait:
     )
 
 
-def strange(system: System) -> list[str]:
+def unsupported_terms(system: System) -> list[str]:
     """What a system has that other engines do not, in words."""
     found = [
-        f"{name.replace('_', ' ')}: {'a force of your own' if name in system.own else 'a field'}"
+        f"{name.replace('_', ' ')}: {'a force of your own' if name in system.user_terms else 'a field'}"
         for name in system.terms
         if name not in KNOWN
     ]

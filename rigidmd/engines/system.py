@@ -13,14 +13,11 @@ from rigidmd.core.state_file import Saved
 from rigidmd.dynamics.momenta import Freedom, mobile
 from rigidmd.dynamics.step_loop import Model
 from rigidmd.engines.cpu import Engine, Precision
-from rigidmd.forces.ewald.errors import (
-    Charges,
-    charges_of,
-)
+from rigidmd.forces.ewald.errors import Charges, charges_of
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.potentials.lennard_jones import Tail
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.models import Molecule, of_each
+from rigidmd.scene.models import Molecule, gather_per_molecule
 from rigidmd.units import GRAM_PER_CM3
 
 
@@ -106,7 +103,7 @@ class System:
         return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
 
     @property
-    def tied_to_places(self) -> list[str]:
+    def position_dependent(self) -> list[str]:
         """Names of the terms whose energy depends on positions in the lab, which exclude a barostat. A field on
         molecules without a net charge is not among them."""
         return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
@@ -145,7 +142,9 @@ class System:
         names = list(dict.fromkeys(m.name for m in self.species))
         index = np.array([names.index(m.name) for m in self.species])
         first = [next(m for m in self.species if m.name == name) for name in names]
-        return Saved(state, names, index[self.model.species], self.residue_number, np.array([m.marks for m in first]))
+        return Saved(
+            state, names, index[self.model.species], self.residue_number, np.array([m.fingerprint for m in first])
+        )
 
     @property
     def residue_names(self) -> np.ndarray:
@@ -158,12 +157,12 @@ class System:
 
     def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> Engine:
         """A new engine for some terms of this system."""
-        presses = any(stage.ensemble == "nph" for stage in self.scene.stages)
-        return Engine(self.model, terms, precision, self.scene.forces.skin_A, self.told, self.scene.threads, presses)
+        needs_virials = any(stage.ensemble == "nph" for stage in self.scene.stages)
+        return Engine(self.model, terms, precision, self.scene.forces.skin_A, self.told, self.scene.threads, needs_virials)
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values for all sites (s,), from `of`, which gives those of one molecule."""
-        return of_each([of(m) for m in self.species], self.model.species)
+        return gather_per_molecule([of(m) for m in self.species], self.model.species)
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""

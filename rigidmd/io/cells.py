@@ -88,7 +88,7 @@ def basis_in_words(basis: np.ndarray) -> str:
     return ", ".join(told)
 
 
-def roomiest(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def least_skewed_cell(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cell (3, 3) of a lattice that allows the longer cut-off, and the rotation (3, 3) to its standard orientation.
 
     The given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cut-off: half the smallest

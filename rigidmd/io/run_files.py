@@ -9,10 +9,10 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from rigidmd.core.files import file_fault
-from rigidmd.core.toml import shortened
+from rigidmd.core.files import unreadable_reason
+from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError
-from rigidmd.scene.validation import Flag, Number, faults_of
+from rigidmd.scene.validation import Flag, Number, validation_messages
 
 #: Bytes of a file of JSON or CSV; characters of a line of CSV; absolute value of a number.
 LARGEST_JSON, LARGEST_TABLE, LONGEST_LINE, LARGEST_NUMBER = 5e7, 4e9, 100_000, 1e100
@@ -80,7 +80,11 @@ def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
         first = error.errors(include_url=False)[0]
         if first["type"] == "json_invalid":
             raise OutputError(f"{path} cannot be read: {first['msg']}{remedy}") from None
-        fault = faults_of(error, BaseModel)[0] if first["loc"] else f"is {shortened(first['input'])}, must be a table"
+        fault = (
+            validation_messages(error, BaseModel)[0]
+            if first["loc"]
+            else f"is {shorten_repr(first['input'])}, must be a table"
+        )
         raise OutputError(f"{path}: {fault}{remedy}") from None
     except OSError as error:
         raise OutputError(f"{path} cannot be read: {error.strerror}") from None
@@ -95,7 +99,7 @@ def _is_there(path: Path, largest: float) -> bool:
     """Whether there is a file. Raises OutputError for what is no file, or larger."""
     if not path.exists() and not path.is_symlink():
         return False
-    if fault := file_fault(path, largest):
+    if fault := unreadable_reason(path, largest):
         raise OutputError(
             f"{path} cannot be read: it {fault}" if fault.startswith(("is", "has")) else f"{path}: {fault}"
         )

@@ -7,15 +7,15 @@ from typing import Any
 
 import tomli_w
 
-from rigidmd.core.files import whole_file, write_text
+from rigidmd.core.files import atomic_file, write_text
 from rigidmd.io.folder import SCENE
 from rigidmd.scene import Scene
-from rigidmd.scene.molecules import HELD
+from rigidmd.scene.molecules import STRUCTURE_NAME
 
 
 def input_names(scene: Scene) -> dict[str, str]:
     """Names for the copies of a scene's input files: dotted key -> unique name. A copy keeps its name."""
-    names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.held, HELD)
+    names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.embedded_files, STRUCTURE_NAME)
     starts = {key: f"input_{re.sub(r'[.](file|module)$|^molecules[.]', '', key)}_" for key in names}
     return {key: starts[key] + name.removeprefix(starts[key]) for key, name in names.items()}
 
@@ -24,9 +24,9 @@ def write_scene(folder: Path, scene: Scene) -> None:
     """Write a resolved scene and copies of its input files."""
     data = scene.model_dump(exclude_none=True)
     for key, copied in input_names(scene).items():
-        with whole_file(folder / copied) as temporary:
-            if key in scene.held:
-                temporary.write_bytes(scene.held[key])
+        with atomic_file(folder / copied) as temporary:
+            if key in scene.embedded_files:
+                temporary.write_bytes(scene.embedded_files[key])
             else:
                 shutil.copyfile(scene.inputs[key], temporary)
         *tables, last = key.split(".")

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.files import file_fault
-from rigidmd.core.memory import in_words, memory_fault
-from rigidmd.errors import UNSEEN, StructureError
+from rigidmd.core.files import unreadable_reason
+from rigidmd.core.memory import format_gigabytes, memory_shortage
+from rigidmd.errors import UNPRINTABLE, StructureError
 from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, element_of
 from rigidmd.io.formats.lammps import read_data, read_dump
 from rigidmd.io.formats.text import read_arc, read_cssr, read_gro, read_pdb
 from rigidmd.io.formats.through_ase import from_ase, read_by_ase, read_xyz
 from rigidmd.io.formats.trajectory_frames import read_trajectory
-from rigidmd.scene.start import BESIDE, LAMMPS_DATA, NAMELESS, TRAJECTORIES
+from rigidmd.scene.start import LAMMPS_DATA, NAMELESS, TOPOLOGY_NAMES, TRAJECTORIES
 
 FARTHEST = 1e9  # Å, of an atom from the origin
 HEAVIEST = 1e30  # u
@@ -68,11 +68,11 @@ def read_atoms(
     atom_types: names of types, where a format has types. topology: a file with the names that a trajectory lacks.
     held: the content, where there is no file; `path` is then its name.
     """
-    if held is None and (fault := file_fault(path)):
+    if held is None and (fault := unreadable_reason(path)):
         raise StructureError(str(path), [fault])
     suffix = path.suffix.lower()
     if suffix in NAMELESS and topology is None:
-        looked = f"there is no {' or '.join(BESIDE)} beside it"
+        looked = f"there is no {' or '.join(TOPOLOGY_NAMES)} beside it"
         raise StructureError(
             str(path), [f"holds no names of atoms, and {looked}: name a file that has them by structure.topology"]
         )
@@ -84,7 +84,7 @@ def read_atoms(
         )
     else:
         size = path.stat().st_size if held is None else len(held)
-        if fault := memory_fault(FOR_BYTE * size, f"reading its {in_words(size)}"):
+        if fault := memory_shortage(FOR_BYTE * size, f"reading its {format_gigabytes(size)}"):
             raise StructureError(str(path), [f"not enough memory: {fault}"])
         with np.errstate(all="ignore"):  # what is not finite is refused below
             atoms = _choose(path, _frames(path, atom_types, held), frame)()
@@ -102,7 +102,7 @@ def read_atoms(
     if atoms.masses is not None and not ((atoms.masses >= 0) & (atoms.masses < HEAVIEST)).all():
         raise StructureError(str(path), ["an atom has a mass that is negative, too large or no number"])
     for k, texts in enumerate(zip(atoms.names, atoms.elements, atoms.residue, strict=True), 1):
-        if any(UNSEEN.search(str(text)) for text in (*texts[:2], *texts[2])):
+        if any(UNPRINTABLE.search(str(text)) for text in (*texts[:2], *texts[2])):
             raise StructureError(str(path), [f"atom {k} has a name with control characters: {texts[0]!r}"])
     return _without_placeholder(atoms)
 
@@ -197,7 +197,9 @@ def _content(path: Path) -> bytes:
             while piece := file.read(PIECE):
                 pieces.append(piece)
                 size += len(piece)
-                if fault := memory_fault(FOR_BYTE * size, f"reading the {in_words(size)} that it unpacks to"):
+                if fault := memory_shortage(
+                    FOR_BYTE * size, f"reading the {format_gigabytes(size)} that it unpacks to"
+                ):
                     raise StructureError(str(path), [f"not enough memory: {fault}"])
     except (OSError, EOFError, zlib.error, lzma.LZMAError) as error:
         raise StructureError(str(path), [f"cannot be unpacked: {error}. Is it damaged?"]) from None

@@ -20,24 +20,23 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
-from rigidmd.run.body_summary import summarise_body
-from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.options import Options
-from rigidmd.run.pilot.stable_step import body_rate, stable_angle
-from rigidmd.run.pilot.subjects import decided_for_body
+from rigidmd.run.pilot.stable_step import fastest_body_rate, stable_angle
+from rigidmd.run.pilot.trial_systems import choose_for_body
 from rigidmd.run.provenance import plain
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.results import Results
-from rigidmd.run.resume import Record, check_same_scene, read_as, state_from
-from rigidmd.run.segments import Costs, Stretch
+from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
+from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
 from rigidmd.run.simulation import Simulation
+from rigidmd.run.summary import summarise_body
 from rigidmd.scene import BodyScene
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 
-class BodyRecord(Record):
+class BodyResumeData(ResumeData):
     """What evolves in the run of a body and is not in its state."""
 
     stable: PositiveFloat | None = None  # the longest stable step, s
@@ -74,9 +73,9 @@ class BodySimulation(Simulation):
         super().__init__(scene, folder, force, **options)
         self._choice = None
         applied = dict(applied or {})
-        if scene.run.is_open:
-            self._say("choosing integrator and step by pilot runs")
-            self.scene, self._choice = decided_for_body(scene, applied)
+        if scene.run.is_auto:
+            self._announce("choosing integrator and step by pilot runs")
+            self.scene, self._choice = choose_for_body(scene, applied)
         self.system = build_body(self.scene, applied)
         self.scene = self.system.scene
         self.threads = 1
@@ -89,14 +88,14 @@ class BodySimulation(Simulation):
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
-        self._say(f"compiling ({kept_in_words()})")
+        self._announce(f"compiling ({kept_in_words()})")
         self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0)
         self._reset()
-        self._stretches = self._walk()
-        rate, angle = body_rate(self.system), stable_angle(self.system.method)
+        self._segments = self._equal_step_segments()
+        rate, angle = fastest_body_rate(self.system), stable_angle(self.system.method)
         followed = self.scene.watch.stable_step and rate > 0 and angle < inf  # some solvers choose their own steps
-        self._record = BodyRecord(stable=angle / rate if followed else None)
-        if (stable := self._record.stable) is not None and self.scene.run.timestep_s > stable:
+        self._resume_data = BodyResumeData(stable=angle / rate if followed else None)
+        if (stable := self._resume_data.stable) is not None and self.scene.run.timestep_s > stable:
             self.note(
                 f"timestep_s = {self.scene.run.timestep_s:g} is longer than what is stable: at its start the body "
                 f"swings or spins at {rate:.3g} rad/s, which {self.scene.run.integrator} can follow "
@@ -104,39 +103,39 @@ class BodySimulation(Simulation):
             )
 
     def _durations(self) -> list[float]:
-        return [stretch.steps * stretch.dt for stretch in self._stretches]
+        return [segment.steps * segment.dt for segment in self._segments]
 
-    def _enter(self, k: int) -> Stretch:
+    def _enter_segment(self, k: int) -> Segment:
         if k > 0:
             self.state.begin_stretch(self.system.breaks()[k - 1])
             self.engine.change(*self.system.during(float(self.state.time[NOW])))
-        return self._stretches[k]
+        return self._segments[k]
 
-    def _memory(self) -> dict[str, Any]:
-        return self._record.to_json(scene=plain(self.scene), notes=self.notes)
+    def _resume_json(self) -> dict[str, Any]:
+        return self._resume_data.to_json(scene=plain(self.scene), notes=self.notes)
 
-    def _recall(self, kept: Checkpoint) -> None:
-        self._record = read_as(BodyRecord, kept.told["run"])
-        self._warnings.extend(self._record.notes)
-        self._stretches = self._walk()
+    def _restore(self, kept: Checkpoint) -> None:
+        self._resume_data = read_as(BodyResumeData, kept.told["run"])
+        self._warnings.extend(self._resume_data.notes)
+        self._segments = self._equal_step_segments()
         arrays, method = kept.of("state").arrays, self.system.method
-        check_same_scene(self.scene, self._record.scene, {}, int(arrays["step"][NOW]))
+        check_same_scene(self.scene, self._resume_data.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
         k = kept.told["place"]["stretch"]
         if k > 0:
             self.engine.change(*self.system.during(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
         if isinstance(self.engine, OdeEngine):
-            self.engine.check(self.state, method, self._stretches[k].dt, self.system.state if k == 0 else None)
+            self.engine.check(self.state, method, self._segments[k].dt, self.system.state if k == 0 else None)
             self.engine.recall(self.state, kept.of("engine").arrays)
 
-    def _reenter(self, k: int) -> Stretch:
-        return self._stretches[k]
+    def _reenter_segment(self, k: int) -> Segment:
+        return self._segments[k]
 
-    def _walk(self) -> list[Stretch]:
+    def _equal_step_segments(self) -> list[Segment]:
         """Stretches between the breaks of given functions of time, in equal steps not longer than the scene's."""
         run = self.scene.run
-        stretches, steps = [], 0
+        segments, steps = [], 0
         for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
             exact = (end - begin) / run.timestep_s
             whole = round(exact)
@@ -144,20 +143,20 @@ class BodySimulation(Simulation):
                 whole = ceil(exact)
             # nothing lies between two breaks that are equal to rounding
             dt = (end - begin) / whole if whole not in (0, exact) else run.timestep_s
-            stretches.append(Stretch(self.system.method, dt, whole, steps))
+            segments.append(Segment(self.system.method, dt, whole, steps))
             steps += whole
-        return stretches
+        return segments
 
-    def _look(self, moment: Moment) -> Pose:
+    def _observe(self, moment: Moment) -> Pose:
         return self.system.pose(moment.time, moment._state)
 
-    def _own_observers(self) -> list[Observer]:
-        output, interval = self.scene.output, settled(self.scene.output.interval_s)
+    def _default_observers(self) -> list[Observer]:
+        output, interval = self.scene.output, not_none(self.scene.output.interval_s)
         self._sampler, self._watch = Sampler(interval), BodyWatch(self)
         files: list[Observer] = []
         if output.trajectory:
             with_velocities = output.trajectory.endswith((".trr", ".nc"))
-            files = [Frames(interval, settled(output.topology), output.trajectory, with_velocities)]
+            files = [Frames(interval, not_none(output.topology), output.trajectory, with_velocities)]
         if self.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
             files += [Figures()] if output.figures else []
@@ -166,12 +165,12 @@ class BodySimulation(Simulation):
     def _samples(self) -> Motion:
         return motion(self.system, self._sampler.snapshots)
 
-    def _summary(self, samples: Motion, costs: Costs) -> dict[str, Any]:
-        steps = sum(stretch.steps for stretch in self._stretches)
+    def _summary(self, samples: Motion, costs: RunTimes) -> dict[str, Any]:
+        steps = sum(segment.steps for segment in self._segments)
         found = summarise_body(
             self.system, samples, steps, costs.preparing, costs.wall, sum(costs.computing), self._interrupted
         )
-        found["stable_timestep_s"] = self._record.stable
+        found["stable_timestep_s"] = self._resume_data.stable
         if getattr(self.engine, "is_stiff", False):
             self.note(
                 "the motion is stiff: stability, not accuracy, limits the steps of dop853; integrator = 'radau' takes "
@@ -181,7 +180,7 @@ class BodySimulation(Simulation):
         return found
 
     def _explain(self, error: SimulationError) -> str:
-        return self._watch.check.explained(error, self.stretch.dt, self._record.stable)
+        return self._watch.check.explain(error, self.segment.dt, self._resume_data.stable)
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs."""
@@ -190,7 +189,7 @@ class BodySimulation(Simulation):
     def introduction(self) -> str:
         """A few lines for the start of a run."""
         system, run = self.system, self.scene.run
-        pinned = "" if system.flies else ", pinned"
+        pinned = "" if system.translates else ", pinned"
         first = (
             f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom} degrees of freedom; "
             f"{run.steps} steps of {run.timestep_s:g} s, {run.integrator.replace('_', ' ')}"

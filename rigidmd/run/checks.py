@@ -31,17 +31,17 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
 #: hydrogen bond stays at half of it. For molecules without any repulsion the fraction is the second one.
-BARE, NAKED = 0.3, 1.0
+CHARGED_OVERLAP_FRACTION, CHARGES_ONLY_OVERLAP_FRACTION = 0.3, 1.0
 #: A moment of inertia is suspiciously small below this fraction of that of the whole mass at the outermost site (for a
 #: body: of its largest moment). For water the fraction is 0.05.
-THIN = 0.01
+MIN_INERTIA_FRACTION = 0.01
 #: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
 #: Most moves of molecules between two checks; for a body, evaluations of its forces, and looks.
-PATIENCE, BODY_PATIENCE, LOOKS = 250_000, 1_000_000, 512
+MOVES_PER_CHECK, EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 250_000, 1_000_000, 512
 
 
-class Finding(SimulationError):
+class FailedCheck(SimulationError):
     """An observation that shows something wrong, as a sentence.
 
     molecule : index of the molecule concerned; shorter : factor by which the step would have to be shorter to stay
@@ -53,14 +53,14 @@ class Finding(SimulationError):
         seen: str,
         molecule: int | None = None,
         shorter: float | None = None,
-        unturned: bool = False,
-        boiled: bool = False,
+        rotation_not_orthogonal: bool = False,
+        evaporated: bool = False,
     ):
         super().__init__(seen)
         self.molecule = molecule
         self.shorter = shorter
-        self.unturned = unturned
-        self.boiled = boiled
+        self.rotation_not_orthogonal = rotation_not_orthogonal
+        self.evaporated = evaporated
 
 
 class Cause(NamedTuple):
@@ -70,20 +70,20 @@ class Cause(NamedTuple):
     advice: str
 
 
-def patience(system: System) -> int:
+def check_interval(system: System) -> int:
     """Steps between two checks of molecules, so many that a check costs less than 1 % of them."""
-    return max(20, PATIENCE // len(system.model.species))
+    return max(20, MOVES_PER_CHECK // len(system.model.species))
 
 
 def steps_between(system: System) -> int | None:
     """Steps between two checks besides those of samples; None where samples come at least as often."""
     interval = system.scene.output.log_interval_ps
     steps = [
-        inf if stage.is_open else interval / (stage.timestep_fs * FEMTOSECOND)
+        inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
         for stage in system.scene.stages
         if not stage.is_minimisation
     ]
-    return patience(system) if max(steps, default=0.0) > patience(system) else None
+    return check_interval(system) if max(steps, default=0.0) > check_interval(system) else None
 
 
 class StepCheck:
@@ -109,54 +109,58 @@ class StepCheck:
         """Take the scale of momenta from a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
         self.thermal = max(2 * kinetic / max(self._system.freedom.total, 1), self._deepest_well)
 
-    def finding(self, state: State, load: Load, stage: Stage, extent: Extent | None) -> Finding | None:
-        """`next_step` of a stage, if it has steps."""
+    def failed_check(self, state: State, load: Load, stage: Stage, extent: Extent | None) -> FailedCheck | None:
+        """`check_step` of a stage, if it has steps."""
         if stage.is_minimisation:
             return None
-        return self.next_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND, extent)
+        return self.check_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND, extent)
 
-    def next_step(
+    def check_step(
         self, state: State, load: Load, scheme: Scheme, dt: float, extent: Extent | None = None
-    ) -> Finding | None:
+    ) -> FailedCheck | None:
         """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
 
         load : at this state or at the last kick; extent : of both, if it is known
         """
         largest = extent or extent_of(state, load)
-        return None if self._is_mild(largest, scheme, dt) else self._looked_at(state, load, scheme, dt)
+        return (
+            None if self._is_within_limits(largest, scheme, dt) else self._check_each_molecule(state, load, scheme, dt)
+        )
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _looked_at(self, state: State, load: Load, scheme: Scheme, dt: float) -> Finding | None:
-        """The finding of `next_step`, from every molecule."""
+    def _check_each_molecule(self, state: State, load: Load, scheme: Scheme, dt: float) -> FailedCheck | None:
+        """The finding of `check_step`, from every molecule."""
         system, limits, model = self._system, self._limits, self._system.model
         for what, values in (("force", load.force), ("torque", load.torque_body)):
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
-                return Finding(f"the {what} on {named(system, m)} is not finite", m)
+                return FailedCheck(f"the {what} on {molecule_label(system, m)} is not finite", m)
         if limits.kick and self.thermal > 0:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
             if size.max() > limits.kick:
                 m = int(size.argmax())
-                seen = f"one kick changes a momentum of {named(system, m)} by {size[m]:.3g} times its thermal size"
-                return Finding(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
+                seen = f"one kick changes a momentum of {molecule_label(system, m)} by {size[m]:.3g} times its thermal size"
+                return FailedCheck(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
         stride = dt * max(map(abs, scheme.drifts))
         if limits.move:
             way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
             m, diameter = int(way.argmax()), self._diameter
             if way[m] > limits.move * diameter:
-                seen = f"{named(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
+                seen = f"{molecule_label(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
                 seen += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
-                return Finding(seen, m, shorter=way[m] / diameter / limits.move)
+                return FailedCheck(seen, m, shorter=way[m] / diameter / limits.move)
         if limits.turn_rad and len(state.rotation):
             omega = state.angular_momentum_body * self._per_momentum[model.species]
             angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
             m = int(angle.argmax())
             if angle[m] > limits.turn_rad:
-                seen = f"{named(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
-                return Finding(f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad)
+                seen = f"{molecule_label(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
+                return FailedCheck(
+                    f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad
+                )
         return None
 
-    def _is_mild(self, largest: Extent, scheme: Scheme, dt: float) -> bool:
+    def _is_within_limits(self, largest: Extent, scheme: Scheme, dt: float) -> bool:
         """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces, velocities and
         so on: nearly always, and many times as fast as to look at each of them."""
         limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
@@ -179,7 +183,7 @@ def axis_distances(molecule: Molecule) -> np.ndarray:
     return np.sqrt((square.sum(axis=1, keepdims=True) - square).max(axis=0))
 
 
-def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) -> Finding | None:
+def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> FailedCheck | None:
     """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
 
     In a minimisation only Q is checked.
@@ -189,13 +193,13 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     """
     if limits.orthogonality and not now.orthogonality_error <= limits.orthogonality:
         seen = f"|QᵀQ - 1| is {now.orthogonality_error:.2g} (watch.orthogonality = {limits.orthogonality:g})"
-        return Finding(f"a matrix Q is no longer a rotation: {seen}", unturned=True)
+        return FailedCheck(f"a matrix Q is no longer a rotation: {seen}", rotation_not_orthogonal=True)
     if system.scene.stages[now.stage].is_minimisation:
         return None
     grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
     if limits.volume and grown > limits.volume:
         seen = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
-        return Finding(f"{seen}, {now.density:.3g} g/cm³", boiled=True)
+        return FailedCheck(f"{seen}, {now.density:.3g} g/cm³", evaporated=True)
     if not limits.energy:
         return None
     stage, share = system.scene.stages[now.stage], 1.0
@@ -212,13 +216,13 @@ def sample_finding(system: System, limits: Watch, since: Sample, now: Sample) ->
     if abs(drift) * share <= limits.energy * scale:
         return None
     n = len(system.model.species)
-    return Finding(
+    return FailedCheck(
         f"the conserved energy changed by {drift / n:.3g} kJ/mol per molecule in {now.time - since.time:g} ps, "
         f"{abs(drift) * share / scale if scale else inf:.3g} kinetic energies (watch.energy = {limits.energy:g})"
     )
 
 
-def named(system: System, molecule: int) -> str:
+def molecule_label(system: System, molecule: int) -> str:
     """Number (from 1) and species of a molecule."""
     return f"molecule {molecule + 1} ({system.species[system.model.species[molecule]].name})"
 
@@ -233,12 +237,16 @@ class Pair(NamedTuple):
     bare: bool  # opposite charges without repulsion between them
 
 
-def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | None:
+def most_overlapping_pair(system: System, state: State, molecule: int | None) -> Pair | None:
     """The pair of sites that overlaps most, preferably of this molecule; None without such a pair."""
     if not np.abs(state.position).max() * np.finfo(float).eps < 1e-3 * system.smallest_diameter:
         return None  # a coordinate is too large to resolve distances
     sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
-    near = system.of_sites(lambda m: np.full(len(m.epsilon), BARE if m.epsilon.any() else NAKED))
+    near = system.of_sites(
+        lambda m: np.full(
+            len(m.epsilon), CHARGED_OVERLAP_FRACTION if m.epsilon.any() else CHARGES_ONLY_OVERLAP_FRACTION
+        )
+    )
     acts = any(name.startswith("coulomb") for name in system.terms)
     charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
     found = []
@@ -253,12 +261,14 @@ def pair_in_core(system: System, state: State, molecule: int | None) -> Pair | N
     return min(own or found, key=lambda pair: pair.share, default=None)
 
 
-def _worst_pair(system: System, molecule: int | None, states: Iterable[tuple[str, State]]) -> tuple[str, Pair | None]:
+def _first_overlap(
+    system: System, molecule: int | None, states: Iterable[tuple[str, State]]
+) -> tuple[str, Pair | None]:
     """Moment and sites of the first overlap of this molecule; without one, of the first of all."""
     first: tuple[str, Pair | None] = ("", None)
     for where, state in states:
         if all(np.isfinite(array).all() for array in state):
-            pair = pair_in_core(system, state, molecule)
+            pair = most_overlapping_pair(system, state, molecule)
             if pair is not None and (molecule is None or molecule in system.sites.molecule[[pair.first, pair.second]]):
                 return where, pair
             if first[1] is None:
@@ -266,7 +276,7 @@ def _worst_pair(system: System, molecule: int | None, states: Iterable[tuple[str
     return first
 
 
-def explained(
+def explain(
     system: System, error: SimulationError, states: Iterable[tuple[str, State]], dt: float, stable: float | None
 ) -> str:
     """The finding in full: what was seen, the likely cause, what to try.
@@ -275,33 +285,33 @@ def explained(
     known, the longest stable one, ps
     """
     if isinstance(error, NotFiniteError):
-        seen = f"{named(system, error.molecule)} is lost: {error.fault}"
-        finding = Finding(seen, error.molecule)
+        seen = f"{molecule_label(system, error.molecule)} is lost: {error.fault}"
+        failed = FailedCheck(seen, error.molecule)
     elif isinstance(error, BehindWallError):
-        finding = Finding(f"{named(system, error.molecule)} {error.fault}", error.molecule)
-    elif isinstance(error, Finding):
-        finding = error
+        failed = FailedCheck(f"{molecule_label(system, error.molecule)} {error.fault}", error.molecule)
+    elif isinstance(error, FailedCheck):
+        failed = error
     else:
         return str(error)
-    text = str(finding)
-    where, pair = ("", None) if finding.boiled else _worst_pair(system, finding.molecule, states)
+    text = str(failed)
+    where, pair = ("", None) if failed.evaporated else _first_overlap(system, failed.molecule, states)
     if pair is not None:
         a, b = (
-            f"{system.sites.name[site]} of {named(system, system.sites.molecule[site])}"
+            f"{system.sites.name[site]} of {molecule_label(system, system.sites.molecule[site])}"
             for site in (pair.first, pair.second)
         )
         whose = "the smallest" if pair.bare else "their"
         text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.share:.2g} of {whose} diameter"
-    likely, advice = _cause(system, finding, pair, dt, stable)
+    likely, advice = _cause(system, failed, pair, dt, stable)
     return f"{text}. Likely cause: {likely}. Try {advice}"
 
 
-def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stable: float | None) -> Cause:
+def _cause(system: System, failed: FailedCheck, pair: Pair | None, dt: float, stable: float | None) -> Cause:
     shorter = f"a shorter timestep_fs than {dt / FEMTOSECOND:g}"
     if stable is not None and stable < dt:
         shorter = f"timestep_fs below {stable / FEMTOSECOND:.2g}, where the stiffest motion is stable"
-    elif finding.shorter is not None and finding.shorter < 1 / ROUNDING:
-        shorter = f"timestep_fs = {dt / finding.shorter / FEMTOSECOND:.2g} or less"
+    elif failed.shorter is not None and failed.shorter < 1 / ROUNDING:
+        shorter = f"timestep_fs = {dt / failed.shorter / FEMTOSECOND:.2g} or less"
     if pair is not None and pair.bare:
         a, b = system.sites.name[[pair.first, pair.second]]
         return Cause(
@@ -314,23 +324,23 @@ def _cause(system: System, finding: Finding, pair: Pair | None, dt: float, stabl
             "these sites overlap: from the start, or because a step was too long",
             f"a start without overlaps, an nvt stage with a short step first, or {shorter}",
         )
-    if finding.molecule is not None:
-        species = system.species[system.model.species[finding.molecule]]
+    if failed.molecule is not None:
+        species = system.species[system.model.species[failed.molecule]]
         even = species.mass * axis_distances(species) ** 2
         share = np.divide(species.inertia, even, out=np.ones(3), where=species.inertia > 0)
-        if share.min() < THIN:
+        if share.min() < MIN_INERTIA_FRACTION:
             return Cause(
                 f"bad inertia: a moment of {species.name} is {species.inertia[share.argmin()]:.2g} u Å², "
                 f"{share.min():.1g} of that of its mass at the outermost site, so torques turn it too fast",
                 f"more of its mass on the outer sites, or {shorter}",
             )
-    if finding.boiled:
+    if failed.evaporated:
         return Cause(
             "at this temperature and pressure the liquid boils, or it starts far from its density under great pressure",
             "a higher pressure_bar or a lower temperature_K, an nvt stage before the barostat, or watch.volume = false "
             "for a gas",
         )
-    if finding.unturned:
+    if failed.rotation_not_orthogonal:
         return Cause(
             "Q was not a rotation at the start or was changed from outside: a run only multiplies rotations",
             "the start from which the last good state came; a very long run may raise watch.orthogonality",
@@ -357,19 +367,19 @@ class BodyCheck:
         return {name: float(values[0]) for name, values in columns.items()}
 
     @np.errstate(over="ignore", invalid="ignore")
-    def finding(self, state: State, dt: float) -> Finding | None:
+    def failed_check(self, state: State, dt: float) -> FailedCheck | None:
         """What is wrong with a state of the run."""
         system, limits = self.system, self.limits
         largest = not_none(limits.orthogonality)
         if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
             seen = f"Q is no longer a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
-            return Finding(seen, unturned=True)
+            return FailedCheck(seen, rotation_not_orthogonal=True)
         if system.rotates and limits.turn_rad:
             omega = system.pose(float(state.time[0]), state).angular_velocity_body
             angle = dt * float(np.linalg.norm(omega))
             if angle > limits.turn_rad:
                 seen = f"the body turns by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
-                return Finding(seen, shorter=angle / limits.turn_rad)
+                return FailedCheck(seen, shorter=angle / limits.turn_rad)
         if not limits.energy or not is_balanced(system):
             return None
         start, now = self._start, self._energies(state)
@@ -378,34 +388,34 @@ class BodyCheck:
         scale = self.moved + ROUNDING * abs(now["energy"])
         if error <= limits.energy * scale:
             return None
-        return Finding(
+        return FailedCheck(
             f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
             f"energy exchanged (watch.energy = {limits.energy:g})"
         )
 
-    def explained(self, error: SimulationError, dt: float, stable: float | None) -> str:
+    def explain(self, error: SimulationError, dt: float, stable: float | None) -> str:
         """The finding in full: what was seen, the likely cause, what to try."""
         system = self.system
         if isinstance(error, NotFiniteError):
-            finding = Finding("position or momentum of the body is not finite")
-        elif isinstance(error, Finding):
-            finding = error
+            failed = FailedCheck("position or momentum of the body is not finite")
+        elif isinstance(error, FailedCheck):
+            failed = error
         else:
             return str(error)
         shorter = f"a shorter timestep_s than {dt:g}"
         if stable is not None and stable < dt:
             shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
-        elif finding.shorter is not None:
-            shorter = f"timestep_s = {dt / finding.shorter:.2g} or less"
+        elif failed.shorter is not None:
+            shorter = f"timestep_s = {dt / failed.shorter:.2g} or less"
         inertia = system.inertia
-        if finding.unturned:
+        if failed.rotation_not_orthogonal:
             cause = Cause(
                 f"only accuracy keeps Q a rotation under {system.method.name}"
                 if isinstance(system.method, Solver)
                 else "Q was changed from outside: a run only multiplies rotations",
                 f"integrator = 'srkn_6', which keeps Q, or {shorter}",
             )
-        elif system.rotates and inertia[inertia > 0].min() < THIN * inertia.max():
+        elif system.rotates and inertia[inertia > 0].min() < MIN_INERTIA_FRACTION * inertia.max():
             least = inertia[inertia > 0].min()
             cause = Cause(
                 f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "
@@ -414,7 +424,7 @@ class BodyCheck:
             )
         else:
             cause = Cause("timestep_s is too long for this motion, or a force grows without bound", shorter)
-        return f"{finding}. Likely cause: {cause.likely}. Try {cause.advice}"
+        return f"{failed}. Likely cause: {cause.likely}. Try {cause.advice}"
 
 
 def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:

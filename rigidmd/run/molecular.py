@@ -15,7 +15,7 @@ from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.compile.cache import kept_in_words
 from rigidmd.compile.machine import threads_for
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import HEAT, NOW, ORIGIN, TAKEN, WORK, State, state_of
+from rigidmd.core.state import HEAT, NOW, ORIGIN, REMOVED, WORK, State, state_of
 from rigidmd.dynamics.momenta import remove_momentum
 from rigidmd.dynamics.observables import Extent, extent_of
 from rigidmd.engines.cpu import Engine
@@ -31,24 +31,22 @@ from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.run import checks
 from rigidmd.run.force_errors import accuracy
 from rigidmd.run.minimise import minimise
-from rigidmd.run.minimum import Minimum, minimum_in_words
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
-from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Frames, Observer, SceneFile
+from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.options import Options
-from rigidmd.run.overlap_removal import Relief, relieve
+from rigidmd.run.overlap_removal import OverlapRemoval, remove_overlaps
 from rigidmd.run.pilot.shadow import choose_for_averages
-from rigidmd.run.pilot.stable_step import is_worth_it, stable_angle, stiffest
-from rigidmd.run.pilot.subjects import choose_for_molecules
+from rigidmd.run.pilot.stable_step import is_estimate_cheap, stable_angle, stiffest_mode
+from rigidmd.run.pilot.trial_systems import choose_for_molecules
 from rigidmd.run.provenance import plain
-from rigidmd.run.quantity_docs import meanings
+from rigidmd.run.quantity_docs import describe_quantities
 from rigidmd.run.report import summary_text
 from rigidmd.run.results import Results
-from rigidmd.run.resume import Record, check_same_scene, read_as, state_from
-from rigidmd.run.segments import Costs, Stretch
+from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
+from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
 from rigidmd.run.simulation import Simulation
-from rigidmd.run.summary import summarise
+from rigidmd.run.summary import Minimum, minimum_in_words, summarise
 from rigidmd.run.user_force_check import check_forces
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
@@ -57,18 +55,16 @@ from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_
 if TYPE_CHECKING:
     import ase
 
-    from rigidmd.engines.external import OtherEngine
-
 
 Count = Annotated[int, Field(ge=0)]
 
 
-class MolecularRecord(Record):
+class MolecularResumeData(ResumeData):
     """What evolves in a run of molecules and is not in its state; dictionaries have the indices of stages."""
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     stage: Count = 0  # the present one
-    relief: Relief | None = None
+    relief: OverlapRemoval | None = None
     choices: dict[Count, str] = Field(default_factory=dict)  # what was chosen for stages that left it open, and why
     stable: dict[Count, PositiveFloat] = Field(default_factory=dict)  # the longest stable step, ps
     moves: dict[Count, tuple[Count, Count]] = Field(default_factory=dict)  # of the box, tried and accepted
@@ -93,7 +89,7 @@ class MolecularSimulation(Simulation):
 
     scene: MolecularScene
     system: System
-    engine: "Engine | OtherEngine"
+    engine: "Engine | ExternalEngine"
 
     def __init__(
         self,
@@ -107,7 +103,7 @@ class MolecularSimulation(Simulation):
     ):
         super().__init__(scene, folder, force, **options)
         given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
-        self._built = build(scene.with_own(given, thermostat))
+        self._built = build(scene.with_user_code(given, thermostat))
         if clash := [name for name in self._built.user_terms if name in COLUMNS]:
             raise SceneError(
                 scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
@@ -132,12 +128,12 @@ class MolecularSimulation(Simulation):
         """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. An observer may call it."""
         return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
 
-    def start(self) -> Relief | None:
+    def start(self) -> OverlapRemoval | None:
         """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
         self._reset()
         with interruptible():
-            self._relieve()
-        return self._record.relief
+            self._remove_overlaps()
+        return self._resume_data.relief
 
     def settle(self) -> State:
         """Go to the state from which time passes, after relief of overlaps and the minimisations that come first."""
@@ -157,20 +153,20 @@ class MolecularSimulation(Simulation):
 
     def _prepare(self) -> None:
         """Relieve overlaps, and compile the steps or see that another engine computes the same."""
-        if self.scene.engine.is_other:
-            from rigidmd.engines.external import other_engine
+        if self.scene.engine.is_external:
+            from rigidmd.engines.external import external_engine
 
-            other = other_engine(self.system)  # first: one that is not here says so before anything is compiled
-            self._relieve()
+            other = external_engine(self.system)  # first: one that is not here says so before anything is compiled
+            self._remove_overlaps()
             self._check(other)
         else:
-            self._relieve()
+            self._remove_overlaps()
             self._compile()
         self.engine.forget()
 
-    def _relieve(self) -> None:
+    def _remove_overlaps(self) -> None:
         """Compile the forces, and relieve overlaps of a lattice."""
-        self._say(f"compiling ({kept_in_words()})")
+        self._announce(f"compiling ({kept_in_words()})")
         with user_errors_explained(self.system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
@@ -187,7 +183,7 @@ class MolecularSimulation(Simulation):
             if thermal > 0:
                 scale = self.system.smallest_diameter
                 dt = first.timestep_fs * FEMTOSECOND
-                relief = relieve(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
+                relief = remove_overlaps(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
                 if relief.excess > 1:
                     raise SceneError(
                         self.scene.source,
@@ -200,13 +196,13 @@ class MolecularSimulation(Simulation):
                     )
         check_forces(self.system, self.state)
         self.engine.forget()
-        self._record = MolecularRecord(relief=relief)
+        self._resume_data = MolecularResumeData(relief=relief)
 
     def _compile(self) -> None:
         """Compile the steps of every stage."""
         with user_errors_explained(self.system):
             for k, stage in enumerate(self.scene.stages):
-                if not (stage.is_open or stage.is_minimisation):
+                if not (stage.is_auto or stage.is_minimisation):
                     row = integrator_of_stage(self.system, k)
                     self.engine.advance(self._begun(row), row, 0.0, 0)
 
@@ -214,9 +210,9 @@ class MolecularSimulation(Simulation):
         """The present state, its arrays as they are, with the variables that a row moves besides."""
         return self.state._replace(bath=self.engine.variables(self.state, row))
 
-    def _check(self, other: "OtherEngine") -> None:
+    def _check(self, other: "ExternalEngine") -> None:
         """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""
-        from rigidmd.engines.comparison import compare_at, in_words
+        from rigidmd.engines.comparison import compare_at, describe_comparison
 
         try:
             lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
@@ -225,29 +221,29 @@ class MolecularSimulation(Simulation):
         if not all(line.agrees for line in lines):
             title = self.scene.engine.name
             raise EngineError(
-                f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{in_words(lines, title)}"
+                f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{describe_comparison(lines, title)}"
             )
 
-    def _engine_of(self, k: int) -> "Engine | OtherEngine":
+    def _engine_of(self, k: int) -> "Engine | ExternalEngine":
         """The engine of stage k; rigidmd's own minimises."""
-        if not self.scene.engine.is_other or self.scene.stages[k].is_minimisation:
+        if not self.scene.engine.is_external or self.scene.stages[k].is_minimisation:
             return self.system.engine()
-        from rigidmd.engines.external import other_engine
+        from rigidmd.engines.external import external_engine
 
-        other = other_engine(self.system, k)
-        self.made_by = other.made_by
+        other = external_engine(self.system, k)
+        self.engine_version = other.version
         return other
 
-    def _memory(self) -> dict[str, Any]:
+    def _resume_json(self) -> dict[str, Any]:
         scene, stages = plain(self._built.scene), self.scene.stages
-        return self._record.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
+        return self._resume_data.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
 
-    def _recall(self, kept: Checkpoint) -> None:
-        record = self._record = read_as(MolecularRecord, kept.told["run"])
+    def _restore(self, kept: Checkpoint) -> None:
+        record = self._resume_data = read_as(MolecularResumeData, kept.told["run"])
         before = record.scene["stages"]
         # the scene in the folder has decided what was open before
         decided = [
-            then if now.is_open else plain(chosen)
+            then if now.is_auto else plain(chosen)
             for now, then, chosen in zip(self.scene.stages, before, record.stages, strict=False)
         ]
         step = int(kept.arrays["state/step"][NOW])
@@ -263,7 +259,7 @@ class MolecularSimulation(Simulation):
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
         self.system = replace(self.system, scene=self.scene)
         self._warnings.extend(record.notes)
-        row = self._reenter(record.stage).row
+        row = self._reenter_segment(record.stage).row
         self.engine = self._engine_of(record.stage)
         like = self._built.state._replace(bath=self.engine.variables(self._built.state, row))
         self.state = state_from(kept.of("state").arrays, like)
@@ -272,27 +268,32 @@ class MolecularSimulation(Simulation):
             raise ValueError("its box is not that of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
 
-    def _reenter(self, k: int) -> Stretch:
+    def _reenter_segment(self, k: int) -> Segment:
         stage = self.scene.stages[k]
         step = stage.timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
-            return Stretch(stage.scheme, step, 0, act=None if k in self._record.minima else self._minimise)
-        return Stretch(integrator_of_stage(self.system, k), step, stage.steps)
+            return Segment(stage.scheme, step, 0, act=None if k in self._resume_data.minima else self._minimise)
+        return Segment(integrator_of_stage(self.system, k), step, stage.steps)
 
     def _durations(self) -> list[float]:
         return [stage.duration for stage in self.scene.stages]
 
-    def _enter(self, k: int) -> Stretch:
-        self._record.moves[self._record.stage] = self.engine.moves
-        self._record.stage = k
+    def _enter_segment(self, k: int) -> Segment:
+        self._resume_data.moves[self._resume_data.stage] = self.engine.moves
+        self._resume_data.stage = k
         if self.scene.stages[k].is_minimisation:
             return self._enter_minimisation(k)
-        if was_open := self.scene.stages[k].is_open:
+        if was_open := self.scene.stages[k].is_auto:
             self._choose(k)
         self._estimate(k)
         # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
         # bit. Those of the start, if nothing has moved since, are what new ones would be.
-        if k or was_open or self.scene.engine.is_other or (self._record.relief and self._record.relief.steps):
+        if (
+            k
+            or was_open
+            or self.scene.engine.is_external
+            or (self._resume_data.relief and self._resume_data.relief.steps)
+        ):
             self.engine = self._engine_of(k)
         row, stage = integrator_of_stage(self.system, k), self.scene.stages[k]
         self.state = self._begun(row)
@@ -300,42 +301,42 @@ class MolecularSimulation(Simulation):
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
         keeps = self.system.keeps_momentum_in
         if before and keeps(k) and not keeps(before[-1]):
-            self.state.books[TAKEN] -= remove_momentum(self.system.model, self.state.velocity)
-        return Stretch(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
+            self.state.books[REMOVED] -= remove_momentum(self.system.model, self.state.velocity)
+        return Segment(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
 
-    def _enter_minimisation(self, k: int) -> Stretch:
+    def _enter_minimisation(self, k: int) -> Segment:
         stage = self.scene.stages[k]
         self.engine = self.system.engine()
         self.state = self._begun(stage.scheme)
         self.state.begin_stretch()
-        return Stretch(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
+        return Segment(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
 
     def _minimise(self, progress: bool | None) -> None:
         """Minimise as the present stage says, with a warning if it does not converge."""
-        k = self._record.stage
+        k = self._resume_data.stage
         stage = self.scene.stages[k]
         with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
             found = minimise(self.system, self.state, stage, self._must_end, bar.update)
         self.engine.forget()
-        self._record.minima[k] = found
+        self._resume_data.minima[k] = found
         if not found.converged:
             self.note(f"stages.{k}: {minimum_in_words(found, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
         stage = self.scene.stages[k]
-        if not self.scene.watch.stable_step or not is_worth_it(
+        if not self.scene.watch.stable_step or not is_estimate_cheap(
             self.system, stage.steps * stage.scheme.force_evaluations
         ):
             return
-        found = stiffest(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
+        found = stiffest_mode(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
         if found is None:
             return
-        stable = self._record.stable[k] = stable_angle(stage.scheme) / found.rate
+        stable = self._resume_data.stable[k] = stable_angle(stage.scheme) / found.rate
         if stage.timestep_fs * FEMTOSECOND > stable:
             self.note(
                 f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
-                f"at its start, of {checks.named(self.system, found.molecule)}, has a period of "
+                f"at its start, of {checks.molecule_label(self.system, found.molecule)}, has a period of "
                 f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
                 f"{stable / FEMTOSECOND:.3g} fs"
             )
@@ -343,10 +344,10 @@ class MolecularSimulation(Simulation):
     def _choose(self, k: int) -> None:
         """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
         stage = self.scene.stages[k]
-        self._say("choosing integrator and step by pilot runs")
+        self._announce("choosing integrator and step by pilot runs")
         choose = choose_for_averages if stage.bias_kT else choose_for_molecules
         decided, reason = choose(self.system, self.state, k)
-        self._record.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
+        self._resume_data.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
         stages = list(self.scene.stages)
         stages[k] = decided
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
@@ -358,7 +359,7 @@ class MolecularSimulation(Simulation):
 
     def _is_replaced(self, moment: Moment) -> bool:
         stages, k = self.scene.stages, moment.stage
-        if stages[k].is_minimisation and k not in self._record.minima:
+        if stages[k].is_minimisation and k not in self._resume_data.minima:
             return True  # the start
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
         # an interrupted minimisation is repeated by a run that resumes, which also has another frame for it
@@ -374,7 +375,7 @@ class MolecularSimulation(Simulation):
         """The extent of the state and its load, if it is known from the last step."""
         return self.engine.extent(self.state) if isinstance(self.engine, Engine) else None
 
-    def _look(self, moment: Moment) -> Observation:
+    def _observe(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]
         is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
         step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
@@ -390,7 +391,7 @@ class MolecularSimulation(Simulation):
         a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = seen.pressure_tensor_bar.tolist()
         # another engine may not tell what its thermostat takes out
-        known = not stage.is_minimisation and getattr(self.engine, "counts_heat", True)
+        known = not stage.is_minimisation and getattr(self.engine, "conserves_energy", True)
         return Sample(
             step=moment.step,
             time=moment.time,
@@ -428,13 +429,13 @@ class MolecularSimulation(Simulation):
             user_energies=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.user_terms),
         )
 
-    def _own_observers(self) -> list[Observer]:
+    def _default_observers(self) -> list[Observer]:
         output = self.scene.output
         interval = output.log_interval_ps
         check = checks.StepCheck(self.system, self.scene.watch)
         self._sampler = Sampler(self, interval, check)
         observers: list[Observer] = [self._sampler]
-        if not self.scene.engine.is_other:  # others look after their own steps
+        if not self.scene.engine.is_external:  # others look after their own steps
             observers.append(StepWatch(self, check))
         files: list[Observer] = []
         if output.trajectory:
@@ -452,8 +453,8 @@ class MolecularSimulation(Simulation):
     def _samples(self) -> Samples:
         return self._sampler.samples
 
-    def _summary(self, samples: Samples, costs: Costs) -> dict[str, Any]:
-        record = self._record
+    def _summary(self, samples: Samples, costs: RunTimes) -> dict[str, Any]:
+        record = self._resume_data
         record.moves[record.stage] = self.engine.moves
         return summarise(
             self.system, samples, self.state, record.relief.steps if record.relief else 0, costs.preparing, costs.wall,
@@ -461,8 +462,8 @@ class MolecularSimulation(Simulation):
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:
-        stable = self._record.stable.get(self._record.stage)
-        return checks.explained(self.system, error, self._suspects(), self.stretch.dt, stable)
+        stable = self._resume_data.stable.get(self._resume_data.stage)
+        return checks.explain(self.system, error, self._suspects(), self.segment.dt, stable)
 
     def _suspects(self) -> Iterator[tuple[str, State]]:
         """States of a run that failed, with the words for their moments: now; the last good one; those between, which
@@ -471,9 +472,9 @@ class MolecularSimulation(Simulation):
         if (good := self._sampler.last_good) is None:
             return
         yield f"at step {good.step}, ", good.state
-        steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.stretch.row
-        short = 0 < steps * len(system.model.species) <= REPLAYED * checks.PATIENCE
-        if short and isinstance(self.engine, Engine) and not (self.stretch.act or system.python_forces):
+        steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.segment.row
+        short = 0 < steps * len(system.model.species) <= REPLAYED * checks.MOVES_PER_CHECK
+        if short and isinstance(self.engine, Engine) and not (self.segment.act or system.python_forces):
             state = good.state.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
                 state = self.engine.begin(state, row)
@@ -481,7 +482,7 @@ class MolecularSimulation(Simulation):
             self.engine.forget()
             for to in sorted({good.step + steps * k // REPLAYED for k in range(1, REPLAYED)} - {good.step}):
                 try:
-                    self.engine.advance(state, row, self.stretch.dt, to)
+                    self.engine.advance(state, row, self.segment.dt, to)
                 except SimulationError:
                     return
                 yield f"at step {to}, ", state
@@ -524,7 +525,7 @@ class MolecularSimulation(Simulation):
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
             "largest_force_per_A": force / size,
             "largest_force_molecule": molecule + 1,
-            "meaning": meanings(self.system),
+            "meaning": describe_quantities(self.system),
         }
         if measure_accuracy:
             error = accuracy(self.system, self.state)

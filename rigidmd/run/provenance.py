@@ -17,7 +17,7 @@ from rigidmd.scene import MolecularScene, Scene
 #: Packages that may change the last bits of a result.
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
 #: Keys that change no bit of a run, or are compared otherwise: input files by their contents.
-APART = ("name", "threads", "output.checkpoint_minutes", "output.figures", "output.drawn_as", "watch")
+NOT_COMPARED = ("name", "threads", "output.checkpoint_minutes", "output.figures", "output.drawn_as", "watch")
 
 
 def computed_with() -> dict[str, Any]:
@@ -52,7 +52,7 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
 
 def scene_digest(scene: Scene) -> str:
     """SHA-256 of all keys of a resolved scene that decide the bits of its run."""
-    keys = keys_of(plain(scene), (*scene.inputs, *scene.held, *APART))
+    keys = keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))
     return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
 
 
@@ -62,7 +62,7 @@ def input_digests(scene: Scene) -> dict[str, str]:
         read = {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
     except OSError as error:
         raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
-    return read | {key: hashlib.sha256(content).hexdigest() for key, content in scene.held.items()}
+    return read | {key: hashlib.sha256(content).hexdigest() for key, content in scene.embedded_files.items()}
 
 
 def plain(scene: BaseModel) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.state_file import LARGEST, are_rotations, is_cell
 from rigidmd.errors import CheckpointError
-from rigidmd.run.provenance import APART, computed_with, differences, input_digests, keys_of, plain
+from rigidmd.run.provenance import NOT_COMPARED, computed_with, differences, input_digests, keys_of, plain
 from rigidmd.scene import MolecularScene, Scene
 
 T = TypeVar("T")
@@ -22,7 +22,7 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
 
     The last stage of molecules may be longer or shorter than it was, but not shorter than it has been.
     """
-    apart = [*scene.inputs, *scene.held, *APART]
+    apart = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
     if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
         apart.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
@@ -38,7 +38,7 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
         )
 
 
-def changed_since(told: Mapping[str, Any]) -> str | None:
+def describe_changes(told: Mapping[str, Any]) -> str | None:
     """A sentence if the run so far was computed with other versions or on another processor, which may change bits."""
     now = computed_with()
     changed = [
@@ -82,7 +82,7 @@ def read_as(kind: type[T], data: Any) -> T:
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-class Record(BaseModel):
+class ResumeData(BaseModel):
     """What evolves in a run and is not in its state, besides the scene that it is of."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants")
@@ -97,7 +97,7 @@ class Record(BaseModel):
 
 
 @contextlib.contextmanager
-def fitting(folder: Path | None) -> Iterator[None]:
+def as_checkpoint_errors(folder: Path | None) -> Iterator[None]:
     """Turns whatever does not fit in a checkpoint into a CheckpointError."""
     try:
         yield

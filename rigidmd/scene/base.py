@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, overload
 from pydantic import Field, PrivateAttr, ValidationError
 
 from rigidmd.core.display import Displayed
-from rigidmd.core.files import file_fault
+from rigidmd.core.files import unreadable_reason
 from rigidmd.core.toml import (
     DEEPEST,
     TOMLDecodeError,
@@ -17,12 +17,12 @@ from rigidmd.core.toml import (
     parse_toml,
     plain_values,
     read_toml,
-    shortened,
-    whole_number,
+    shorten_repr,
+    parse_whole_number,
 )
 from rigidmd.errors import SceneError
 from rigidmd.scene.shipped import examples
-from rigidmd.scene.validation import Section, faults_of, meant, nearest, numbers_beyond, perhaps, place
+from rigidmd.scene.validation import Section, validation_messages, did_you_mean, similar_names, numbers_out_of_range, suggestion, location_of
 
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene
@@ -45,7 +45,7 @@ class Scene(Section, Displayed):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
-    _held: dict[str, bytes] = PrivateAttr(default_factory=dict)
+    _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.in_short}>"
@@ -62,7 +62,7 @@ class Scene(Section, Displayed):
         """The file it was read from, for messages."""
         return self._source
 
-    def lasting(self, until: float) -> "Scene":
+    def with_end(self, until: float) -> "Scene":
         """The same scene with an end at a time of the run. Raises SceneError where it has none to set."""
         raise SceneError(self.source, ["--until is for molecules; set run.duration_s of a single body"])
 
@@ -76,13 +76,13 @@ class Scene(Section, Displayed):
         return {}
 
     @property
-    def held(self) -> dict[str, bytes]:
+    def embedded_files(self) -> dict[str, bytes]:
         """Contents of further inputs that lie in no file: dotted key, whose value names the file, -> content. The
         folder of a run has them as files."""
-        return self._held
+        return self._embedded_files
 
     @classmethod
-    def strange_paths(cls, data: dict[str, Any], folder: Path) -> list[str]:
+    def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
         """Faults: files of a scene that lie outside its folder."""
         return []
 
@@ -113,7 +113,7 @@ class Scene(Section, Displayed):
         """
         path = Path(path)
         data, text = read_tables(path)
-        data.setdefault("name", name_of_file(path))
+        data.setdefault("name", default_name(path))
         return cls.from_dict(data, path.parent, overrides, source=str(path), text=text)
 
     @overload
@@ -154,47 +154,47 @@ class Scene(Section, Displayed):
         overrides: dict[str, Any] | None = None,
         source: str = "scene",
         text: str = "",
-        held: dict[str, bytes] | None = None,
+        embedded_files: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
         """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault.
 
         Numbers and arrays of NumPy and paths may stand for numbers, lists and texts. The dictionary is not changed.
 
-        held : see `held`; files of a scene that holds inputs, which Python made, may be anywhere
+        held : see `embedded_files`; files of a scene that holds inputs, which Python made, may be anywhere
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
         from rigidmd.scene import BodyScene, MolecularScene
 
-        kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind(data, BodyScene, MolecularScene)
+        kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind_of_scene(data, BodyScene, MolecularScene)
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
-        faults = [] if held else kind.strange_paths(data, folder)
+        faults = [] if embedded_files else kind.paths_outside_folder(data, folder)
         overridden = []
         for named, value in overrides.items():
             key, wrong = _override(data, named, value)
             faults += wrong
-            if value is None and whole_number(key.rpartition(".")[2]) is not None:
+            if value is None and parse_whole_number(key.rpartition(".")[2]) is not None:
                 text = ""  # entries after a removed one have other numbers than in the text
             else:
                 overridden.append(key)
         if wrong := impossible_values(data):
-            raise SceneError(source, [f"{place(keys, text, overridden)}: {fault}" for keys, fault in wrong])
-        faults += [f"{place(keys, text, overridden)}: {fault}" for keys, fault in numbers_beyond(data, *kind.SIZES)]
+            raise SceneError(source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong])
+        faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in numbers_out_of_range(data, *kind.SIZES)]
         faults += kind.contradictions(data, text)
 
         def refusal(found: list[str]) -> SceneError:
-            return SceneError(source, [fault + _removes(fault, data, overridden) for fault in found])
+            return SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in found])
 
         try:
             scene = kind.model_validate(data)
         except ValidationError as error:
-            raise refusal(faults + faults_of(error, kind, text, overridden)) from None
+            raise refusal(faults + validation_messages(error, kind, text, overridden)) from None
         if faults:
             raise refusal(faults)
         scene._source = source
         scene._folder = folder
-        scene._held = held or {}
+        scene._embedded_files = embedded_files or {}
         if missing := scene._missing_files(text, overridden):
             raise SceneError(source, missing)
         return scene
@@ -203,36 +203,36 @@ class Scene(Section, Displayed):
         """Faults: missing files, by line and key."""
         faults = []
         for key, path in self.inputs.items():
-            if not (fault := file_fault(path)):
+            if not (fault := unreadable_reason(path)):
                 continue
-            keys = [part if (number := whole_number(part)) is None else number for part in key.split(".")]
-            faults.append(f"{place(keys, text, overridden)}: {fault}: {shortened(str(path))}{_alike(path)}")
+            keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
+            faults.append(f"{location_of(keys, text, overridden)}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
         return faults
 
 
 def read_tables(path: Path) -> tuple[dict[str, Any], str]:
     """The tables of a scene file, and its text. Raises SceneError, which names a shipped scene of such a name."""
-    fault = file_fault(path)
+    fault = unreadable_reason(path)
     if fault.startswith("there is no such file"):
-        shipped = nearest(path.stem, [example.name for example in examples()])
+        shipped = similar_names(path.stem, [example.name for example in examples()])
         new = f"; `rigidmd new {shipped[0]}` copies a shipped scene" if shipped else "; `rigidmd examples` lists scenes"
-        raise SceneError(str(path), [fault + (_alike(path, ".toml") or new)])
+        raise SceneError(str(path), [fault + (_similar_files(path, ".toml") or new)])
     return read_toml(path, SceneError)
 
 
-def name_of_file(path: Path) -> str:
+def default_name(path: Path) -> str:
     """The name of the scene in a file that says none."""
     return re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene"
 
 
-def _alike(path: Path, ending: str = "") -> str:
+def _similar_files(path: Path, ending: str = "") -> str:
     """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are none."""
     try:
         there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(ending)]
     except (OSError, ValueError):
         return ""
-    stems = nearest(path.stem, {other.stem for other in there if other.name != path.name})
-    return perhaps([other.name for other in there if other.stem in stems])
+    stems = similar_names(path.stem, {other.stem for other in there if other.name != path.name})
+    return suggestion([other.name for other in there if other.stem in stems])
 
 
 def file_name(name: str, endings: tuple[str, ...]) -> str:
@@ -246,7 +246,7 @@ def file_name(name: str, endings: tuple[str, ...]) -> str:
     return name
 
 
-def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
+def _kind_of_scene(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
     """The kind of scene with these tables; None if no table belongs to either kind."""
     for kind, marker in ((body, "body"), (molecules, "molecules")):
         if marker in data:
@@ -256,7 +256,7 @@ def _kind(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"
     return best if own[best] > 0 else None
 
 
-def _removes(fault: str, data: dict, overridden: Iterable[str]) -> str:
+def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
     """How the command line removes the keys that contradict overridden ones; empty for any other fault."""
     if not re.search("not both|omit one|contradict", fault):
         return ""
@@ -264,11 +264,11 @@ def _removes(fault: str, data: dict, overridden: Iterable[str]) -> str:
     tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)]) if overridden else ()
     keys = [table + name for table in tables for name in names]
     return "".join(
-        f"; --set {key}= removes it" for key in dict.fromkeys(keys) if key not in overridden and _holds(data, key)
+        f"; --set {key}= removes it" for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)
     )
 
 
-def _holds(data: Any, key: str) -> bool:
+def _has_key(data: Any, key: str) -> bool:
     """Whether nested tables have a dotted key, which is not a table itself."""
     for part in key.split("."):
         if not isinstance(data, dict) or part not in data:
@@ -286,24 +286,24 @@ def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".", DEEPEST + 1)
     if len(parents) > DEEPEST:
-        return key, [f"--set {shortened(key)}: is a key of more than {DEEPEST} parts"]
+        return key, [f"--set {shorten_repr(key)}: is a key of more than {DEEPEST} parts"]
     target: Any = data
     indices: list[Any] = []
     for depth, part in enumerate([*parents, last]):
         here = ".".join(key.split(".")[:depth])
         listed, table = isinstance(target, list), isinstance(target, dict)
-        number = whole_number(part)
+        number = parse_whole_number(part)
         if listed:
             names = [_name_of_entry(entry) for entry in target]
             if number is None and names.count(part) == 1:
                 number = names.index(part)
             if number is None or number >= len(target):
-                called = f" ({', '.join(map(shortened, names))})" if number is None and any(names) else ""
+                called = f" ({', '.join(map(shorten_repr, names))})" if number is None and any(names) else ""
                 return key, [f"--set {key}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"]
         elif not table:
             return key, [f"--set {key}: {here} is not a table"]
         elif value is None and part not in target:
-            there = meant(part, target) or f"; there are {', '.join(target)}"
+            there = did_you_mean(part, target) or f"; there are {', '.join(target)}"
             return key, [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
         index: Any = number if listed else part
         indices.append(index)

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_faults, rotor_fault
-from rigidmd.mechanics.inertia import impossible, shifted
+from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors, rotor_error
+from rigidmd.mechanics.inertia import inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
-    direction,
+    unit_vector,
     from_attitude_matrix,
     from_euler_angles,
     from_quaternion,
@@ -34,7 +34,7 @@ from rigidmd.scene.body_forces import (
     Wheel,
 )
 from rigidmd.scene.limits import BodyWatch
-from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, place
+from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, location_of
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -45,12 +45,12 @@ FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
 
 #: Moments of inertia are equal, for a picture, if they differ by less than this share of the largest.
-EVEN = 1e-6
+EQUAL_MOMENTS = 1e-6
 
 
 def axis_of_symmetry(moments: np.ndarray) -> int | None:
     """The axis about which a body with these principal moments is symmetric: 2 (axis 3) if all are equal; or None."""
-    near = EVEN * moments.max()
+    near = EQUAL_MOMENTS * moments.max()
     return next((k for k in (2, 0, 1) if abs(moments[k - 1] - moments[k - 2]) <= near), None)
 
 
@@ -143,13 +143,13 @@ class BodyTable(Section):
         if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():
             return ["inertia_tensor_kg_m2 is not symmetric"]
         if self.inertia_about == "pivot":
-            if why := impossible(tensor):
+            if why := inertia_error(tensor):
                 return [f"no body has this inertia: {why}"]
-            at_centre = shifted(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
-            if why := impossible(at_centre, np.abs(tensor).max()):
+            at_centre = shifted_inertia(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
+            if why := inertia_error(at_centre, np.abs(tensor).max()):
                 return [f"no body of this mass has this inertia about its pivot: about its centre of mass {why}"]
             return []
-        why = impossible(tensor)
+        why = inertia_error(tensor)
         return [f"no body has this inertia: {why}"] if why else []
 
     @property
@@ -229,7 +229,7 @@ class BodyStart(Section):
         if self.yaw_pitch_roll_deg is not None:
             return from_yaw_pitch_roll(np.radians(self.yaw_pitch_roll_deg))
         if self.quaternion_wxyz is not None:
-            return from_quaternion(direction(np.array(self.quaternion_wxyz)))
+            return from_quaternion(unit_vector(np.array(self.quaternion_wxyz)))
         if self.rotation is not None:
             return nearest_rotation(np.array(self.rotation))
         if self.attitude_matrix is not None:
@@ -272,7 +272,7 @@ class Run(Section):
     def _faults(self):
         if self.rotor is not None and self.integrator in SOLVERS:
             yield f"rotor would do nothing with {self.integrator}"
-        elif fault := self.rotor and rotor_fault(self.integrator, self.rotor):
+        elif fault := self.rotor and rotor_error(self.integrator, self.rotor):
             yield fault
         if self.formulation is not None and self.integrator not in SOLVERS:
             yield f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}"
@@ -280,14 +280,14 @@ class Run(Section):
         if tolerances and self.integrator not in ("dop853", "radau"):
             yield f"{', '.join(tolerances)} would do nothing with {self.integrator}"
         asked = {"energy_error": self.energy_error, "trajectory_error": self.trajectory_error}
-        yield from auto_faults(self.integrator, asked, ["rotor"] if self.rotor is not None else [])
+        yield from auto_errors(self.integrator, asked, ["rotor"] if self.rotor is not None else [])
         if not self.duration_s / self.timestep_s < MOST_STEPS:
             yield f"duration_s / timestep_s is more than {MOST_STEPS:g} steps"
         elif self.duration_s < 0.5 * self.timestep_s:
             yield f"duration_s = {self.duration_s:g} is less than one step of {self.timestep_s:g} s"
 
     @property
-    def is_open(self) -> bool:
+    def is_auto(self) -> bool:
         """Whether integrator and step are still open."""
         return self.integrator == AUTO
 
@@ -363,7 +363,7 @@ class BodyScene(Scene):
     @property
     def in_short(self) -> str:
         run = self.run
-        how = "" if run.is_open else f" in {run.steps} steps of {run.timestep_s:g} s"
+        how = "" if run.is_auto else f" in {run.steps} steps of {run.timestep_s:g} s"
         pinned = ", pinned" if self.body.pinned else ""
         return f"{self.name}: one body{pinned}; {run.duration_s:g} s{how}, {run.integrator}"
 
@@ -389,7 +389,7 @@ class BodyScene(Scene):
             found.append((["body", key], "changing_inertia defines the inertia: omit one of them"))
         if "fluid" in data and "frame" in data:
             found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
-        return [f"{place(keys, text)}: {fault}" for keys, fault in found]
+        return [f"{location_of(keys, text)}: {fault}" for keys, fault in found]
 
     def _faults(self):
         fluid, body = self.fluid, self.body

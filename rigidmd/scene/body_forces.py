@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from rigidmd.mechanics.inertia import impossible
+from rigidmd.mechanics.inertia import inertia_error
 from rigidmd.scene.validation import NonNegative, Number, Positive, Section, Vector
 
 NonNegativeVector = tuple[NonNegative, NonNegative, NonNegative]
@@ -175,5 +175,5 @@ class ChangingInertia(Timed):
         if self.from_s is not None or self.to_s is not None:
             yield "from_s and to_s are not supported here; use times_s"
         for k, moments in enumerate(self.inertia_kg_m2):
-            if why := impossible(np.diag(moments)):
+            if why := inertia_error(np.diag(moments)):
                 yield f"no body has the inertia of entry {k}: {why}"

@@ -7,7 +7,7 @@ from pydantic import model_validator
 from rigidmd.scene.validation import Count, Section
 
 #: Other engines by their key, as their own pages write them.
-OTHERS = {"lammps": "LAMMPS", "openmm": "OpenMM"}
+EXTERNAL = {"lammps": "LAMMPS", "openmm": "OpenMM"}
 Platform = Literal["CPU", "Reference", "CUDA", "OpenCL", "HIP"]
 
 
@@ -29,9 +29,9 @@ class EngineChoice(Section):
         return self
 
     @property
-    def is_other(self) -> bool:
+    def is_external(self) -> bool:
         """Whether another engine computes."""
-        return self.name in OTHERS
+        return self.name in EXTERNAL
 
     @property
     def title(self) -> str:

@@ -125,9 +125,9 @@ class Fields(Section):
             yield "electric_phase_deg would do nothing without electric_frequency_per_ps"
 
     @property
-    def holds_in_place(self) -> bool:
+    def depends_on_position(self) -> bool:
         """Whether energies depend on where in the lab molecules are: by walls, restraints and gravity. They do not
-        follow a box that changes its size. (So do those of charges in a field: see `System.tied_to_places`.)"""
+        follow a box that changes its size. (So do those of charges in a field: see `System.position_dependent`.)"""
         return bool(self.walls or self.restraints or any(self.gravity_m_s2 or ()))
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
@@ -165,6 +165,6 @@ def field_faults(scene: "MolecularScene") -> list[str]:
             f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is less than two steps of stages.{k} "
             f"({stage.timestep_fs:g} fs), which cannot follow it"
             for k, stage in enumerate(scene.stages)
-            if not (stage.is_open or stage.is_minimisation) and period < 2 * stage.timestep_fs
+            if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.timestep_fs
         ]
     return faults

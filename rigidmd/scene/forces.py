@@ -5,12 +5,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from rigidmd.core.toml import shortened
+from rigidmd.core.toml import shorten_repr
 from rigidmd.scene.models import Mixing
 from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Line, NonNegative, Number, Positive, Section
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
-WaveNumber = Annotated[int, Strict(), Field(ge=0, le=1000)]
+KIndex = Annotated[int, Strict(), Field(ge=0, le=1000)]
 Truncation = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
@@ -31,10 +31,10 @@ ELECTROSTATIC_KEYS = {
 
 
 #: A cutoff within this fraction of the minimum of an energy is that minimum, rounded: its sites are meant to repel.
-ROUNDED = 0.01
+MINIMUM_TOLERANCE = 0.01
 
 
-def short_cutoff(cutoff: float, sites: str, minimum: float) -> str:
+def short_cutoff_note(cutoff: float, sites: str, minimum: float) -> str:
     """A note on a cutoff (Å) within the minimum of the energy of two sites."""
     unit = "Is it in nm? " if cutoff < 2 < minimum else ""
     return (
@@ -43,7 +43,7 @@ def short_cutoff(cutoff: float, sites: str, minimum: float) -> str:
     )
 
 
-def usual_start(truncation: str, cutoff: float) -> float:
+def default_switch_start(truncation: str, cutoff: float) -> float:
     """Where a switch begins if a scene does not say, Å."""
     return 0.6 * cutoff if truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
 
@@ -105,7 +105,7 @@ class CustomForce(Section):
             if idle:
                 raise ValueError(f"{', '.join(idle)} would do nothing with a module: its object has `parameters`")
             if not self.module.endswith(".py"):
-                raise ValueError(f"module = {shortened(self.module)} must be a Python file, ending in .py")
+                raise ValueError(f"module = {shorten_repr(self.module)} must be a Python file, ending in .py")
         return self
 
 
@@ -142,7 +142,7 @@ class Forces(Section):
     keys below; default: 1e-5"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
-    ewald_k_max: WaveNumber | tuple[WaveNumber, WaveNumber, WaveNumber] | None = None
+    ewald_k_max: KIndex | tuple[KIndex, KIndex, KIndex] | None = None
     """Of ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or file"""
     ewald_k2_max: Count | None = None
     """Of ewald: also largest n_x² + n_y² + n_z²"""
@@ -174,12 +174,12 @@ class Forces(Section):
             raise ValueError("ewald_k2_max needs ewald_k_max beside it")
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
             raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
-        settled = self.gives_waves or (self.pme_grid is not None and self.pme_order is not None)
+        settled = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
         if settled and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             raise ValueError("ewald_accuracy would do nothing: alpha and the waves are given")
         return self
 
     @property
-    def gives_waves(self) -> bool:
+    def sets_k_vectors(self) -> bool:
         """Whether the scene sets the waves of an Ewald sum."""
         return self.ewald_k_max is not None or self.ewald_k_radius_per_A is not None

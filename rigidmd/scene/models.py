@@ -19,10 +19,10 @@ from rigidmd.scene.validation import (
     Positive,
     Section,
     Vector,
-    faults_of,
-    meant,
-    numbers_beyond,
-    place,
+    validation_messages,
+    did_you_mean,
+    numbers_out_of_range,
+    location_of,
 )
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 
@@ -33,7 +33,7 @@ SIZES = (1e-30, 1e30)
 #: Of one rigid molecule.
 MOST_SITES = 5000
 #: Two sites closer than this fraction of the molecule's size count as coinciding.
-SAME_PLACE = 1e-6
+COINCIDENT = 1e-6
 #: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
 OFF_AXIS = 1e-4
 MOST_PARAMETERS = 100  # of one site
@@ -147,10 +147,10 @@ class Molecule:
     parameters: tuple[dict[str, float], ...] = ()  # of each site, for pair laws of users
 
     def __repr__(self) -> str:
-        return f"<Molecule {self.name}: {self.words}>"
+        return f"<Molecule {self.name}: {self.description}>"
 
     @property
-    def marks(self) -> tuple[float, ...]:
+    def fingerprint(self) -> tuple[float, ...]:
         """Mass, u, moments of inertia, u Å², and number of sites (5,): by them a saved state knows its model."""
         return (self.mass, *map(float, self.inertia), float(len(self.masses)))
 
@@ -173,7 +173,7 @@ class Molecule:
     @property
     def has_dipole(self) -> bool:
         """Whether the dipole moment about the centre of mass is more than rounding."""
-        scale = SAME_PLACE * self.radius * np.abs(self.charges).sum()
+        scale = COINCIDENT * self.radius * np.abs(self.charges).sum()
         return bool(self.dipole_debye * DEBYE > scale)
 
     @property
@@ -193,7 +193,7 @@ class Molecule:
         return np.append(np.linalg.svd(self.positions_body, compute_uv=False), [0.0, 0.0])[:3]
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Kind of body, sites, mass, charge and dipole in words."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
         charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
@@ -251,7 +251,7 @@ def molecule(
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
     frame = principal_frame(masses, positions, size)
     body = (positions - frame.centre) @ frame.axes
-    near = KDTree(body).query_pairs(SAME_PLACE * size, output_type="ndarray")
+    near = KDTree(body).query_pairs(COINCIDENT * size, output_type="ndarray")
     faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
     if frame.kind == "point" and not faults:
         off = np.linalg.norm(body, axis=1)
@@ -329,7 +329,7 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
     return tuple(filled)
 
 
-def of_each(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
+def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
     """values[k] (own, ...) of each molecule of species k, one molecule after the other; species (n,)."""
     counts = np.array([len(own) for own in values])
     begin, own = np.cumsum(counts) - counts, counts[species]
@@ -338,7 +338,7 @@ def of_each(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
     return np.concatenate(values)[rows]
 
 
-def named_sites(species: list[Molecule], name: str) -> list[np.ndarray]:
+def sites_named(species: list[Molecule], name: str) -> list[np.ndarray]:
     """Which sites of each species a name means: those of this name, or else of this element; SPECIES.NAME of one."""
     owner, _, own = name.rpartition(".")
     for of_molecule in ("site_names", "elements"):
@@ -371,7 +371,7 @@ def model_fault(name: str) -> str:
     known = available_models()
     if name in known:
         return ""
-    return f"there is no model {name!r}{meant(name, known) or ';'} `rigidmd models` lists all {len(known)}"
+    return f"there is no model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all {len(known)}"
 
 
 def load_model(name: str) -> Molecule:
@@ -413,10 +413,10 @@ def _read(path: Path, kind: type[Table]) -> Table:
     data, text = read_toml(path, MoleculeError)
     wrong = impossible_values(data)
     if not wrong:
-        wrong = numbers_beyond(data, *SIZES)
+        wrong = numbers_out_of_range(data, *SIZES)
     if wrong:
-        raise MoleculeError(str(path), [f"{place(keys, text)}: {fault}" for keys, fault in wrong])
+        raise MoleculeError(str(path), [f"{location_of(keys, text)}: {fault}" for keys, fault in wrong])
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        raise MoleculeError(str(path), faults_of(error, kind, text)) from None
+        raise MoleculeError(str(path), validation_messages(error, kind, text)) from None

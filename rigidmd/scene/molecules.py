@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
 
-from rigidmd.core.toml import shortened
+from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.engine import EngineChoice
@@ -135,23 +135,23 @@ class MolecularScene(Scene):
     """Set by a run from Python: names of forces and a thermostat that it was given and a scene cannot hold. Such a
     scene runs only from Python, with the same ones"""
 
-    _own: UserCode = PrivateAttr(UserCode())
+    _user_code: UserCode = PrivateAttr(UserCode())
 
     @property
-    def own(self) -> UserCode:
+    def user_code(self) -> UserCode:
         """What Python has added."""
-        return self._own
+        return self._user_code
 
-    def with_own(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
+    def with_user_code(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`. Raises SceneError."""
-        own = UserCode((*self._own.forces, *forces), thermostat if thermostat is not None else self._own.thermostat)
-        if self.from_python not in ((), own.names):
-            raise SceneError(self.source, [missing_user_code(self.from_python, own.names)])
-        scene = self.model_copy(update={"from_python": own.names})
-        scene._own = own
+        user_code = UserCode((*self._user_code.forces, *forces), thermostat if thermostat is not None else self._user_code.thermostat)
+        if self.from_python not in ((), user_code.names):
+            raise SceneError(self.source, [missing_user_code(self.from_python, user_code.names)])
+        scene = self.model_copy(update={"from_python": user_code.names})
+        scene._user_code = user_code
         return scene
 
-    def lasting(self, until: float) -> "MolecularScene":
+    def with_end(self, until: float) -> "MolecularScene":
         """The same scene with a last stage that ends at a time of the run, ps. Raises SceneError."""
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]
@@ -183,7 +183,7 @@ class MolecularScene(Scene):
     @property
     def inputs(self) -> dict[str, Path]:
         found = {}
-        if self.structure is not None and "structure.file" not in self.held:
+        if self.structure is not None and "structure.file" not in self.embedded_files:
             found["structure.file"] = self.path(self.structure.file)
         if (names := self.topology) is not None:
             found["structure.topology"] = self.path(names)
@@ -201,7 +201,7 @@ class MolecularScene(Scene):
         """Where the atoms of the start come from, for messages; empty without a structure."""
         if self.structure is None:
             return ""
-        return "atoms" if "structure.file" in self.held else str(self.path(self.structure.file))
+        return "atoms" if "structure.file" in self.embedded_files else str(self.path(self.structure.file))
 
     @property
     def topology(self) -> str | None:
@@ -278,7 +278,7 @@ class MolecularScene(Scene):
         ]
         for k in range(len(self.stages)) if stages is None else stages:
             stage = self.stages[k]
-            if stage.is_minimisation or stage.is_open:
+            if stage.is_minimisation or stage.is_auto:
                 continue
             of_stage = [(f"stages.{k}.{key}", getattr(stage, key)) for key in ("duration_ps", "barostat_interval_ps")]
             for key, wanted in [*of_run, *of_stage]:
@@ -299,7 +299,7 @@ class MolecularScene(Scene):
         for k, stage in enumerate(self.stages):
             if stage.is_minimisation:
                 continue
-            if stage.is_open:
+            if stage.is_auto:
                 faults.append(f"output.trajectory: a .dcd file cannot follow the step of stages.{k}; use .xtc")
                 continue
             every = max(1, round(wanted * 1000 / stage.timestep_fs))
@@ -312,7 +312,7 @@ class MolecularScene(Scene):
         return faults
 
     @classmethod
-    def strange_paths(cls, data: dict[str, Any], folder: Path) -> list[str]:
+    def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
         """Files of a scene that lie outside its folder."""
         named = []
         if isinstance(structure := data.get("structure"), dict):
@@ -332,7 +332,7 @@ class MolecularScene(Scene):
                 if isinstance(entry, dict)
             ]
         return [
-            f"{key}: {shortened(file)} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
+            f"{key}: {shorten_repr(file)} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
             for key, file in named
             if isinstance(file, str) and not _is_inside(folder / file, folder)
         ]

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from rigidmd.core.files import whole_file
-from rigidmd.errors import Faults, OutputError
+from rigidmd.core.files import atomic_file
+from rigidmd.errors import InputError, OutputError
 
 PACKAGE = Path(__file__).parent.parent
 
@@ -65,7 +65,7 @@ def examples() -> list[Example]:
         text = path.read_text(encoding="utf-8")
         about = text.partition("\n")[0].removeprefix("# ")
         found.append(Example(path.stem, path, about, "body" in tomllib.loads(text)))
-    return sorted(found, key=_in_series)
+    return sorted(found, key=_natural_order)
 
 
 def notebooks() -> list[Example]:
@@ -85,7 +85,7 @@ def scripts() -> list[Example]:
     ]
 
 
-def _in_series(example: Example) -> list:
+def _natural_order(example: Example) -> list:
     """Sort key in which numbers within a name count as numbers."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
 
@@ -101,7 +101,7 @@ def find_example(name: str) -> Example:
     near = [other for other in known if other == stem or other.startswith(f"{stem}_")]
     near = near or difflib.get_close_matches(stem, known, 3, 0.6)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise Faults("examples", [f"there is no scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
+    raise InputError("examples", [f"there is no scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
 
 
 def series_of(name: str) -> list[str]:
@@ -123,7 +123,7 @@ def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path]
     for target, source in {path: example.path, **inputs}.items():
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(target) as temporary:
+            with atomic_file(target) as temporary:
                 shutil.copyfile(source, temporary)
         except OSError as error:
             raise OutputError(f"{target} cannot be written: {error.strerror}") from None
@@ -144,7 +144,7 @@ def chapter_text(name: str) -> str:
         found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
         named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
         where = f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
-        raise Faults("help", [f"there is no chapter {name!r}; {hint}{where}"])
+        raise InputError("help", [f"there is no chapter {name!r}; {hint}{where}"])
     return _plain(name)
 
 

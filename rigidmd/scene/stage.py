@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
 
-from rigidmd.core.integrators import AUTO, SCHEMES, WITH_BATH, Rotor, Scheme, auto_faults, rotor_fault
+from rigidmd.core.integrators import AUTO, SCHEMES, WITH_THERMOSTAT, Rotor, Scheme, auto_errors, rotor_error
 from rigidmd.scene.validation import Count, Line, Number, Positive, Section
 
 MOST_STEPS = 1e12
@@ -54,7 +54,7 @@ USED = {
 }
 
 #: What may be asked of the integrator and step that are left to a pilot.
-ASKED = ("energy_error_kT", "trajectory_error", "bias_kT")
+ERROR_TARGETS = ("energy_error_kT", "trajectory_error", "bias_kT")
 
 #: Names from other programs -> advice.
 REFUSED = {
@@ -110,7 +110,7 @@ class Stage(Section):
     """Of npt, time between two moves of the box; default: 0.05 of barostat_time_ps"""
     compressibility_per_bar: Positive | None = None
     """Compressibility; it sets the speed of the box, not the ensemble. Default: that of water, 4.5e-5"""
-    integrator: Literal[(*SCHEMES, *WITH_BATH, AUTO)] = "velocity_verlet"  # type: ignore[valid-type]
+    integrator: Literal[(*SCHEMES, *WITH_THERMOSTAT, AUTO)] = "velocity_verlet"  # type: ignore[valid-type]
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
     scheme and step that keep the requested error with the fewest force evaluations"""
     energy_error_kT: Positive | None = None
@@ -167,17 +167,17 @@ class Stage(Section):
             yield f"an {self.ensemble} stage needs pressure_bar"
         if idle := [key for key, where in USED.items() if self._is_given(key) and not where & self._parts]:
             yield f"{', '.join(idle)} would do nothing {self._where(idle)}"
-        if self.integrator in WITH_BATH and not self.has_thermostat and not self.is_minimisation:
+        if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.changes_box:
             yield from self._pressure_faults()
-        if fault := rotor_fault(self.integrator, self.rotor):
+        if fault := rotor_error(self.integrator, self.rotor):
             yield fault
-        decided = [
+        with_integrator = [
             key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default
         ]
-        asked = {key: getattr(self, key) for key in ASKED}
-        yield from auto_faults(self.integrator, asked, decided)
+        asked = {key: getattr(self, key) for key in ERROR_TARGETS}
+        yield from auto_errors(self.integrator, asked, with_integrator)
         if self.bias_kT is not None and not self.has_thermostat:
             yield f"bias_kT is of averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
@@ -245,25 +245,25 @@ class Stage(Section):
         return self.ensemble == "minimise"
 
     @property
-    def is_open(self) -> bool:
+    def is_auto(self) -> bool:
         """Whether integrator and step are still open."""
         return self.integrator == AUTO
 
     @property
-    def leaves_thermostat(self) -> bool:
+    def thermostat_is_open(self) -> bool:
         """Whether the thermostat is chosen with the integrator: a bias is asked for, and nothing of a thermostat."""
         return self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
 
-    def decided(self, integrator: str, timestep_fs: float) -> "Stage":
+    def with_integrator(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with the choice of pilot runs."""
         changes = {"integrator": integrator, "timestep_fs": timestep_fs}
-        return self.model_copy(update=changes | dict.fromkeys(ASKED))
+        return self.model_copy(update=changes | dict.fromkeys(ERROR_TARGETS))
 
     @property
-    def resolved(self) -> "Stage":
+    def with_defaults(self) -> "Stage":
         """This stage with every number that it uses."""
         found: dict[str, Any] = {}
-        if self.has_thermostat and not self.leaves_thermostat:
+        if self.has_thermostat and not self.thermostat_is_open:
             found |= {"thermostat": self.thermostat_kind}
             if self.thermostat_kind == "langevin":
                 translation, rotation = self.frictions
@@ -281,7 +281,7 @@ class Stage(Section):
     @property
     def scheme(self) -> Scheme:
         """The integrator with its rotor."""
-        return (SCHEMES | WITH_BATH)[self.integrator].with_rotor(self.rotor)
+        return (SCHEMES | WITH_THERMOSTAT)[self.integrator].with_rotor(self.rotor)
 
     @property
     def label(self) -> str:

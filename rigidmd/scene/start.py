@@ -15,7 +15,7 @@ LAMMPS_DATA = (".data", ".lmp", ".lammps")
 NAMELESS = (".xtc", ".trr", ".dcd", ".nc", ".ncdf")
 TRAJECTORIES = (*NAMELESS, ".gsd")
 #: What a topology beside a trajectory is called, as in the folder of a run.
-BESIDE = ("topology.gro", "topology.pdb")
+TOPOLOGY_NAMES = ("topology.gro", "topology.pdb")
 
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 

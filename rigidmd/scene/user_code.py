@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 
-class Own(NamedTuple):
+class UserCode(NamedTuple):
     """Objects of users; `rigidmd.assemble.user_code` knows what they are."""
 
     forces: tuple[Any, ...] = ()
@@ -15,9 +15,9 @@ class Own(NamedTuple):
     def names(self) -> tuple[str, ...]:
         """The names of all, no two the same."""
         thermostat = () if self.thermostat is None else (f"thermostat {name_of(self.thermostat)}",)
-        return (*self.of_forces(), *thermostat)
+        return (*self.force_names(), *thermostat)
 
-    def of_forces(self, taken: Sequence[str] = ()) -> list[str]:
+    def force_names(self, taken: Sequence[str] = ()) -> list[str]:
         """A name for each force: its own, with a number if that is taken."""
         found = list(taken)
         for force in self.forces:
@@ -36,7 +36,7 @@ def name_of(thing: Any) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(thing).__qualname__.rpartition(".")[2]).lower().strip("_")
 
 
-def not_given(wanted: Sequence[str], given: Sequence[str]) -> str:
+def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
     """The fault of a scene that lacks what Python added."""
     there = f"; this has {', '.join(given)}" if given else ""
     return (

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from rigidmd.core.toml import cut, line_of, shortened
+from rigidmd.core.toml import shorten_text, line_of, shorten_repr
 from rigidmd.errors import MOST_SHOWN
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -25,7 +25,7 @@ T = TypeVar("T")
 MOST_TABLES = 1000
 
 #: With more similar names than this, no suggestion is made from a common beginning or end.
-MOST_MEANT = 8
+MOST_SUGGESTIONS = 8
 #: Names longer than this, and more of them, are compared with no others: that would take long and say nothing.
 LONGEST_NAME, MOST_NAMES = 60, 1000
 
@@ -50,13 +50,13 @@ class Section(BaseModel):
 Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max_length=4096)]
 
 
-def settled(value: T | None) -> T:
+def not_none(value: T | None) -> T:
     """A value that may be left out of a scene, but is there where it is used: in a validated and resolved one."""
     assert value is not None, "the scene is not validated or not resolved"
     return value
 
 
-def faults_of(
+def validation_messages(
     error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
 ) -> list[str]:
     """One sentence for each error of pydantic: line (if the TOML text is given), key, what was expected.
@@ -77,13 +77,13 @@ def faults_of(
     # specific than one about the whole value.
     around = {keys[:depth] for keys in faults for depth in range(1, len(keys))}
     return [
-        f"{place(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
+        f"{location_of(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
         for keys, sentences in faults.items()
         if keys not in around
     ]
 
 
-def numbers_beyond(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
+def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
     """Numbers of nested tables and lists that are too small or too large, each with its path of keys and what is wrong.
 
     Infinities and NaN, which some keys allow, are left to the types of those keys.
@@ -107,9 +107,9 @@ def _either(sentences: list[str]) -> str:
     return " or ".join([sentences[0], *(sentence.removeprefix(begin + must) for sentence in sentences[1:])])
 
 
-def place(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
+def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
     """Where a key of a scene was given: its line, or the command line."""
-    path = ".".join(cut(str(key)) for key in keys)
+    path = ".".join(shorten_text(str(key)) for key in keys)
     if any(f"{path}.".startswith(f"{key}.") for key in overridden):
         return f"--set {path}"
     line = line_of(keys, text)
@@ -143,18 +143,18 @@ SENTENCES = {
 
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
-    shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shortened(value)
+    shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shorten_repr(value)
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
             known = _known_keys(model, keys[:-1])
             listed = f"; known here: {', '.join(known)}" if known else ""
-            return "unknown key" + (meant(str(keys[-1]), known) or listed)
+            return "unknown key" + (did_you_mean(str(keys[-1]), known) or listed)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
             wanted = context["expected"]
-            return f"is {shown}, must be {wanted}" + meant(str(value), re.findall(r"'([^']*)'", wanted))
+            return f"is {shown}, must be {wanted}" + did_you_mean(str(value), re.findall(r"'([^']*)'", wanted))
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
         case "string_pattern_mismatch" if "!-~" in context["pattern"]:
@@ -166,17 +166,17 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     return f"is {shown}: {detail['msg']}"
 
 
-def meant(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str]) -> str:
     """'; did you mean ...?' for an unknown name; empty if no known name is similar."""
-    return perhaps(nearest(name, known))
+    return suggestion(similar_names(name, known))
 
 
-def perhaps(names: list[str]) -> str:
+def suggestion(names: list[str]) -> str:
     """'; did you mean ...?' for these names; empty for none."""
     return f"; did you mean {' or '.join(names)}?" if names else ""
 
 
-def nearest(name: str, known: Iterable[str]) -> list[str]:
+def similar_names(name: str, known: Iterable[str]) -> list[str]:
     """Known names that an unknown one may stand for.
 
     These are the names that differ only in case and punctuation; else those that begin with it, as when a unit is
@@ -190,7 +190,7 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
     near = [key for key, letters in plain.items() if letters == asked]
     near = near or [key for key, letters in plain.items() if asked and letters.startswith(asked)]
     near = near or [key for key, letters in plain.items() if asked and letters.endswith(asked)]
-    if not near or len(near) > MOST_MEANT:
+    if not near or len(near) > MOST_SUGGESTIONS:
         alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
         near = [key for key, letters in plain.items() if letters in alike]
     return near

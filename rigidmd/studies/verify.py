@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.assemble.build import build
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, State
-from rigidmd.engines.comparison import ERRORS, Line, compare_at, in_words
-from rigidmd.engines.external import OtherEngine, other_engine
+from rigidmd.engines.comparison import ERRORS, Comparison, compare_at, describe_comparison
+from rigidmd.engines.external import ExternalEngine, external_engine
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
@@ -35,8 +35,8 @@ class Verified(NamedTuple):
 
     scene: str
     other: str  # with its version
-    start: list[Line]
-    run: list[Line]
+    start: list[Comparison]
+    run: list[Comparison]
 
     @property
     def agrees(self) -> bool:
@@ -46,8 +46,8 @@ class Verified(NamedTuple):
     def in_words(self) -> str:
         name = self.other.split()[0]
         parts = [f"{self.scene}: rigidmd and {self.other} at the start"]
-        parts += [in_words(self.start, name), f"after {STEPS} steps of {STEP:g} fs at constant energy"]
-        parts += [in_words(self.run, name), "they agree" if self.agrees else "they do NOT agree"]
+        parts += [describe_comparison(self.start, name), f"after {STEPS} steps of {STEP:g} fs at constant energy"]
+        parts += [describe_comparison(self.run, name), "they agree" if self.agrees else "they do NOT agree"]
         return "\n".join(parts)
 
     def told(self) -> dict[str, Any]:
@@ -63,22 +63,22 @@ def verify(scene: Scene) -> Verified:
     """
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body has no other engine: verify is for molecules"])
-    if not scene.engine.is_other:
+    if not scene.engine.is_external:
         raise SceneError(scene.source, [f"engine.name names no other engine; there are {', '.join(EXTERNAL)}"])
     system = build(scene)
     state = start_of(system)
     short = Stage(ensemble="nve", duration_ps=STEPS * STEP * FEMTOSECOND, timestep_fs=STEP)
     system = replace(system, scene=system.scene.model_copy(update={"stages": (short,)}), state=state)
-    other = other_engine(system)
+    other = external_engine(system)
     try:
         start = compare_at(system, state, system.engine_of(system.terms, "double"), other)
         run = _short_run(system, state, other)
-        return Verified(scene.name, other.made_by, start, run)
+        return Verified(scene.name, other.version, start, run)
     finally:
         other.close()
 
 
-def _short_run(system: System, state: State, other: OtherEngine) -> list[Line]:
+def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comparison]:
     """Both engines from the state on: how far sites have moved, and how far apart they are then."""
     rotor, span = other.rotor(system.model), STEPS * STEP * FEMTOSECOND
     here = replace(system, model=system.model._replace(rotor=rotor)) if rotor is not None else system
@@ -90,8 +90,8 @@ def _short_run(system: System, state: State, other: OtherEngine) -> list[Line]:
         ends, doubt = [end for end, _ in found], sum(error for _, error in found)
     apart = float(np.abs(ends[0] - ends[1]).max())
     far = [float(np.abs(end - system.site_positions(state)).max()) for end in ends]
-    allowed = APART * max(1.0, far[0]) + doubt + GROWTH * other.lengths_to * far[0] + _of_accuracy(system, span)
-    return [Line("largest move of a site", "Å", far[0], far[1], apart, allowed)]
+    allowed = APART * max(1.0, far[0]) + doubt + GROWTH * other.length_tolerance * far[0] + _of_accuracy(system, span)
+    return [Comparison("largest move of a site", "Å", far[0], far[1], apart, allowed)]
 
 
 def _sites_after(system: System, engine: Engine, state: State, steps: int) -> np.ndarray:

@@ -8,9 +8,9 @@ import numpy as np
 
 from rigidmd.assemble.body_parts import inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.mechanics.rotation import direction
+from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.solids import SOLIDS
-from rigidmd.scene.body import EVEN, Solid, axis_of_symmetry
+from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
 #: Corners of a circle; a body that has no thickness gets this share of its reach.
 ROUND, THIN = 24, 0.02
@@ -94,10 +94,10 @@ def _top(mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, cen
     along, across = moments[symmetric], moments[symmetric - 1]
     far = float(np.linalg.norm(centre))
     axis, right = axes[:, symmetric], axes[:, symmetric - 2]
-    is_ball = bool(np.ptp(moments) <= EVEN * moments.max())
+    is_ball = bool(np.ptp(moments) <= EQUAL_MOMENTS * moments.max())
     if is_ball and far:
         axis = centre / far
-        right = direction(np.cross(np.eye(3)[np.abs(axis).argmin()], axis))
+        right = unit_vector(np.cross(np.eye(3)[np.abs(axis).argmin()], axis))
     elif axis @ centre < 0:
         axis = -axis
     if is_ball:
@@ -108,7 +108,7 @@ def _top(mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, cen
         radius, half = max(radius, THIN * height), max(height, THIN * 2 * radius) / 2
         rings = [(radius, -half), (radius, half)]
     about = f"the {'ball' if is_ball else 'cylinder'} {EQUAL}"
-    stem = pinned and far > half and float(axis @ centre) > (1 - EVEN) * far
+    stem = pinned and far > half and float(axis @ centre) > (1 - EQUAL_MOMENTS) * far
     if stem:
         thick = min(STEM * far, 0.5 * radius)
         if is_ball:
@@ -135,8 +135,8 @@ def _of_points(places: np.ndarray, masses: np.ndarray) -> Mesh:
     tree = minimum_spanning_tree(far).tocoo()
     for i, j in zip(tree.row, tree.col, strict=True):
         unit, along = _cylinder(), places[j] - places[i]
-        right = direction(np.cross(along, np.eye(3)[np.abs(along).argmin()]))
-        frame = np.stack([0.02 * size * right, 0.02 * size * direction(np.cross(along, right)), along])
+        right = unit_vector(np.cross(along, np.eye(3)[np.abs(along).argmin()]))
+        frame = np.stack([0.02 * size * right, 0.02 * size * unit_vector(np.cross(along, right)), along])
         parts.append((unit.vertices @ frame + (places[i] + places[j]) / 2, unit._replace(painted=[False] * 99)))
     faces, painted, start = [], [], 0
     for vertices, unit in parts:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import atomic_file
 from rigidmd.figures.style import COOL, FAINT, INK, save_figure, settings
 from rigidmd.io.connections import COVALENT, bonds
 from rigidmd.io.write import check_target
@@ -58,7 +58,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     axes.text(corner[0], corner[1] + 0.03 * half, f"{length:g} Å", color=INK, fontsize=FONT, ha="left", va="bottom")
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
     figure.text(0.03, 0.975, title, fontsize=min(13.0, 780 / len(title)), weight="bold", **plain)
-    told = [f"{m.name}: {m.words}"]
+    told = [f"{m.name}: {m.description}"]
     if m.radius > 0:
         told.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
     legend = [
@@ -69,7 +69,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     ]
     told.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(told), fontsize=FONT, linespacing=1.35, **plain)
-    with settings({"svg.hashsalt": m.name}), whole_file(path) as temporary:
+    with settings({"svg.hashsalt": m.name}), atomic_file(path) as temporary:
         metadata = {"Date": None} if path.suffix == ".svg" else None
         save_figure(figure, temporary, dpi=150, metadata=metadata)
 

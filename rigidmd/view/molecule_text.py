@@ -44,7 +44,7 @@ def molecule_text(m: Molecule) -> str:
     moments = " ".join(f"{x:.5g}" for x in m.inertia)
     lines = [
         f"{m.name}: {m.title}" if m.title else m.name,
-        f"  {m.words}",
+        f"  {m.description}",
         f"  {m.degrees_of_freedom} degrees of freedom",
     ]
     lines.append(f"  principal moments {moments} u Å²")

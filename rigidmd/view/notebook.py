@@ -10,10 +10,10 @@ import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.species import species_of
-from rigidmd.assemble.stage_description import stage_in_words
+from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.core.display import html as html_of
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.errors import Faults
+from rigidmd.errors import InputError
 from rigidmd.figures.run import run_figures
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.run.report import body_rows, body_title, stage_rows, stage_title
@@ -67,7 +67,7 @@ def results_html(results: Results) -> str:
     name, first = next(iter(drawn.items()), ("", None))
     right = "" if first is None else f"<div>{_svg(first, name, results)}</div>"
     body = f'<div class="sides">{left}{right}</div>{_columns(results)}'
-    return _shown(results.system.scene.name, results._told, body)
+    return _shown(results.system.scene.name, results._summary_line, body)
 
 
 def _shown(name: str, about: str, body: str) -> str:
@@ -101,7 +101,7 @@ def _rows(scene: Scene) -> list[Row]:
         if isinstance(scene, BodyScene):
             return list(_body_rows(build_body(scene)))
         return list(_molecular_rows(cast(MolecularScene, scene)))
-    except Faults as error:
+    except InputError as error:
         return [("this scene", scene.in_short), *(("fault", fault) for fault in error.faults)]
 
 
@@ -110,7 +110,7 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
     for entry, molecule in zip(scene.molecules, species, strict=True):
         count = f"{entry.count} " if entry.count else ""
         frozen = ", frozen" if entry.frozen else ""
-        yield "molecules", f"{count}{molecule.name}: {molecule.words}{frozen}"
+        yield "molecules", f"{count}{molecule.name}: {molecule.description}{frozen}"
     if scene.structure is not None:
         yield "start", f"from {scene.structure.file}"
     yield "box", _box(scene)
@@ -125,7 +125,7 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
         if getattr(scene.fields, name):
             yield "fields", name.replace("_", " ")
     for stage in scene.stages:
-        yield "stages", stage_in_words(stage)[0]
+        yield "stages", describe_stage(stage)[0]
 
 
 def _box(scene: MolecularScene) -> str:
@@ -142,11 +142,11 @@ def _box(scene: MolecularScene) -> str:
 
 def _body_rows(system: BodySystem) -> Iterable[Row]:
     scene, run = system.scene, system.scene.run
-    pinned = "" if system.flies else ", pinned"
+    pinned = "" if system.translates else ", pinned"
     yield "body", f"{system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of freedom"
-    if system.turns:
+    if system.rotates:
         moments = ", ".join(f"{x:.6g}" for x in system.inertia)
-        yield "moments", f"{moments} kg m² about the {'centre of mass' if system.flies else 'pivot'}"
+        yield "moments", f"{moments} kg m² about the {'centre of mass' if system.translates else 'pivot'}"
         pose = system.pose(0.0, system.state)
         angles = ", ".join(f"{x + 0.0:.6g}°" for x in np.degrees(to_euler_angles(pose.rotation)).round(9))
         spin = float(np.linalg.norm(pose.angular_velocity_body))
@@ -157,7 +157,7 @@ def _body_rows(system: BodySystem) -> Iterable[Row]:
     if acting := [word for name, word in ACTING.items() if getattr(scene, name)]:
         yield "acting", ", ".join(acting)
     yield "run", f"{run.duration_s:g} s in {run.steps} steps of {run.timestep_s:g} s"
-    yield "method", "chosen before the run" if run.is_open else run.integrator
+    yield "method", "chosen before the run" if run.is_auto else run.integrator
     interval = scene.output.interval_s or inf
     yield "samples", f"every {max(1, round(interval / run.timestep_s)) * run.timestep_s:g} s"
 

@@ -15,7 +15,7 @@ from peers import WORKLOADS, choice, start_of
 from scaling import STEP, speed
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import row_of_stage
+from support import integrator_of_stage
 
 from rigidmd import Scene, Simulation
 
@@ -39,7 +39,7 @@ def measure(workload: str, folder: Path, rounds: int, seconds: float) -> dict[st
     run = Simulation(Scene.from_dict(data, folder))
     movers = []
     for k in range(len(stages)):
-        row, engine = row_of_stage(run.system, k), run.system.engine()
+        row, engine = integrator_of_stage(run.system, k), run.system.engine()
         movers.append((engine, engine.begin(run.state, row), row))
 
     warm = [speed(*mover, WARM_UP) for mover in movers]

@@ -12,7 +12,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import build
-from support import row_of_stage as row
+from support import integrator_of_stage as row
 
 import rigidmd
 
@@ -69,7 +69,7 @@ def main() -> None:
             for name, law in laws(float(molecule.epsilon[0]) / 100, float(molecule.sigma[0])).items():
                 of = scene if law is None else scene.model_copy(
                     update={"forces": scene.forces.model_copy(update={"lennard_jones": False})}
-                ).with_own([law])  # fmt: skip
+                ).with_user_code([law])  # fmt: skip
                 system = build(of)
                 engine = system.engine()
                 state = engine.begin(system.state, row(system, 0))

@@ -23,7 +23,7 @@ from peers import choice
 from scaling import STEP, speed
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import row_of_stage as row
+from support import integrator_of_stage as row
 
 from rigidmd import Scene, Simulation, run_together
 

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.user_code.force import Bound, Force, OwnError, changes_momentum
-from rigidmd.assemble.user_code.pair_potential import LawError, PairLaw, check_reach, pair_law
+from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
+from rigidmd.assemble.user_code.pair_potential import PairPotentialError, PairLaw, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.state import State
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
 from rigidmd.engines.cpu import CompileError
-from rigidmd.errors import SceneError, told
+from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.lennard_jones import Tail
-from rigidmd.scene.user_code import Own, name_of
-from rigidmd.scene.validation import meant
+from rigidmd.scene.user_code import UserCode, name_of
+from rigidmd.scene.validation import did_you_mean
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from rigidmd.scene.forces import CustomForce
 
 
-class OwnTerms(NamedTuple):
+class UserTerms(NamedTuple):
     """What users add to a system."""
 
     terms: dict[str, NamedTuple]
-    told: dict[str, Callable[[Any, State], None]]  # of those that Python computes: what the engine asks
+    python_forces: dict[str, Callable[[Any, State], None]]  # of those that Python computes: what the engine asks
     moves: np.ndarray  # (3,) whether they may change components of the total momentum
     thermostat: Any
     notes: list[str]
@@ -50,8 +50,8 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
         except ValueError as error:
             faults.append((None, f"forces.custom.{k}: {error}"))
     if faults:  # of a file once
-        told = {module or fault: fault for module, fault in reversed(faults)}
-        raise SceneError(scene.source, list(told.values())[::-1])
+        messages = {module or fault: fault for module, fault in reversed(faults)}
+        raise SceneError(scene.source, list(messages.values())[::-1])
     return found
 
 
@@ -66,13 +66,13 @@ def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
     module = trusted_module(scene.path(entry.module), f"{key}.module")
     if not hasattr(module, entry.name):
         there = [name for name in vars(module) if not name.startswith("_")]
-        raise ValueError(f"name: {entry.module} has no {entry.name}{meant(entry.name, there) or ''}")
+        raise ValueError(f"name: {entry.module} has no {entry.name}{did_you_mean(entry.name, there) or ''}")
     made = getattr(module, entry.name)
     if isinstance(made, type) or (callable(made) and not isinstance(made, Force)):
         try:
             made = made(**entry.parameters)
         except (Exception, SystemExit) as error:  # whatever a stranger's code raises
-            raise ValueError(f"{entry.name}(...) raised {told(error)}") from error
+            raise ValueError(f"{entry.name}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
         raise ValueError(f"parameters would do nothing: {entry.name} is not called with any")
     return _Named(entry.name, made)
@@ -86,14 +86,14 @@ class _Named(NamedTuple):
 
 
 @contextmanager
-def told_plainly(system: "System") -> Iterator[None]:
+def user_errors_explained(system: "System") -> Iterator[None]:
     """Turn errors of a user's code before the first step, Numba's too, into a SceneError."""
     try:
         yield
-    except OwnError as error:
+    except UserForceError as error:
         raise SceneError(system.scene.source, [f"at the start: {error}"]) from error
     except CompileError as error:
-        if not system.own and system.thermostat is None:
+        if not system.user_terms and system.thermostat is None:
             raise
         unknown = re.findall(r">>> (\S.*)", str(error))
         plain = re.findall(r"Untyped global name '(\w+)'", str(error))
@@ -104,16 +104,16 @@ def told_plainly(system: "System") -> Iterator[None]:
             why = f"it uses {plain[-1]}, which is not compiled: if it is a function, put numba.njit before it"
         else:
             why = f"Numba knows no {unknown[-1]}" if unknown else str(error).strip().splitlines()[-1]
-        names = ", ".join([*system.own, *(["the thermostat"] if system.thermostat is not None else [])])
+        names = ", ".join([*system.user_terms, *(["the thermostat"] if system.thermostat is not None else [])])
         raise SceneError(system.scene.source, [f"{names}: cannot be compiled{where}: {why}"]) from None
 
 
-def own_terms(system: "System") -> OwnTerms:
+def user_terms(system: "System") -> UserTerms:
     """The terms of what a scene and Python add. Raises SceneError with every fault."""
     scene = system.scene
-    everything = Own((*custom_forces(scene), *scene.own.forces))
-    names = everything.of_forces([*system.terms, *system.constants])
-    found = OwnTerms({}, {}, np.zeros(3, bool), scene.own.thermostat, [], {}, [])
+    everything = UserCode((*custom_forces(scene), *scene.user_code.forces))
+    names = everything.force_names([*system.terms, *system.constants])
+    found = UserTerms({}, {}, np.zeros(3, bool), scene.user_code.thermostat, [], {}, [])
     faults = []
     for name, given in zip(names, everything.forces, strict=True):
         made = given.made if isinstance(given, _Named) else given
@@ -121,10 +121,10 @@ def own_terms(system: "System") -> OwnTerms:
             term = _term(made, name, system, found)
             if not isinstance(term, PairForces):
                 found.moves[:] |= changes_momentum(term)
-        except (LawError, SceneError) as error:
+        except (PairPotentialError, SceneError) as error:
             faults += [f"{name}: {fault}" for fault in error.faults]
             continue
-        except (ValueError, OwnError) as error:
+        except (ValueError, UserForceError) as error:
             faults.append(f"{name}: {error}")
             continue
         found.terms[name] = term
@@ -141,7 +141,7 @@ def own_terms(system: "System") -> OwnTerms:
     return found
 
 
-def _term(made: Any, name: str, system: "System", found: OwnTerms) -> NamedTuple:
+def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTuple:
     """The term of one object. Raises LawError, ValueError, OwnError."""
     if isinstance(made, PairLaw):
         law = made.bind(system)
@@ -159,8 +159,8 @@ def _term(made: Any, name: str, system: "System", found: OwnTerms) -> NamedTuple
         found.words[name] = f"{law.formula.text}, {len(law.term.group)} sites, {reach}"
         return law.term
     if isinstance(made, Force):
-        bound = Bound(made, name, system)
-        found.told[name] = bound
+        bound = BoundForce(made, name, system)
+        found.python_forces[name] = bound
         found.words[name] = f"{type(made).__qualname__}, computed by Python"
         return bound.term
     if hasattr(made, "term"):
@@ -169,9 +169,9 @@ def _term(made: Any, name: str, system: "System", found: OwnTerms) -> NamedTuple
         except (ValueError, SceneError):
             raise
         except (Exception, SystemExit) as error:  # whatever a stranger's code raises
-            raise ValueError(f"term(system) raised {told(error)}") from error
+            raise ValueError(f"term(system) raised {describe_error(error)}") from error
     if isinstance(made, PairForces):  # of a law that is not a `PairLaw`
-        check_reach(made.law.cutoff, system)  # type: ignore[attr-defined]  # every law has a cut-off
+        check_cutoff(made.law.cutoff, system)  # type: ignore[attr-defined]  # every law has a cut-off
     if not (isinstance(made, PairForces) or type(made) in FORCES):
         raise ValueError(
             f"{made!r:.80} is no force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "

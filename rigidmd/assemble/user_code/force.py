@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.errors import SimulationError, told
-from rigidmd.forces.fields.python_forces import AskedForces, ToldForces
+from rigidmd.errors import SimulationError, describe_error
+from rigidmd.forces.fields.python_forces import PythonForcesWorkspace, PythonForces
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class HasStage(Protocol):
         ...
 
 
-class OwnError(SimulationError):
+class UserForceError(SimulationError):
     """A force of a user's cannot be computed."""
 
 
@@ -73,19 +73,19 @@ class Force:
         raise NotImplementedError
 
 
-class Bound:
+class BoundForce:
     """A `Force` in a system: asks it, checks what it gives, and turns forces on sites into those on bodies."""
 
     def __init__(self, force: Force, name: str, system: "System"):
         self.force, self.name, self.system = force, name, system
         self._by_site = type(force).on_sites is not Force.on_sites
         if self._by_site == (type(force).on_molecules is not Force.on_molecules):
-            raise OwnError(f"the force {name} must define one of on_sites and on_molecules")
+            raise UserForceError(f"the force {name} must define one of on_sites and on_molecules")
         self._called("begin", force.begin, system)
         n, turns = len(system.state.velocity), len(system.state.rotation) > 0
-        self.term = ToldForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
+        self.term = PythonForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
 
-    def __call__(self, workspace: AskedForces, state: State) -> None:
+    def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
         """Fill a workspace with the forces at a state. Raises OwnError."""
         seen = State(*(_read_only(array) for array in state))
         if self._by_site:
@@ -97,7 +97,7 @@ class Bound:
         self._fill(workspace.force, force, "forces", shape)
         self._fill(workspace.torque_body, torque, "torques", workspace.torque_body.shape)
         if not np.isfinite(energy):
-            raise OwnError(f"the force {self.name} gave the energy {energy}")
+            raise UserForceError(f"the force {self.name} gave the energy {energy}")
         workspace.tally[0] = energy * KJ_PER_MOL
         workspace.tally[1:] = self._virial(virial)
         workspace.fresh[0] = 1
@@ -106,7 +106,7 @@ class Bound:
         """A virial (9,), u Å²/ps²; None is 0."""
         virial = np.zeros((3, 3)) if given is None else _numbers(given)
         if virial is None or virial.shape != (3, 3) or not np.isfinite(virial).all():
-            raise OwnError(f"the force {self.name} gave {given!r:.60} as its virial, not (3, 3) finite numbers")
+            raise UserForceError(f"the force {self.name} gave {given!r:.60} as its virial, not (3, 3) finite numbers")
         return KJ_PER_MOL * virial.ravel()
 
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
@@ -129,11 +129,11 @@ class Bound:
         if not isinstance(found, tuple) or not 2 <= len(found) <= most:
             given = f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
             more = " and perhaps torques and a virial" if most == 4 else " and perhaps a virial"
-            raise OwnError(f"the force {self.name} gave {given}; it must give a tuple of an energy, forces{more}")
+            raise UserForceError(f"the force {self.name} gave {given}; it must give a tuple of an energy, forces{more}")
         try:
             energy = float(found[0])
         except (TypeError, ValueError):
-            raise OwnError(f"the force {self.name} gave {found[0]!r:.60} as its energy, not a number") from None
+            raise UserForceError(f"the force {self.name} gave {found[0]!r:.60} as its energy, not a number") from None
         return [energy, *found[1:], *[None] * (4 - len(found))]
 
     def _fill(
@@ -151,14 +151,14 @@ class Bound:
             return
         array = _numbers(given)
         if array is None:
-            raise OwnError(f"the force {self.name} gave {given!r:.60} as {what}, not real numbers of the shape {shape}")
+            raise UserForceError(f"the force {self.name} gave {given!r:.60} as {what}, not real numbers of the shape {shape}")
         if array.shape != shape:
-            raise OwnError(f"the force {self.name} gave {what} of the shape {array.shape}, not {shape}")
+            raise UserForceError(f"the force {self.name} gave {what} of the shape {array.shape}, not {shape}")
         if not np.isfinite(array).all():
             row = int(np.argmin(np.isfinite(array).all(axis=1)))
             of = row if molecule is None else int(molecule[row])
             which = f"molecule {of + 1} ({self.system.species[self.system.model.species[of]].name})"
-            raise OwnError(f"the force {self.name} gave {array[row]} as {what} on {which}, which is no finite number")
+            raise UserForceError(f"the force {self.name} gave {array[row]} as {what} on {which}, which is no finite number")
         room[:] = size * array
 
     def _called(self, what: str, function: Callable, *arguments: Any) -> Any:
@@ -169,7 +169,7 @@ class Bound:
             while trace is not None and trace.tb_next is not None:
                 trace = trace.tb_next
             line = f", line {trace.tb_lineno} of {trace.tb_frame.f_code.co_filename}" if trace is not None else ""
-            raise OwnError(f"{what} of the force {self.name} raised {told(error)}{line}") from error
+            raise UserForceError(f"{what} of the force {self.name} raised {describe_error(error)}{line}") from error
 
 
 def _numbers(given: Any) -> np.ndarray | None:

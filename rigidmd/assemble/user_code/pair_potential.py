@@ -14,9 +14,9 @@ from rigidmd.forces.potentials.custom import OwnLaw, tail_of
 from rigidmd.forces.potentials.formulas import DISTANCE, Formula, FormulaError, of_function, of_table, of_text
 from rigidmd.forces.potentials.lennard_jones import Tail
 from rigidmd.forces.potentials.truncation import NAMES, Name, ending, shape_of
-from rigidmd.scene.forces import ROUNDED, short_cutoff, usual_start
-from rigidmd.scene.models import Molecule, named_sites, of_each
-from rigidmd.scene.validation import meant
+from rigidmd.scene.forces import MINIMUM_TOLERANCE, short_cutoff_note, default_switch_start
+from rigidmd.scene.models import Molecule, sites_named, gather_per_molecule
+from rigidmd.scene.validation import did_you_mean
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
@@ -30,7 +30,7 @@ REACH = 20.0
 Columns = tuple[Sequence[float], Sequence[float]]
 
 
-class LawError(ValueError):
+class PairPotentialError(ValueError):
     """What is wrong with a pair law in a scene, as sentences."""
 
     def __init__(self, *faults: str):
@@ -65,30 +65,30 @@ class PairLaw:
             assert self.of_function is not None  # a law has a text, a function or a table
             return self.of_function
         except FormulaError as error:
-            raise LawError(str(error)) from None
+            raise PairPotentialError(str(error)) from None
 
-    def bind(self, system: "System") -> "BoundLaw":
+    def bind(self, system: "System") -> "BoundPotential":
         """The law between the sites of a system. Raises LawError with every fault."""
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
-        check_reach(cutoff, system)
+        check_cutoff(cutoff, system)
         name: Name = self.truncation or forces.truncation
         given = self.switch_start_A or (forces.switch_start_A if cutoff == system.cutoff else None)
         if self.switch_start_A is not None and "switch" not in name:
-            raise LawError(f"switch_start_A would do nothing with truncation = {name!r}")
-        start = (given or usual_start(name, cutoff)) if "switch" in name else cutoff
+            raise PairPotentialError(f"switch_start_A would do nothing with truncation = {name!r}")
+        start = (given or default_switch_start(name, cutoff)) if "switch" in name else cutoff
         if not start <= cutoff:
-            raise LawError(f"switch_start_A = {start:g} is beyond the cut-off of {cutoff:g} Å")
+            raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cut-off of {cutoff:g} Å")
         formula = self.formula(cutoff)
-        kinds = _Kinds(self, formula, system.species)
+        kinds = _SiteTypes(self, formula, system.species)
         chosen = [np.flatnonzero([entry is not None for entry in of]) for of in kinds.of_species]
         if not any(len(own) for own in chosen):
-            raise LawError("no site of the scene takes part in it")
+            raise PairPotentialError("no site of the scene takes part in it")
         index = system.model.species
         offsets = [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)]
         sites = sites_of(index, offsets, system.model.inverse_inertia)
         numbers_of = [[kinds.number[entry] for entry in of if entry is not None] for of in kinds.of_species]
-        kind = of_each([np.array(own, int) for own in numbers_of], index)
+        kind = gather_per_molecule([np.array(own, int) for own in numbers_of], index)
         shape = shape_of(name, cutoff, start)
         count = len(kinds.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
@@ -117,9 +117,9 @@ class PairLaw:
             numbers[:, j, i], ends[:, j, i] = numbers[:, i, j], ends[:, i, j]
             acts[i, j] = acts[j, i] = 1.0
         if faults:
-            raise LawError(*dict.fromkeys(faults))
+            raise PairPotentialError(*dict.fromkeys(faults))
         if not acts.any():
-            raise LawError("no pair of sites of the scene has parameters")
+            raise PairPotentialError("no pair of sites of the scene has parameters")
         first = np.argwhere(acts)[0]
         law = OwnLaw(
             cutoff,
@@ -132,11 +132,11 @@ class PairLaw:
             acts,
         )
         frozen = (system.model.inverse_mass == 0)[index]
-        return BoundLaw(
+        return BoundPotential(
             pair_forces(law, sites, groups(sites, frozen)),
             formula,
             beyond if forces.tail_correction else None,
-            [short_cutoff(cutoff, max(short)[1], max(short)[0])] if short else [],
+            [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else [],
         )
 
 
@@ -151,21 +151,21 @@ def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | 
         except (FormulaError, ArithmeticError, ValueError):
             return False
 
-    if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - ROUNDED, 32)):
+    if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - MINIMUM_TOLERANCE, 32)):
         return None
     return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
 
 
-def check_reach(cutoff: float, system: "System") -> None:
+def check_cutoff(cutoff: float, system: "System") -> None:
     """Raise LawError unless the box is large enough for a law's cut-off (Å)."""
     half = min(system.space.edges) / 2
     if cutoff == inf and system.space.volume < inf:
-        raise LawError("it has no cut-off, and the box is periodic: a law in a box needs one (cutoff_A)")
+        raise PairPotentialError("it has no cut-off, and the box is periodic: a law in a box needs one (cutoff_A)")
     if not cutoff <= half:
-        raise LawError(f"its cut-off of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
+        raise PairPotentialError(f"its cut-off of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
 
 
-class BoundLaw(NamedTuple):
+class BoundPotential(NamedTuple):
     """A law in a system."""
 
     term: PairForces
@@ -174,7 +174,7 @@ class BoundLaw(NamedTuple):
     notes: list[str]
 
 
-class _Kinds:
+class _SiteTypes:
     """Kinds of sites that a law tells apart: their parameters, and the entries of `pairs` that mean them."""
 
     def __init__(self, law: PairLaw, formula: Formula, species: list[Molecule]):
@@ -183,9 +183,9 @@ class _Kinds:
         known |= dict.fromkeys(e for m in species for e in m.elements)
         listed = [*(law.of_sites or {}), *law.sites, *(name for pair in law.pairs for name in pair)]
         there = f"; there are {', '.join(known)}"
-        self._meant = {name: named_sites(species, name) for name in listed}
+        self._meant = {name: sites_named(species, name) for name in listed}
         faults = [
-            f"no site is {name!r}{meant(name, list(known)) or there}"
+            f"no site is {name!r}{did_you_mean(name, list(known)) or there}"
             for name, of in self._meant.items()
             if not any(own.any() for own in of)
         ]
@@ -203,7 +203,7 @@ class _Kinds:
             if pair[0] < pair[1] and pair[::-1] in law.pairs
         ]
         if faults:
-            raise LawError(*faults)
+            raise PairPotentialError(*faults)
         self.of_species = [[self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)]
         self.all = sorted({entry for of in self.of_species for entry in of if entry is not None}, key=repr)
         self.number = {entry: k for k, entry in enumerate(self.all)}
@@ -322,7 +322,7 @@ def pair_law(
     if (energy is None) == (table is None):
         raise ValueError("a pair law needs an energy or a table")
     if truncation is not None and truncation not in NAMES:
-        raise ValueError(f"truncation is {truncation!r}{meant(truncation, NAMES) or ''}; there are {', '.join(NAMES)}")
+        raise ValueError(f"truncation is {truncation!r}{did_you_mean(truncation, NAMES) or ''}; there are {', '.join(NAMES)}")
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 
-from rigidmd.core.files import file_fault
-from rigidmd.core.user_modules import OF_FILE, digest_of, module_of
-from rigidmd.errors import SceneError, told
+from rigidmd.core.files import unreadable_reason
+from rigidmd.core.user_modules import USER_FILE_PREFIX, digest_of, module_of
+from rigidmd.errors import SceneError, describe_error
 from rigidmd.scene import Scene
 
 #: Digests of the files that may run.
@@ -45,16 +45,16 @@ def trusted_module(path: Path, key: str) -> ModuleType:
             ],
         )
     try:
-        return module_of(source, str(path), OF_FILE)
+        return module_of(source, str(path), USER_FILE_PREFIX)
     except SceneError:
         raise
     except (Exception, SystemExit) as error:  # whatever a stranger's file raises
         line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
-        raise SceneError(key, [f"{path}{line} raised {told(error)}"]) from error
+        raise SceneError(key, [f"{path}{line} raised {describe_error(error)}"]) from error
 
 
 def _source(path: Path, key: str) -> bytes:
-    if fault := file_fault(path):
+    if fault := unreadable_reason(path):
         raise SceneError(key, [f"{fault}: {path}"])
     try:
         return path.read_bytes()

@@ -14,13 +14,13 @@ from scipy.special import erfc
 from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import as_word, distinct, in_comment
 from rigidmd.core.state import State
-from rigidmd.engines.force_field import Portrait, strange
+from rigidmd.engines.force_field import ForceFieldView, unsupported_terms
 from rigidmd.engines.mass_points import SAME, MassPoints, mass_points
-from rigidmd.engines.rigid_bodies import Bodies, Points
+from rigidmd.engines.rigid_bodies import Points, RigidBodies
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
-from rigidmd.scene.models import Molecule, of_each
+from rigidmd.scene.models import Molecule, gather_per_molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import KJ_PER_MOL
 
@@ -37,22 +37,22 @@ POINT = "MP"
 SEEDS = 2**31 - 1
 
 
-def faults(portrait: Portrait) -> list[str]:
+def unsupported_features(view: ForceFieldView) -> list[str]:
     """What of a scene GROMACS cannot do, in words; empty if it can do all."""
-    system = portrait.system
-    found = [f"{what} is left to rigidmd" for what in strange(system)]
-    if not portrait.boxed or system.cutoff == inf:
+    system = view.system
+    found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
+    if not view.is_periodic or system.cutoff == inf:
         found.append("there is no box: GROMACS computes pairs within a cut-off in a periodic box")
-    if portrait.lennard_jones is not None and portrait.truncation not in MODIFIERS:
-        found.append(f"forces.truncation = {portrait.truncation!r}: GROMACS has {', '.join(MODIFIERS)}")
-    if portrait.electrostatics == "reaction_field" and portrait.truncation not in ("plain", "shift"):
+    if view.lennard_jones is not None and view.truncation not in MODIFIERS:
+        found.append(f"forces.truncation = {view.truncation!r}: GROMACS has {', '.join(MODIFIERS)}")
+    if view.electrostatics == "reaction_field" and view.truncation not in ("plain", "shift"):
         found.append(
-            f"forces.truncation = {portrait.truncation!r} with reaction_field: GROMACS' ends as plain or shift; "
+            f"forces.truncation = {view.truncation!r} with reaction_field: GROMACS' ends as plain or shift; "
             "take one of them, or pme"
         )
-    if portrait.electrostatics in ("ewald", "damped_shifted_force"):
-        found.append(f"forces.electrostatics = {portrait.electrostatics!r}: GROMACS has pme and reaction_field")
-    if portrait.frozen.any():
+    if view.electrostatics in ("ewald", "damped_shifted_force"):
+        found.append(f"forces.electrostatics = {view.electrostatics!r}: GROMACS has pme and reaction_field")
+    if view.frozen.any():
         found.append("frozen molecules: GROMACS would let them act on one another")
     shapes = [_body(m) for m in system.species]
     found += [
@@ -63,11 +63,11 @@ def faults(portrait: Portrait) -> list[str]:
     if sum(len(body.mass) == 3 for body in shapes) > 1:
         found.append("several kinds of planar molecules: GROMACS' SETTLE keeps one kind of triangle")
     for k, stage in enumerate(system.scene.stages):
-        found += [f"stages.{k}.{fault}" for fault in _stage_faults(stage)]
+        found += [f"stages.{k}.{fault}" for fault in _unsupported_in_stage(stage)]
     return found
 
 
-def _stage_faults(stage: Stage) -> list[str]:
+def _unsupported_in_stage(stage: Stage) -> list[str]:
     if stage.is_minimisation:
         return []  # rigidmd itself minimises
     found, kind = [], stage.thermostat_kind
@@ -103,15 +103,15 @@ def _body(molecule: Molecule) -> MassPoints:
     return body if fits and (np.diff(body.site) == 1).all() else mass_points(molecule, sites=False)
 
 
-def write_gromacs(folder: Path, portrait: Portrait, state: State) -> list[str]:
+def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     """Write the files for a system that begins at a state; their names. Raises OutputError."""
-    bodies = [_body(m) for m in portrait.system.species]
-    stages = [(k, stage) for k, stage in enumerate(portrait.system.scene.stages) if not stage.is_minimisation]
+    bodies = [_body(m) for m in view.system.species]
+    stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
     names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
     text = {
-        COORDINATES: _coordinates(portrait, bodies, state),
-        TOPOLOGY: _topology(portrait, bodies),
-        **{f"{name}.mdp": _settings(portrait, k) for name, (k, _) in zip(names, stages, strict=True)},
+        COORDINATES: _coordinates(view, bodies, state),
+        TOPOLOGY: _topology(view, bodies),
+        **{f"{name}.mdp": _settings(view, k) for name, (k, _) in zip(names, stages, strict=True)},
         SCRIPT: _script(names),
     }
     for name, content in text.items():
@@ -137,17 +137,17 @@ def _extra(molecule: Molecule, body: MassPoints) -> int:
     return int((body.site < 0).sum())
 
 
-def _coordinates(portrait: Portrait, bodies: list[MassPoints], state: State) -> str:
+def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -> str:
     """The .gro file, with velocities."""
-    system = portrait.system
+    system = view.system
     species = system.model.species
     at, velocity = system.site_positions(state), system.site_velocities(state)
     extra = Points(
         np.repeat(np.arange(len(species)), [_extra(system.species[k], bodies[k]) for k in species]),
-        of_each([body.position_body[body.site < 0] for body in bodies], species),
-        of_each([body.mass[body.site < 0] for body in bodies], species),
+        gather_per_molecule([body.position_body[body.site < 0] for body in bodies], species),
+        gather_per_molecule([body.mass[body.site < 0] for body in bodies], species),
     )
-    more, more_velocity = _points_at(portrait, extra, state)
+    more, more_velocity = _points_at(view, extra, state)
     width = DECIMALS + 5
     rows, s, e = [], 0, 0
     for n, k in enumerate(species):
@@ -169,15 +169,15 @@ def _coordinates(portrait: Portrait, bodies: list[MassPoints], state: State) -> 
     return "\n".join([f"{system.scene.name}, written by rigidmd", str(len(rows)), *rows, last]) + "\n"
 
 
-def _points_at(portrait: Portrait, points: Points, state: State) -> tuple[np.ndarray, np.ndarray]:
+def _points_at(view: ForceFieldView, points: Points, state: State) -> tuple[np.ndarray, np.ndarray]:
     if not len(points.mass):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    return Bodies(portrait.system, points).points(state)
+    return RigidBodies(view.system, points).points(state)
 
 
-def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
+def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     """The .top file: kinds of sites, all parameters between them, molecules."""
-    system, kinds = portrait.system, portrait.kinds
+    system, kinds = view.system, view.kinds
     lines = [
         f"; {in_comment(system.scene.in_short)}",
         "; Written by rigidmd.",
@@ -186,7 +186,7 @@ def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
         "; nbfunc comb-rule gen-pairs",
     ]
     lines += ["1 2 no", "", "[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
-    rows = [(portrait.sigma[k, k] * NM, portrait.epsilon[k, k] / KJ_PER_MOL) for k in range(len(kinds))]
+    rows = [(view.sigma[k, k] * NM, view.epsilon[k, k] / KJ_PER_MOL) for k in range(len(kinds))]
     lines += [
         f"K{k + 1} {kind.mass:.10g} 0 A {sigma:.12g} {epsilon:.12g} ; {in_comment(kind.name)}"
         for k, (kind, (sigma, epsilon)) in enumerate(zip(kinds, rows, strict=True))
@@ -195,7 +195,7 @@ def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
         lines += [f"{POINT} 0 0 A 0 0 ; a point with mass alone"]
     lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
     lines += [
-        f"K{i + 1} K{j + 1} 1 {portrait.sigma[i, j] * NM:.12g} {portrait.epsilon[i, j] / KJ_PER_MOL:.12g}"
+        f"K{i + 1} K{j + 1} 1 {view.sigma[i, j] * NM:.12g} {view.epsilon[i, j] / KJ_PER_MOL:.12g}"
         for i in range(len(kinds))
         for j in range(i, len(kinds))
     ]
@@ -203,8 +203,8 @@ def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
     for k in sorted(set(index.tolist())):
         first = int(np.flatnonzero(index == k)[0])
         start = int(np.searchsorted(system.sites.molecule, first))
-        own = portrait.kind[start : start + len(system.species[k].masses)]
-        lines += ["", *_molecule(portrait, system.species[k], bodies[k], own, names[k])]
+        own = view.kind[start : start + len(system.species[k].masses)]
+        lines += ["", *_molecule(view, system.species[k], bodies[k], own, names[k])]
     lines += ["", "[ system ]", f"{system.scene.name}", "", "[ molecules ]"]
     ends = np.flatnonzero(np.diff(index, append=-1)) + 1
     for begin, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
@@ -212,9 +212,9 @@ def _topology(portrait: Portrait, bodies: list[MassPoints]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
+def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
     """A moleculetype."""
-    count, charges = len(m.masses), m.charges if portrait.coulomb is not None else np.zeros(len(m.masses))
+    count, charges = len(m.masses), m.charges if view.coulomb is not None else np.zeros(len(m.masses))
     extra = np.cumsum(body.site < 0) - 1
     where = np.where(body.site >= 0, body.site, count + extra)
     mass = np.zeros(count + _extra(m, body))
@@ -234,10 +234,10 @@ def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarra
         lines += ["", "[ settles ]", f"{at[0]} 1 {d[0, 1]:.12g} {d[1, 2]:.12g}"]
     elif len(at) == 2:
         lines += ["", "[ constraints ]", f"{at[0]} {at[1]} 1 {body.distances[0][2] * NM:.12g}"]
-    if body.placed:
+    if body.virtual_sites:
         lines += ["", f"[ virtual_sites{len(at)} ]"]
     points = " ".join(map(str, at))
-    for site, place in body.placed.items():
+    for site, place in body.virtual_sites.items():
         parts = " ".join(f"{weight:.12g}" for weight in place.weight[1:])
         out = f"4 {parts} {place.cross / NM:.12g}" if place.cross else f"1 {parts}"
         lines.append(f"{site + 1} {points} {out}")
@@ -247,9 +247,9 @@ def _molecule(portrait: Portrait, m: Molecule, body: MassPoints, kind: np.ndarra
     return lines
 
 
-def _settings(portrait: Portrait, k: int) -> str:
+def _settings(view: ForceFieldView, k: int) -> str:
     """The .mdp file of stage k."""
-    system = portrait.system
+    system = view.system
     scene, stage = system.scene, system.scene.stages[k]
     cutoff = system.cutoff * NM
 
@@ -281,11 +281,11 @@ def _settings(portrait: Portrait, k: int) -> str:
         "DispCorr": "AllEnerPres" if system.tail is not None else "no",
         "ld-seed": (scene.seed * 1000 + k) % SEEDS,
     }
-    if portrait.lennard_jones is not None:
-        found["vdw-modifier"] = MODIFIERS[portrait.truncation]
-        if "switch" in portrait.truncation:
+    if view.lennard_jones is not None:
+        found["vdw-modifier"] = MODIFIERS[view.truncation]
+        if "switch" in view.truncation:
             found["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
-    return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(portrait) | _bath(stage)).items())
+    return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(view) | _bath(stage)).items())
 
 
 def _integrator(stage: Stage) -> str:
@@ -295,8 +295,8 @@ def _integrator(stage: Stage) -> str:
     return "md" if stage.thermostat_kind == "velocity_rescaling" else "md-vv"
 
 
-def _coulomb(portrait: Portrait) -> dict[str, object]:
-    law, mesh = portrait.coulomb, portrait.system.terms.get("coulomb_reciprocal")
+def _coulomb(view: ForceFieldView) -> dict[str, object]:
+    law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
         return {
             "coulombtype": "PME",
@@ -306,7 +306,7 @@ def _coulomb(portrait: Portrait) -> dict[str, object]:
             "pme-order": mesh.order,
         }
     if isinstance(law, ReactionField):
-        permittivity = portrait.system.scene.forces.reaction_field_permittivity
+        permittivity = view.system.scene.forces.reaction_field_permittivity
         return {"coulombtype": "Reaction-Field", "epsilon-rf": 0 if permittivity == inf else f"{permittivity:.12g}"}
     return {"coulombtype": "Cut-off"}
 

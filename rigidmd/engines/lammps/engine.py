@@ -20,18 +20,18 @@ import numpy as np
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.step_loop import Model
 from rigidmd.engines.cpu import NotFiniteError
-from rigidmd.engines.external import OtherEngine, same
+from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files as files
 from rigidmd.engines.lammps.dump import read_dump
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import Tally
-from rigidmd.engines.rigid_bodies import Bodies
+from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce
-from rigidmd.mechanics.free_rotor import NONE, SplitRotor
-from rigidmd.scene.validation import settled
+from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
+from rigidmd.scene.validation import not_none
 
 #: Begins a line with figures, which also ends an answer.
 FIGURES = "rigidmd:"
@@ -62,17 +62,17 @@ def command(ranks: int) -> list[str]:
     return [launcher, "-n", str(ranks), program]
 
 
-class LammpsEngine(OtherEngine):
+class LammpsEngine(ExternalEngine):
     """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
 
-    `lammps_files.faults` tells what LAMMPS cannot do. Raises EngineError if it is not here.
+    `lammps_files.unsupported_features` tells what LAMMPS cannot do. Raises EngineError if it is not here.
     """
 
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         super().__init__(system, stage)
-        self._styles = files.pair_styles(self._portrait)
-        self._movers = files.movers(self._portrait, stage)
-        self._bodies = Bodies(system)
+        self._styles = files.pair_styles(self._view)
+        self._movers = files.movers(self._view, stage)
+        self._bodies = RigidBodies(system)
         self._process = Process(command(ranks))
         date, there = self._process.say(f'print "{FIGURES} $(version) $(extract_setting(world_size))"')
         if there != ranks:
@@ -81,14 +81,14 @@ class LammpsEngine(OtherEngine):
                 f"{ranks} ranks were asked for, and LAMMPS has {there:.0f}: the launcher is of another MPI than it; "
                 "put its own mpirun on the PATH, or take 1 rank"
             )
-        self.made_by = f"LAMMPS {date:.0f}"
+        self.version = f"LAMMPS {date:.0f}"
 
     def _run(self, state: State, steps: int, dt: float) -> None:
         ramp = f" start 0 stop {self._stage.steps}" if self._stage.ramps else ""
         self._process.say(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        self._give(state)
+        self._send(state)
         load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
@@ -107,12 +107,12 @@ class LammpsEngine(OtherEngine):
         """
         if not isinstance(model.rotor, SplitRotor):
             return model.rotor
-        if (model.rotor.symmetry[model.inertia.any(axis=1)] != NONE).any():
+        if (model.rotor.symmetry[model.inertia.any(axis=1)] != NO_SYMMETRY).any():
             return None
         inverse = model.rotor.inverse_inertia
         largest_first = np.argsort(-model.inertia, axis=1, kind="stable")
         return model.rotor._replace(
-            symmetry=np.full(len(inverse), NONE),
+            symmetry=np.full(len(inverse), NO_SYMMETRY),
             common=np.zeros(len(inverse)),
             excess=inverse.copy(),
             order=largest_first,
@@ -121,38 +121,38 @@ class LammpsEngine(OtherEngine):
     def close(self) -> None:
         self._process.close()
 
-    def _give(self, state: State) -> None:
+    def _send(self, state: State) -> None:
         """Let LAMMPS have a state, unless it has it already."""
-        if same(self._has, state):
+        if same_state(self._known_state, state):
             return
-        drawn, folder = self._portrait, self._process.folder
-        files.write_data(folder / files.DATA, drawn, state)
-        files.write_tables(folder / files.TABLES, drawn)
+        view, folder = self._view, self._process.folder
+        files.write_data(folder / files.DATA, view, state)
+        files.write_tables(folder / files.TABLES, view)
         energies = [f"compute e{n} all pair {files.called(self._styles, n)}" for n in range(len(self._styles))]
         columns = " ".join(f"c_{line.split()[1]}" for line in energies)
         self._process.say(
             "clear",
-            *files.settings(drawn),
+            *files.settings(view),
             f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
             *energies,
             "compute virial all pressure NULL pair kspace",
-            f"thermo_style custom step pe {'elong' if drawn.has_waves else ''} {columns} c_virial[*]",
+            f"thermo_style custom step pe {'elong' if view.is_periodic_coulomb else ''} {columns} c_virial[*]",
             *self._movers,
             "run 0",
         )
-        self._books = 0.0
+        self._heat_offset = 0.0
         given = state.copy()
-        self._take(given)
-        self._books = float(state.books[HEAT] - given.books[HEAT])
-        self._has = state.copy()
+        self._receive(given)
+        self._heat_offset = float(state.books[HEAT] - given.books[HEAT])
+        self._known_state = state.copy()
 
-    def _take(self, state: State) -> None:
+    def _receive(self, state: State) -> None:
         """Fill a state in, in place, with what LAMMPS has, and keep energies and forces for `evaluate`.
 
         Raises NotFiniteError, SimulationError or EngineError.
         """
-        drawn = self._portrait
-        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if drawn.has_waves else [])
+        view = self._view
+        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.is_periodic_coulomb else [])
         asked = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
         figures = self._process.say(
             f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
@@ -161,8 +161,8 @@ class LammpsEngine(OtherEngine):
         dump = read_dump(self._process.folder / DUMP)
         if not (np.isfinite(dump.rows).all() and np.isfinite(figures).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
-        cell = dump.cell if drawn.boxed else state.cell
-        position = dump.rows[:, 1:4] + (dump.rows[:, 4:7] @ cell if drawn.boxed else 0.0)
+        cell = dump.cell if view.is_periodic else state.cell
+        position = dump.rows[:, 1:4] + (dump.rows[:, 4:7] @ cell if view.is_periodic else 0.0)
         found = self._bodies.state(state, position, dump.rows[:, 7:10] * PER_PS, cell)
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
@@ -172,37 +172,37 @@ class LammpsEngine(OtherEngine):
         self._seen = self._bodies.load(state, position, force), tallies
         # LAMMPS' fix rigid tells a conserved energy, but it is none: 512 SPC/E under rigid/nvt changed theirs by 1 % of
         # it in 0.6 ps, at 0.5 fs as at 2 fs
-        if self.counts_heat:
+        if self.conserves_energy:
             put_in = 0.0
         else:
             put_in = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
-        state.books[HEAT] = self._books + put_in
+        state.books[HEAT] = self._heat_offset + put_in
 
     def _virial(self, pressure: list[float], volume: float, position: np.ndarray, force: np.ndarray) -> np.ndarray:
         """The virial of molecules (3, 3), its symmetric part, from that of sites as a pressure xx yy zz xy xz yz."""
-        if not self._portrait.boxed:
+        if not self._view.is_periodic:
             return np.zeros((3, 3))
         xx, yy, zz, xy, xz, yz = np.array(pressure) * files.ATMOSPHERE * volume
-        within = self._bodies.within(position, force)
+        within = self._bodies.intramolecular_virial(position, force)
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (within + within.T) / 2
 
     def _tallies(self, energy: np.ndarray, virial: np.ndarray, volume: float) -> dict[str, Tally]:
         """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
-        drawn, found = self._portrait, {}
-        charge = drawn.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # of LAMMPS' own constant
-        names = ["lennard_jones"] * (len(self._styles) - (drawn.coulomb is not None))
-        if drawn.has_waves:
-            alpha = settled(drawn.system.scene.forces.ewald_alpha_per_A)
+        view, found = self._view, {}
+        charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # of LAMMPS' own constant
+        names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
+        if view.is_periodic_coulomb:
+            alpha = not_none(view.system.scene.forces.ewald_alpha_per_A)
             even = background(float(charge.sum()) ** 2, alpha).strength / volume
             own = self_energy(charge, alpha)
             found = dict(zip([*names, "coulomb_real", "coulomb_reciprocal"], energy, strict=True))
             found["coulomb_reciprocal"] -= own + even
-            if "coulomb_background" in drawn.system.terms:
+            if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
-        elif drawn.coulomb is not None:
+        elif view.coulomb is not None:
             found = dict(zip([*names, "coulomb"], energy, strict=True))
-            if isinstance(drawn.coulomb, DampedShiftedForce):
-                law = drawn.coulomb
+            if isinstance(view.coulomb, DampedShiftedForce):
+                law = view.coulomb
                 found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
         else:
             found = dict(zip(names, energy, strict=True))

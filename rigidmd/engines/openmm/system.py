@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erfc
 
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula
-from rigidmd.engines.force_field import Portrait, strange
+from rigidmd.engines.force_field import ForceFieldView, unsupported_terms
 from rigidmd.engines.mass_points import MassPoints, mass_points
 from rigidmd.engines.rigid_bodies import Points
 from rigidmd.engines.system import charges_in
@@ -23,7 +23,7 @@ from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Plain, Switched
-from rigidmd.scene.models import of_each
+from rigidmd.scene.models import gather_per_molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
@@ -50,28 +50,28 @@ def library() -> Any:
     return openmm
 
 
-def faults(portrait: Portrait) -> list[str]:
+def unsupported_features(view: ForceFieldView) -> list[str]:
     """What of a scene OpenMM cannot do, in words; empty if it can do all."""
-    system, forces = portrait.system, portrait.system.scene.forces
-    found = [f"{what} is left to rigidmd" for what in strange(system)]
-    if portrait.has_waves and grid_for(portrait, PME_ORDER) is None:
+    system, forces = view.system, view.system.scene.forces
+    found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
+    if view.is_periodic_coulomb and grid_for(view, PME_ORDER) is None:
         found.append(
             f"forces.electrostatics = {forces.electrostatics!r}: no grid for OpenMM's splines, of order {PME_ORDER}, "
             "has the accuracy asked for; ask for less"
         )
     for k, stage in enumerate(system.scene.stages):
-        found += [f"stages.{k}.{fault}" for fault in _stage_faults(stage)]
-    if portrait.frozen.any() and any(stage.has_barostat for stage in system.scene.stages):
+        found += [f"stages.{k}.{fault}" for fault in _unsupported_in_stage(stage)]
+    if view.frozen.any() and any(stage.has_barostat for stage in system.scene.stages):
         found.append("a barostat with frozen molecules: OpenMM would move them with the box")
     return found
 
 
-def grid_for(portrait: Portrait, order: int) -> tuple[int, int, int] | None:
+def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
     """A grid for splines of an order with the accuracy of the scene's Ewald sum; None if there is none.
 
     The scene's own grid if its splines are of that order or a lower one.
     """
-    system, law = portrait.system, portrait.coulomb
+    system, law = view.system, view.coulomb
     own = system.terms.get("coulomb_reciprocal")
     if isinstance(own, Pme) and own.order <= order:
         a, b, c = own.grid
@@ -86,7 +86,7 @@ def grid_for(portrait: Portrait, order: int) -> tuple[int, int, int] | None:
     return None if found is None else found[0]
 
 
-def _stage_faults(stage: Stage) -> list[str]:
+def _unsupported_in_stage(stage: Stage) -> list[str]:
     if stage.is_minimisation:
         return []  # rigidmd itself minimises
     found, allowed, kind = [], ("velocity_verlet",), stage.thermostat_kind
@@ -121,7 +121,7 @@ class Layout(NamedTuple):
     first: np.ndarray  # (n,) first particle of each molecule
     local: list[np.ndarray]  # for each species the particles of its points, from the first one of the molecule
 
-    def excluded(self, portrait: Portrait) -> list[tuple[int, int]]:
+    def excluded(self, view: ForceFieldView) -> list[tuple[int, int]]:
         """Pairs of particles that do not act on one another: those of one molecule, and of frozen ones."""
         count = np.diff([*self.first, len(self.mass)])
         pairs = [
@@ -130,15 +130,15 @@ class Layout(NamedTuple):
             for i in range(n)
             for j in range(i + 1, n)
         ]
-        still = np.flatnonzero(portrait.frozen[self.molecule])
+        still = np.flatnonzero(view.frozen[self.molecule])
         other = np.triu_indices(len(still), 1)
         apart = self.molecule[still[other[0]]] != self.molecule[still[other[1]]]
         return pairs + list(zip(still[other[0]][apart].tolist(), still[other[1]][apart].tolist(), strict=True))
 
 
-def layout(portrait: Portrait) -> Layout:
+def layout(view: ForceFieldView) -> Layout:
     """The particles that stand for the molecules of a system: of each its sites, in their order, then other points."""
-    system = portrait.system
+    system = view.system
     species, frozen = system.model.species, system.model.inverse_mass == 0
     bodies = [mass_points(m, bool(still)) for m, still in zip(system.species, frozen, strict=True)]
     local, mass = [], []
@@ -155,11 +155,11 @@ def layout(portrait: Portrait) -> Layout:
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),
-        of_each([body.position_body for body in bodies], species),
-        of_each([body.mass for body in bodies], species),
+        gather_per_molecule([body.position_body for body in bodies], species),
+        gather_per_molecule([body.mass for body in bodies], species),
     )
     return Layout(
-        of_each(mass, species),
+        gather_per_molecule(mass, species),
         np.repeat(np.arange(len(species)), count),
         np.repeat(first, sites) + within,
         np.concatenate([first[i] + local[k] for i, k in enumerate(species)]),
@@ -170,7 +170,7 @@ def layout(portrait: Portrait) -> Layout:
     )
 
 
-def openmm_system(portrait: Portrait, particles: Layout, cell: np.ndarray, apart: bool) -> "openmm.System":
+def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, apart: bool) -> "openmm.System":
     """OpenMM's System, with all forces but a barostat; cell (3, 3) is that of the state it begins with.
 
     apart : whether Lennard-Jones and Coulomb forces are two forces even where one can do both, which is faster: a step
@@ -180,18 +180,18 @@ def openmm_system(portrait: Portrait, particles: Layout, cell: np.ndarray, apart
     made = mm.System()
     for mass in particles.mass:
         made.addParticle(float(mass))
-    if portrait.boxed:
+    if view.is_periodic:
         made.setDefaultPeriodicBoxVectors(*(cell * NM).tolist())
-    for a, k in zip(particles.first, portrait.system.model.species, strict=True):
+    for a, k in zip(particles.first, view.system.model.species, strict=True):
         body, where = particles.of_species[k], (particles.local[k] + a).tolist()
-        if portrait.frozen[particles.molecule[a]]:
+        if view.frozen[particles.molecule[a]]:
             continue
         for i, j, distance in body.distances:
             made.addConstraint(where[i], where[j], distance * NM)
-        for site, place in body.placed.items():
+        for site, place in body.virtual_sites.items():
             made.setVirtualSite(int(a) + site, _virtual(mm, where, place.weight.tolist(), place.cross))
-    excluded = particles.excluded(portrait)
-    for force, group in _forces(mm, portrait, particles, apart):
+    excluded = particles.excluded(view)
+    for force, group in _forces(mm, view, particles, apart):
         force.setForceGroup(group)
         add = force.addException if isinstance(force, mm.NonbondedForce) else None
         for i, j in excluded if group != TAIL else []:
@@ -215,60 +215,60 @@ def _virtual(mm: Any, points: list[int], weight: list[float], cross: float):
     return mm.LocalCoordinatesSite(points, weight, [-1, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0])
 
 
-def _forces(mm: Any, portrait: Portrait, particles: Layout, apart: bool) -> list[tuple]:
+def _forces(mm: Any, view: ForceFieldView, particles: Layout, apart: bool) -> list[tuple]:
     """Forces and their groups."""
-    found, law, coulomb = [], portrait.lennard_jones, portrait.coulomb
-    plain = _plain_lennard_jones(portrait)
+    found, law, coulomb = [], view.lennard_jones, view.coulomb
+    plain = _plain_lennard_jones(view)
     own_charges = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)
     together = plain is not None and own_charges and not apart
-    if law is not None and portrait.epsilon.any():
+    if law is not None and view.epsilon.any():
         if plain is None:
-            found.append((_own_lennard_jones(mm, portrait, particles), LENNARD_JONES))
+            found.append((_own_lennard_jones(mm, view, particles), LENNARD_JONES))
         elif not together:
-            force = _nonbonded(mm, portrait, particles, law.cutoff, np.zeros_like(portrait.charge), plain)
+            force = _nonbonded(mm, view, particles, law.cutoff, np.zeros_like(view.charge), plain)
             found.append((force, LENNARD_JONES))
-        if portrait.boxed and isinstance(law.shape, Plain) and portrait.truncation == "plain":
-            found.append((_own_lennard_jones(mm, portrait, particles, step=True), STEP_LENNARD_JONES))
+        if view.is_periodic and isinstance(law.shape, Plain) and view.truncation == "plain":
+            found.append((_own_lennard_jones(mm, view, particles, step=True), STEP_LENNARD_JONES))
     if coulomb is not None and own_charges:
-        force = _nonbonded(mm, portrait, particles, coulomb.cutoff, portrait.charge, plain if together else None)
+        force = _nonbonded(mm, view, particles, coulomb.cutoff, view.charge, plain if together else None)
         found.append((force, COULOMB_PAIRS))
         if isinstance(coulomb, ScreenedCoulomb):
             force.setNonbondedMethod(mm.NonbondedForce.PME)
-            force.setPMEParameters(float(coulomb.alpha) / NM, *(grid_for(portrait, PME_ORDER) or ()))
+            force.setPMEParameters(float(coulomb.alpha) / NM, *(grid_for(view, PME_ORDER) or ()))
             force.setReciprocalSpaceForceGroup(RECIPROCAL)
             height = f"{-float(erfc(coulomb.alpha * coulomb.cutoff)) / coulomb.cutoff!r}"
-            found.append((_between_charges(mm, portrait, particles, height), STEP_COULOMB))
+            found.append((_between_charges(mm, view, particles, height), STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
-        found.append((_between_charges(mm, portrait, particles, coulomb_formula(coulomb, 1.0)), COULOMB_PAIRS))
-        if portrait.boxed and not isinstance(coulomb, DampedShiftedForce) and portrait.truncation == "plain":
+        found.append((_between_charges(mm, view, particles, coulomb_formula(coulomb, 1.0)), COULOMB_PAIRS))
+        if view.is_periodic and not isinstance(coulomb, DampedShiftedForce) and view.truncation == "plain":
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
-            found.append((_between_charges(mm, portrait, particles, height), STEP_COULOMB))
-    if (tail := portrait.system.tail) is not None:
+            found.append((_between_charges(mm, view, particles, height), STEP_COULOMB))
+    if (tail := view.system.tail) is not None:
         energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
         found.append((mm.CustomVolumeForce(f"{energy!r}/v"), TAIL))
     return found
 
 
-def _plain_lennard_jones(portrait: Portrait) -> tuple[np.ndarray, np.ndarray] | None:
+def _plain_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
     """sigma and epsilon of kinds where OpenMM's own law is that of the scene; None where it is not."""
-    law = portrait.lennard_jones
-    if law is None or not (law.cutoff == inf or portrait.truncation in ("plain", "switch")):
+    law = view.lennard_jones
+    if law is None or not (law.cutoff == inf or view.truncation in ("plain", "switch")):
         return None
-    return _mixed_by_lorentz_berthelot(portrait)
+    return _mixed_by_lorentz_berthelot(view)
 
 
-def _mixed_by_lorentz_berthelot(portrait: Portrait) -> tuple[np.ndarray, np.ndarray] | None:
+def _mixed_by_lorentz_berthelot(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
     """sigma and epsilon of kinds if those between kinds follow from them, else None."""
-    sigma, epsilon = portrait.sigma.diagonal(), portrait.epsilon.diagonal()
-    deep = portrait.epsilon > 0
-    same = np.allclose(portrait.epsilon, np.sqrt(np.outer(epsilon, epsilon)), rtol=ROUNDING, atol=0)
-    wide = np.isclose(portrait.sigma, (sigma[:, None] + sigma) / 2, rtol=ROUNDING, atol=0)
+    sigma, epsilon = view.sigma.diagonal(), view.epsilon.diagonal()
+    deep = view.epsilon > 0
+    same = np.allclose(view.epsilon, np.sqrt(np.outer(epsilon, epsilon)), rtol=ROUNDING, atol=0)
+    wide = np.isclose(view.sigma, (sigma[:, None] + sigma) / 2, rtol=ROUNDING, atol=0)
     return (sigma, epsilon) if same and wide[deep].all() else None
 
 
 def _nonbonded(
     mm: Any,
-    portrait: Portrait,
+    view: ForceFieldView,
     particles: Layout,
     cutoff: float,
     charge: np.ndarray,
@@ -277,7 +277,7 @@ def _nonbonded(
     """A NonbondedForce between charges (s,) of sites, and with sigma and epsilon of kinds."""
     force = mm.NonbondedForce()
     force.setUseDispersionCorrection(False)
-    force.setNonbondedMethod(_method(mm.NonbondedForce, portrait, cutoff))
+    force.setNonbondedMethod(_method(mm.NonbondedForce, view, cutoff))
     if cutoff < inf:
         force.setCutoffDistance(cutoff * NM)
     rows = np.zeros((len(particles.mass), 3))
@@ -285,9 +285,9 @@ def _nonbonded(
     rows[particles.site, 0] = charge
     if lennard_jones is not None:
         sigma, epsilon = lennard_jones
-        rows[particles.site, 1] = sigma[portrait.kind] * NM
-        rows[particles.site, 2] = epsilon[portrait.kind] / KJ_PER_MOL
-        if (law := portrait.lennard_jones) and isinstance(law.shape, Switched):
+        rows[particles.site, 1] = sigma[view.kind] * NM
+        rows[particles.site, 2] = epsilon[view.kind] / KJ_PER_MOL
+        if (law := view.lennard_jones) and isinstance(law.shape, Switched):
             force.setUseSwitchingFunction(True)
             force.setSwitchingDistance(float(law.shape.start) * NM)
     for row in rows.tolist():
@@ -295,17 +295,19 @@ def _nonbonded(
     return force
 
 
-def _method(kind, portrait: Portrait, cutoff: float) -> int:
+def _method(kind, view: ForceFieldView, cutoff: float) -> int:
     if cutoff == inf:
         return kind.NoCutoff
-    return kind.CutoffPeriodic if portrait.boxed else kind.CutoffNonPeriodic
+    return kind.CutoffPeriodic if view.is_periodic else kind.CutoffNonPeriodic
 
 
-def _custom(mm: Any, portrait: Portrait, particles: Layout, cutoff: float, formula: str, values: dict[str, np.ndarray]):
+def _custom(
+    mm: Any, view: ForceFieldView, particles: Layout, cutoff: float, formula: str, values: dict[str, np.ndarray]
+):
     """A CustomNonbondedForce of a formula of r in Å, with values (s,) of sites."""
     text = re.sub(r"\br\b", "R", formula)
     force = mm.CustomNonbondedForce(f"{text}; R={1 / NM!r}*r" if text != formula else text)
-    force.setNonbondedMethod(_method(mm.CustomNonbondedForce, portrait, cutoff))
+    force.setNonbondedMethod(_method(mm.CustomNonbondedForce, view, cutoff))
     if cutoff < inf:
         force.setCutoffDistance(cutoff * NM)
     rows = np.zeros((len(particles.mass), len(values)))
@@ -317,12 +319,12 @@ def _custom(mm: Any, portrait: Portrait, particles: Layout, cutoff: float, formu
     return force
 
 
-def _own_lennard_jones(mm: Any, portrait: Portrait, particles: Layout, step: bool = False):
+def _own_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: bool = False):
     """The law as a formula, or the step that it makes at the cut-off; linear in c12 and c6, which tables of kinds give.
 
     Kind 0 of the tables is that of points that are no sites.
     """
-    law = portrait.lennard_jones
+    law = view.lennard_jones
     assert isinstance(law, LennardJones)
     if step:
         formula = f"c6*{law.cutoff**-6!r}-c12*{law.cutoff**-12!r}"
@@ -330,11 +332,11 @@ def _own_lennard_jones(mm: Any, portrait: Portrait, particles: Layout, step: boo
         parts = [lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0))]
         definitions = f";{parts[0][1]}" if len(parts[0]) == 2 else ""
         formula = f"c12*({parts[0][0]})+c6*({parts[1][0]}){definitions}"
-    six = portrait.sigma**6
-    c6 = 4 * portrait.epsilon * six / KJ_PER_MOL
+    six = view.sigma**6
+    c6 = 4 * view.epsilon * six / KJ_PER_MOL
     force = _custom(
-        mm, portrait, particles, law.cutoff,
-        f"{formula}; c12=table12(kind1,kind2); c6=table6(kind1,kind2)", {"kind": portrait.kind + 1},
+        mm, view, particles, law.cutoff,
+        f"{formula}; c12=table12(kind1,kind2); c6=table6(kind1,kind2)", {"kind": view.kind + 1},
     )  # fmt: skip
     size = len(c6) + 1
     for name, table in (("table12", c6 * six), ("table6", c6)):
@@ -344,11 +346,11 @@ def _own_lennard_jones(mm: Any, portrait: Portrait, particles: Layout, step: boo
     return force
 
 
-def _between_charges(mm: Any, portrait: Portrait, particles: Layout, formula: str):
+def _between_charges(mm: Any, view: ForceFieldView, particles: Layout, formula: str):
     """q q times a formula of unit strength; charges are in units where q q/r is in kJ/mol."""
-    law = portrait.coulomb
+    law = view.coulomb
     assert law is not None
     main, *definitions = formula.split(";", 1)
-    charge = portrait.charge * np.sqrt(COULOMB / KJ_PER_MOL)
+    charge = view.charge * np.sqrt(COULOMB / KJ_PER_MOL)
     text = "; ".join([f"q1*q2*({main})", *definitions])
-    return _custom(mm, portrait, particles, law.cutoff, text, {"q": charge})
+    return _custom(mm, view, particles, law.cutoff, text, {"q": charge})

@@ -14,7 +14,7 @@ import gsd.fl
 import gsd.hoomd
 import numpy as np
 
-from rigidmd.core.files import begin_file, file_fault, whole_file
+from rigidmd.core.files import atomic_file, create_empty_file, unreadable_reason
 from rigidmd.core.state import State
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
@@ -22,7 +22,7 @@ from rigidmd.io.connections import charges, connections
 from rigidmd.io.formats.gsd import TIME, GsdReader, box_of, momentum_quaternion
 from rigidmd.io.write import writing
 from rigidmd.mechanics.rotation import to_quaternion
-from rigidmd.scene.models import of_each
+from rigidmd.scene.models import gather_per_molecule
 
 #: Å; a viewer draws the central particle as a dot.
 DOT = 0.1
@@ -52,7 +52,7 @@ class GsdFile:
                 pass
             return
         try:
-            begin_file(path)
+            create_empty_file(path)
             self._file = gsd.hoomd.open(str(path), "w")
         except (OSError, RuntimeError) as error:
             raise OutputError(f"{path} cannot be written: {_reason(error)}") from None
@@ -74,7 +74,7 @@ class GsdFile:
     def cut(self) -> None:
         """Leave out the frames that came after the time of `kept`."""
         try:
-            with whole_file(self._path) as temporary, gsd.hoomd.open(str(temporary), "w") as new:
+            with atomic_file(self._path) as temporary, gsd.hoomd.open(str(temporary), "w") as new:
                 for frame in self._kept_frames():
                     self._append(new, frame)
             self._file = gsd.hoomd.open(str(self._path), "r+")
@@ -96,7 +96,7 @@ class GsdFile:
         """The frames that a checkpoint knows, one after the other. Raises OutputError if they have changed."""
         self._sum, (kept_sum, self._frames) = 0, self._kept or (0, 0)
         try:
-            if fault := file_fault(self._path):
+            if fault := unreadable_reason(self._path):
                 raise ValueError(fault)
             reader, sizes = GsdReader(self._path), {len(self._constant["mass"])}
             if reader.count < self._frames or not {reader.size(k) for k in range(self._frames)} <= sizes:
@@ -160,7 +160,7 @@ class GsdFile:
             np.array([label(m.name, *both) for both in zip(own, m.site_names, strict=True)], dtype=object)
             for m, own in zip(self._system.species, names, strict=True)
         ]
-        return of_each(labels, self._system.model.species)
+        return gather_per_molecule(labels, self._system.model.species)
 
     def _frame(self, state: State, time: float, step: int) -> Any:
         system, sites = self._system, self._constituent

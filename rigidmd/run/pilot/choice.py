@@ -1,7 +1,7 @@
 """The cheapest integrator and time step for an accuracy, found by runs from the start.
 
 Cost is counted in force evaluations, not seconds, so a scene leads to the same choice on every machine. An error of the
-energy is to hold over the whole run: short pilots measure the regular error of each step, `measure.walk` the random
+energy is to hold over the whole run: short pilots measure the regular error of each step, `measure.energy_walk` the random
 walk of the energy by truncated forces, and a longer pilot of the best step its slow regular error.
 """
 
@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.drift import OF_ENERGY
+from rigidmd.core.drift import ENERGY_ERROR
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
-from rigidmd.run.pilot.trials import Subject, Trial, end_of, gap, look
-from rigidmd.run.pilot.walk import Walk, walk
+from rigidmd.run.pilot.trials import TrialSystem, Trial, final_state, state_difference, measure_errors
+from rigidmd.run.pilot.energy_walk import EnergyWalk, energy_walk
 
 #: Tried in this order. A later one is given up at a step that is too long and costs more.
 CANDIDATES = ("srkn_4", "two_stage", "velocity_verlet", "pefrl", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
@@ -48,10 +48,10 @@ class Choice(NamedTuple):
 class _Search:
     """The longest steps of the candidates within a target for an error (an attribute of `Trial`) over a time."""
 
-    def __init__(self, subject: Subject, target: float, error: str, longest: dict[str, float], exact: State | None):
-        self.subject, self.target, self.error, self.longest, self.exact = subject, target, error, longest, exact
-        self.walk: Walk | None = None
-        self.time = subject.span
+    def __init__(self, trial_system: TrialSystem, target: float, error: str, longest: dict[str, float], exact: State | None):
+        self.trial_system, self.target, self.error, self.longest, self.exact = trial_system, target, error, longest, exact
+        self.energy_walk: EnergyWalk | None = None
+        self.time = trial_system.span
         self.slow: dict[str, float] = {}  # regular errors over a longer pilot, in those of the short one
         self.found: dict[str, Trial] = {}
         self.measured: dict[str, Trial] = {}  # the last one of each that has an error
@@ -69,33 +69,33 @@ class _Search:
 
     def cost(self, trial: Trial) -> float:
         """Forces per unit of time of the span."""
-        subject = self.subject
-        return subject.methods[trial.integrator].force_evaluations / (trial.timestep * subject.time_size)
+        trial_system = self.trial_system
+        return trial_system.methods[trial.integrator].force_evaluations / (trial.timestep * trial_system.time_size)
 
     def walked(self, name: str, timestep: float, time: float) -> float:
         """Mean square of the energy's walk."""
-        scheme = self.subject.methods[name].how
-        if self.walk is None or not isinstance(scheme, Scheme):
+        scheme = self.trial_system.methods[name].scheme
+        if self.energy_walk is None or not isinstance(scheme, Scheme):
             return 0.0
-        return self.walk.square(scheme, timestep * self.subject.time_size, time)
+        return self.energy_walk.square(scheme, timestep * self.trial_system.time_size, time)
 
     def expected(self, trial: Trial, timestep: float | None = None) -> float:
         """Error over the time; at another step by the order of the integrator."""
         name, step = trial.integrator, timestep or trial.timestep
-        order = self.subject.methods[name].order
+        order = self.trial_system.methods[name].order
         regular = self.slow.get(name, 1.0) * getattr(trial, self.error) * (step / trial.timestep) ** order
         return sqrt(regular**2 + self.walked(name, step, self.time))
 
     def trial(self, name: str, timestep: float, span: float | None = None) -> Trial:
         """A trial of an integrator at a step; it ends exactly at the span if trajectories are compared."""
-        subject = self.subject if span is None else replace(self.subject, span=span)
-        n = max(1, ceil(subject.span / (timestep * subject.time_size) * (1 - 1e-12)))
+        trial_system = self.trial_system if span is None else replace(self.trial_system, span=span)
+        n = max(1, ceil(trial_system.span / (timestep * trial_system.time_size) * (1 - 1e-12)))
         if self.exact is not None:
-            timestep = subject.span / n / subject.time_size
+            timestep = trial_system.span / n / trial_system.time_size
         if span is None and (name, timestep) in self._tried:
             return self._tried[name, timestep]
-        trial = Trial(name, timestep, n, n * subject.methods[name].force_evaluations)
-        look(subject, trial, self.exact)
+        trial = Trial(name, timestep, n, n * trial_system.methods[name].force_evaluations)
+        measure_errors(trial_system, trial, self.exact)
         if span is None:
             self._tried[name, timestep] = trial
         return trial
@@ -133,47 +133,47 @@ class _Search:
 
 
 def choose(
-    subject: Subject, target: float, error: str, longest: dict[str, float], duration: float | None = None
+    trial_system: TrialSystem, target: float, error: str, longest: dict[str, float], duration: float | None = None
 ) -> Choice:
     """The integrator and step with the fewest forces that keep an error (an attribute of `Trial`) below a target.
 
     longest : the longest step to try of each integrator, in the subject's unit. duration : of the run over which an
     error of the energy is to hold, if not the span. Raises SimulationError.
     """
-    exact = _reference(subject, target) if error == "trajectory_error" else None
-    search = _Search(subject, target, error, longest, exact)
+    exact = _reference(trial_system, target) if error == "trajectory_error" else None
+    search = _Search(trial_system, target, error, longest, exact)
     first = search.best()
     if first is None:
         least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
         reached = "" if least is None else (
-            f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {subject.time_unit}"
+            f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {trial_system.time_unit}"
         )  # fmt: skip
         raise SimulationError(f"no integrator keeps its error below {target:g} with any step tried{reached}")
     best = first
-    per = "ps" if subject.time_unit == "fs" else "s"
-    value, over, words = getattr(best, error), f"over {subject.span:.3g} {per}", ""
-    if duration is not None and duration > subject.span:
+    per = "ps" if trial_system.time_unit == "fs" else "s"
+    value, over, words = getattr(best, error), f"over {trial_system.span:.3g} {per}", ""
+    if duration is not None and duration > trial_system.span:
         best, value, words = _over(search, best, duration)
         over = f"over {duration:.4g} {per}"
     cost, before = search.cost(best), search.cost(first)
-    kind = OF_ENERGY if error == "energy_rms" else "error of the trajectory"
+    kind = ENERGY_ERROR if error == "energy_rms" else "error of the trajectory"
     reason = f"{kind} {value:.1e} {over} for a target of {target:g}{words}; {cost:.4g} forces per {per}"
     common = search.measured.get("velocity_verlet")
     if common is not None and best.integrator != "velocity_verlet":
         step = min(search.step_for(common), longest["velocity_verlet"])
         fewer = search.cost(common) * common.timestep / step / cost
-        reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {subject.time_unit}"
+        reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {trial_system.time_unit}"
     if value > target:
         reason += f"; no step tried keeps the target over that time: {REMEDIES}"
     elif cost > 1.5 * before and search.walked(best.integrator, best.timestep, search.time) > 0.1 * value**2:
-        reason += f"; {cost / before:.1f} times as many as for {subject.span:.3g} {per} only: {REMEDIES}"
+        reason += f"; {cost / before:.1f} times as many as for {trial_system.span:.3g} {per} only: {REMEDIES}"
     return Choice(best.integrator, best.timestep, value, cost, reason)
 
 
 def _over(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
     """The best trial for a run that is longer than its pilots, its expected error, and in words how it was found."""
-    span, target = search.subject.span, search.target
-    search.walk, search.time = walk(search.subject, first.timestep), duration
+    span, target = search.trial_system.span, search.target
+    search.energy_walk, search.time = energy_walk(search.trial_system, first.timestep), duration
     search.target = SAFE * target
     long = min(duration, MOST * span, max(LEAST * span, PART * duration))
     best, value, seen = first, search.expected(first), first
@@ -192,7 +192,7 @@ def _over(search: _Search, first: Trial, duration: float) -> tuple[Trial, float,
             break
         regular = sqrt(max(square - there, best.energy_rms**2))
         search.slow[name] = max(1.2 * search.slow.get(name, 1.0), regular / (best.energy_rms or regular or 1.0))
-    pilot = seen.steps * seen.timestep * search.subject.time_size
+    pilot = seen.steps * seen.timestep * search.trial_system.time_size
     return best, value, f" (expected, from {seen.energy_rms:.1e} in a pilot of {pilot:.3g} ps)"
 
 
@@ -202,15 +202,15 @@ def rounded_down(step: float) -> float:
     return float(f"{floor(step / unit) * unit:.3g}")
 
 
-def _reference(subject: Subject, target: float) -> State:
+def _reference(trial_system: TrialSystem, target: float) -> State:
     """The state at the end of the span, exact to a tenth of the target. Raises SimulationError."""
-    method = subject.methods[subject.reference]
+    method = trial_system.methods[trial_system.reference]
     steps = 16
-    before = end_of(subject, method, steps)
+    before = final_state(trial_system, method, steps)
     for _ in range(HALVINGS):
         steps *= 2
-        now = end_of(subject, method, steps)
-        rotation, position = gap(now, before)
+        now = final_state(trial_system, method, steps)
+        rotation, position = state_difference(now, before)
         if (position if rotation != rotation else rotation) <= 0.1 * target:
             return now
         before = now

@@ -24,13 +24,13 @@ from math import inf, isfinite, sqrt
 
 import numpy as np
 
-from rigidmd.assemble.stage_flows import row
+from rigidmd.assemble.stage_flows import integrator_of_stage
 from rigidmd.core.state import State
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.run.pilot.choice import rounded_down
-from rigidmd.run.pilot.stable_step import stable_angle, stiffest
+from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
@@ -44,12 +44,12 @@ BASIS = {
     "baoab": "as one of two parts that cancel in harmonic motions",
 }
 #: A step of the pilot, and its length, for one radian of the mean motion of translation or rotation, the faster one.
-STEP, SPAN, LOOKS = 0.15, 50.0, 25
+PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
 #: Longest step, in the longest stable one of the start: beyond it more than dt² counts.
 LONGEST = 0.5
 
 
-def square_rate(system: System, engine: Engine, state: State, thermal: float) -> tuple[float, float]:
+def sums_of_square_frequencies(system: System, engine: Engine, state: State, thermal: float) -> tuple[float, float]:
     """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal` (u Å²/ps²).
 
     By equipartition <F²/m> = kT sum w², and the same of torques. Exact in the mean over the canonical distribution.
@@ -77,7 +77,7 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     target = stage.bias_kT
     if target is None:
         raise ValueError("no bias is asked for")
-    found = stiffest(system, state)
+    found = stiffest_mode(system, state)
     rate = mean_square_rate(system, state, k)
     steps = {}
     for integrator in BIAS:
@@ -100,14 +100,14 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
 
 def _may_use_langevin(stage: Stage) -> bool:
     """Whether the stage has Langevin's thermostat, or says nothing of its thermostat."""
-    return stage.leaves_thermostat or stage.thermostat == "langevin"
+    return stage.thermostat_is_open or stage.thermostat == "langevin"
 
 
 def _decided(stage: Stage, integrator: str, timestep_fs: float) -> Stage:
-    decided = stage.decided(integrator, timestep_fs)
+    decided = stage.with_integrator(integrator, timestep_fs)
     if integrator == "baoab":
         decided = decided.model_copy(update={"thermostat": "langevin"})
-    return decided.resolved
+    return decided.with_defaults
 
 
 def mean_square_rate(system: System, state: State, k: int) -> float:
@@ -115,29 +115,29 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     stage = system.scene.stages[k]
     thermal = BOLTZMANN * max(stage.temperatures)
     engine, freedom = system.engine(), system.freedom_in(k)
-    first = square_rate(system, engine, state, thermal)
+    first = sums_of_square_frequencies(system, engine, state, thermal)
     fastest = max(sum_ / n for sum_, n in zip(first, freedom, strict=True) if n) if freedom.total else 0.0
-    if fastest == 0 and (found := stiffest(system, state)) is not None:
+    if fastest == 0 and (found := stiffest_mode(system, state)) is not None:
         fastest = found.rate**2  # the start is a minimum, where no force says how fast motions are
     if not isfinite(fastest) or fastest <= 0:
         return 0.0
-    dt = STEP / sqrt(fastest)
+    dt = PILOT_STEP / sqrt(fastest)
     stages = list(system.scene.stages)
     # Langevin's thermostat at a fifth of that rate brings any start to its temperature within the first half
     heat = {"thermostat": "langevin", "thermostat_time_ps": None, "friction_translation_per_ps": sqrt(fastest) / 5}
-    pilot_stage = stage.decided("baoab", dt / FEMTOSECOND)
+    pilot_stage = stage.with_integrator("baoab", dt / FEMTOSECOND)
     stages[k] = pilot_stage.model_copy(update=heat | {"friction_rotation_per_ps": None})
     pilot = replace(system, scene=system.scene.model_copy(update={"stages": tuple(stages)}))
-    scheme = row(pilot, k)
+    scheme = integrator_of_stage(pilot, k)
     moving = engine.begin(state, scheme)
     moving.step[:] = 0
     moving.begin_stretch(0.0)
-    every = round(SPAN / STEP / LOOKS)
+    every = round(PILOT_RADIANS / PILOT_STEP / PILOT_SAMPLES)
     seen = []
-    for look in range(LOOKS):
-        engine.advance(moving, scheme, dt, (look + 1) * every)
-        seen.append(sum(square_rate(system, engine, moving, thermal)))
-    rate = float(np.mean(seen[LOOKS // 2 :])) / freedom.total
+    for measure_errors in range(PILOT_SAMPLES):
+        engine.advance(moving, scheme, dt, (measure_errors + 1) * every)
+        seen.append(sum(sums_of_square_frequencies(system, engine, moving, thermal)))
+    rate = float(np.mean(seen[PILOT_SAMPLES // 2 :])) / freedom.total
     if not isfinite(rate):
         raise SimulationError("the pilot run that measures frequencies for bias_kT has no finite forces")
     return rate

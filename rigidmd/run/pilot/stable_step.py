@@ -28,7 +28,7 @@ MOST_DISPLACED = 50_000
 #: For larger systems the estimate is made only if it costs less than 1 % of the stage.
 SMALL_SYSTEM = 1000
 #: Rms amplitudes of the stiffest motions of a liquid at its temperature, as angles and in diameters. Measured by
-#: `stiffest` at the end of 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in
+#: `stiffest_mode` at the end of 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in
 #: CO2 and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in CO2, 0.006 in water.
 SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 
@@ -56,14 +56,14 @@ def stable_angle(method: Scheme | Solver) -> float:
     return float(angle[beyond.argmax()]) if beyond.any() else inf
 
 
-class Stiffest(NamedTuple):
+class StiffestMode(NamedTuple):
     """The fastest small motion about a state."""
 
     rate: float  # angular frequency, rad/ps
     molecule: int  # with the largest share in it
 
 
-def stiffest(system: System, state: State, engine: Engine | None = None) -> Stiffest | None:
+def stiffest_mode(system: System, state: State, engine: Engine | None = None) -> StiffestMode | None:
     """The fastest small motion of all molecules together; None if no restoring force acts.
 
     The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of one random vector
@@ -118,7 +118,7 @@ def stiffest(system: System, state: State, engine: Engine | None = None) -> Stif
     mode = np.einsum("k,kn", vectors[:, -1], np.array(basis)) ** 2
     share = mode[: 3 * len(moving)].reshape(-1, 3).sum(axis=1)
     share[: len(turning)] += mode[3 * len(moving) :].reshape(-1, 3).sum(axis=1)
-    return Stiffest(sqrt(values[-1]), int(moving[share.argmax()]))
+    return StiffestMode(sqrt(values[-1]), int(moving[share.argmax()]))
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> float:
@@ -126,7 +126,7 @@ def _product(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.einsum("i,i", a, b))
 
 
-def long_steps(scene: MolecularScene) -> list[str]:
+def step_warnings(scene: MolecularScene) -> list[str]:
     """Warnings of steps too long for these molecules in a liquid. Nothing is compiled for them.
 
     At a temperature T a motion of angular frequency w has the rms amplitude sqrt(kT/m)/w. So a step is unstable if a
@@ -138,7 +138,7 @@ def long_steps(scene: MolecularScene) -> list[str]:
     temperature = scene.start.temperature_K
     for k, stage in enumerate(scene.stages):
         temperature = max(stage.temperatures) or temperature
-        if stage.is_open or stage.is_minimisation or not (species and temperature and scene.watch.stable_step):
+        if stage.is_auto or stage.is_minimisation or not (species and temperature and scene.watch.stable_step):
             continue
         swings = [swing for m in species for swing in _swings(m, BOLTZMANN * temperature)]
         shortest = min(swings, key=lambda swing: swing.time)
@@ -175,18 +175,18 @@ def _swings(m: Molecule, thermal: float) -> list[_Swing]:
     ]
 
 
-def is_worth_it(system: System, evaluations: int) -> bool:
+def is_estimate_cheap(system: System, evaluations: int) -> bool:
     """Whether an estimate is cheap compared with the force evaluations of a stage."""
     return len(system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
 
 
-def body_rate(system: BodySystem) -> float:
+def fastest_body_rate(system: BodySystem) -> float:
     """The fastest rate (rad/s) that a body's steps have to resolve at its start: swing under its weight, or spin.
 
     The exact rotor turns a free body exactly at any spin, the split one only a symmetric body. For a weight on the axis
     of symmetry, only the nutation remains of the spin. General solvers have to resolve all of it.
     """
-    if not system.turns:
+    if not system.rotates:
         return 0.0
     inertia, momentum = system.inertia, system.state.angular_momentum_body[0]
     weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]

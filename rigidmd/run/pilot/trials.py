@@ -27,20 +27,20 @@ from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import KJ_PER_MOL
 
 #: Number of looks at the energy in a span.
-LOOKS = 40
+OBSERVATIONS = 40
 #: A run diverges if its energy error exceeds this fraction of the kinetic energy.
 DIVERGED = 0.5
 #: Time between looks for averages, ps: about the correlation time of the kinetic energy of water.
-LOOK_PS = 0.02
+SAMPLING_INTERVAL_PS = 0.02
 #: Part of an integrator's longest stable step that is recommended, where a longer one diverges.
-STABLE_SHARE = 0.8
+STABLE_FRACTION = 0.8
 #: Least steps in a span of a trial that extends a ladder.
-FEWEST = 4
+MIN_STEPS = 4
 #: Steps that warm up an engine: they build lists, grow buffers and touch memory. The first 25 steps of 216 waters took
 #: 40 ms, the next 25 took 20 ms.
 WARM_UP = 10
 #: Least seconds of computing in a timing.
-TIMED = 0.2
+TIMING_SECONDS = 0.2
 #: For general solvers that choose their own steps.
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 
@@ -49,26 +49,26 @@ class Method(NamedTuple):
     """A way to move the subject."""
 
     engine: Callable[[], Engine]
-    how: Scheme | Solver
+    scheme: Scheme | Solver
 
     @property
     def chooses_steps(self) -> bool:
         """Whether it is given a tolerance, not a time step."""
-        return isinstance(self.how, Solver) and self.how.name != RK4
+        return isinstance(self.scheme, Solver) and self.scheme.name != RK4
 
     @property
     def force_evaluations(self) -> int:
         """In a step of given length."""
-        return 4 if isinstance(self.how, Solver) else self.how.force_evaluations
+        return 4 if isinstance(self.scheme, Solver) else self.scheme.force_evaluations
 
     @property
     def order(self) -> int:
         """Order of the error in a given step."""
-        return 4 if isinstance(self.how, Solver) else self.how.order
+        return 4 if isinstance(self.scheme, Solver) else self.scheme.order
 
 
 @dataclass
-class Subject:
+class TrialSystem:
     """A start, and how to measure errors on it.
 
     methods : by name. energy(engine, state) : the conserved energy. energy_unit : the unit of the reported energy
@@ -93,8 +93,8 @@ class Subject:
     time_size: float  # of that unit, in the units of the span
     length_unit: str
     reference: str
-    kept: Callable[[State], dict[str, float]]
-    goes_on: bool
+    conserved_errors: Callable[[State], dict[str, float]]
+    can_continue: bool
     refused: dict[str, str] = field(default_factory=dict)
     singular: tuple[str, ...] = ()
     observe: Callable[[Engine, State, float], Observation] | None = None
@@ -118,16 +118,16 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
-    kept: dict[str, float] = field(default_factory=dict)  # largest relative errors of other conserved quantities
+    conserved_errors: dict[str, float] = field(default_factory=dict)  # largest relative errors of other conserved quantities
     tolerance: float | None = None  # of a method that chooses its steps
-    fault: str = ""  # why it failed or diverged
+    failure: str = ""  # why it failed or diverged
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
     energies: list[float] = field(default_factory=list, repr=False)  # errors in the subject's unit, from 0 at the start
 
     @property
     def diverged(self) -> bool:
         """Whether it has no results."""
-        return bool(self.fault)
+        return bool(self.failure)
 
     @property
     def time(self) -> float:
@@ -146,10 +146,10 @@ class Trial:
 
 
 @dataclass
-class Precision:
+class IntegratorAccuracy:
     """All trials of a subject, and the error of their reference."""
 
-    subject: Subject
+    trial_system: TrialSystem
     trials: list[Trial]
     reference_steps: int
     reference_error: float  # of the reference, from a run with half as many steps
@@ -157,7 +157,7 @@ class Precision:
     left_out: dict[str, str] = field(default_factory=dict)  # usual methods that were not tried -> reason
 
     def __repr__(self) -> str:
-        return f"<Precision of {self.subject.name}: {len(self.trials)} trials>"
+        return f"<Precision of {self.trial_system.name}: {len(self.trials)} trials>"
 
     @property
     def most_exact(self) -> Trial:
@@ -180,7 +180,7 @@ class Precision:
     def time_for(self, integrator: str, error: str, target: float) -> "Reached | None":
         """Where an integrator reaches an error, between its trials; None if its shortest step is not exact enough.
 
-        At most its longest step, or `STABLE_SHARE` of it where a longer one diverges.
+        At most its longest step, or `STABLE_FRACTION` of it where a longer one diverges.
         """
         own = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
         own.sort(key=lambda t: -t.timestep)
@@ -195,15 +195,15 @@ class Precision:
                 step = coarse.timestep * (fine.timestep / coarse.timestep) ** share
         if step is None:
             return None
-        longest = max((STABLE_SHARE if unstable else 1.0) * own[0].timestep, own[-1].timestep)
+        longest = max((STABLE_FRACTION if unstable else 1.0) * own[0].timestep, own[-1].timestep)
         limit = "" if step < longest else "kept from its longest stable step" if unstable else "its longest step tried"
         step, up = float(min(step, longest)), own[::-1]
         seconds = np.exp(np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up])))
         near = min(own, key=lambda t: abs(np.log(t.timestep / step)))
-        return Reached(float(seconds), step, near.spread or 0.0, limit)
+        return ReachedError(float(seconds), step, near.spread or 0.0, limit)
 
 
-class Reached(NamedTuple):
+class ReachedError(NamedTuple):
     """Where an integrator reaches an error."""
 
     seconds: float  # of computing in a span
@@ -213,70 +213,70 @@ class Reached(NamedTuple):
 
 
 def measure(
-    subject: Subject,
+    trial_system: TrialSystem,
     trials: list[Trial],
     repeats: int,
     averages: float | None = None,
     say: Callable[[float], object] = lambda share: None,
     extend: bool = False,
-) -> Precision:
+) -> IntegratorAccuracy:
     """Run all trials and the reference; time the trials alternately `repeats` times; report progress by say(share).
 
     averages : ps over which every trial is also averaged; None for no averages. extend : whether longer steps follow
     the longest one of each integrator, doubled until one fails
     """
-    most = max((trial.forces for trial in trials), default=0) or LOOKS * LOOKS
-    reference = subject.methods[subject.reference]
+    most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
+    reference = trial_system.methods[trial_system.reference]
     steps = 2 * -(-2 * most // reference.force_evaluations)
-    exact = end_of(subject, reference, steps)
-    own_error = gap(exact, end_of(subject, reference, steps // 2))
-    result = Precision(subject, trials, steps, max(gap for gap in own_error if not np.isnan(gap)), averages)
+    exact = final_state(trial_system, reference, steps)
+    own_error = state_difference(exact, final_state(trial_system, reference, steps // 2))
+    result = IntegratorAccuracy(trial_system, trials, steps, max(state_difference for state_difference in own_error if not np.isnan(state_difference)), averages)
     for trial in trials:  # compile and measure errors
-        look(subject, trial, exact)
+        measure_errors(trial_system, trial, exact)
     if extend:
-        result.trials = trials = _extended(subject, trials, exact)
+        result.trials = trials = _extended(trial_system, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / subject.span)
+    done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / trial_system.span)
     for _ in range(repeats):
         for trial in good:
-            trial.seconds.append(timing(subject, trial))
+            trial.seconds.append(time_span(trial_system, trial))
             done += 1
             say(done / whole)
     if averages:
         for trial in good:
-            _average(subject, trial, averages)
-            done += averages / subject.span
+            _average(trial_system, trial, averages)
+            done += averages / trial_system.span
             say(done / whole)
     return result
 
 
-def _extended(subject: Subject, trials: list[Trial], exact: State) -> list[Trial]:
+def _extended(trial_system: TrialSystem, trials: list[Trial], exact: State) -> list[Trial]:
     """Trials with longer steps before those of each integrator, doubled until one fails."""
     found = []
     for name, own in groupby(trials, key=lambda trial: trial.integrator):
         ladder = list(own)
         longest = max(ladder, key=lambda trial: trial.timestep)
-        while not longest.diverged and longest.tolerance is None and longest.steps >= 2 * FEWEST:
+        while not longest.diverged and longest.tolerance is None and longest.steps >= 2 * MIN_STEPS:
             n = longest.steps // 2
-            per_step = subject.methods[name].force_evaluations
-            longest = Trial(name, subject.span / n / subject.time_size, n, n * per_step)
-            look(subject, longest, exact)
+            per_step = trial_system.methods[name].force_evaluations
+            longest = Trial(name, trial_system.span / n / trial_system.time_size, n, n * per_step)
+            measure_errors(trial_system, longest, exact)
             ladder.insert(0, longest)
         found += ladder
     return found
 
 
-def timing(subject: Subject, trial: Trial) -> float:
-    """Seconds of computing in a span, from spans of `TIMED` seconds in all, with a warm engine.
+def time_span(trial_system: TrialSystem, trial: Trial) -> float:
+    """Seconds of computing in a span, from spans of `TIMING_SECONDS` seconds in all, with a warm engine.
 
     The cost of a call without steps is subtracted: 15 µs, as much as 200 steps of a free body.
     """
-    engine, state = _begun(subject, trial)
+    engine, state = _begin_trial(trial_system, trial)
     begun, done = state.copy(), 0
 
     def seconds_of(steps: int) -> float:
         began = clock.perf_counter()
-        _advance(subject, engine, state, trial, steps, done)
+        _advance(trial_system, engine, state, trial, steps, done)
         return clock.perf_counter() - began
 
     def start_again() -> None:
@@ -291,7 +291,7 @@ def timing(subject: Subject, trial: Trial) -> float:
         seconds_of(min(WARM_UP, trial.steps))
         start_again()
     computing, calls, spans = 0.0, 0.0, 0
-    while computing < TIMED:
+    while computing < TIMING_SECONDS:
         call = seconds_of(0)
         try:
             computing += seconds_of(trial.steps)
@@ -301,119 +301,119 @@ def timing(subject: Subject, trial: Trial) -> float:
             start_again()
             continue
         calls, spans, done = calls + call, spans + 1, done + trial.steps
-        if not subject.goes_on:
+        if not trial_system.can_continue:
             start_again()
     return (computing - calls if computing > calls else computing) / spans
 
 
-def plan(subject: Subject, steps: dict[str, list[float]]) -> list[Trial]:
+def plan(trial_system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
     """Trials of integrators at time steps (in the subject's unit), adjusted to a whole number in the span.
 
     Methods that choose their steps get tolerances instead.
     """
     trials = {}
     for integrator, timesteps in steps.items():
-        method = subject.methods[integrator]
+        method = trial_system.methods[integrator]
         if method.chooses_steps:
             for tolerance in TOLERANCES:
-                step = subject.span / LOOKS / subject.time_size
-                trials[integrator, tolerance] = Trial(integrator, step, LOOKS, 0, tolerance=tolerance)
+                step = trial_system.span / OBSERVATIONS / trial_system.time_size
+                trials[integrator, tolerance] = Trial(integrator, step, OBSERVATIONS, 0, tolerance=tolerance)
             continue
         for timestep in timesteps:
-            n = max(1, round(subject.span / (timestep * subject.time_size)))
-            step = subject.span / n / subject.time_size
+            n = max(1, round(trial_system.span / (timestep * trial_system.time_size)))
+            step = trial_system.span / n / trial_system.time_size
             trials[integrator, n] = Trial(integrator, step, n, n * method.force_evaluations)
     return list(trials.values())
 
 
-def _begun(subject: Subject, trial: Trial) -> tuple[Engine, State]:
+def _begin_trial(trial_system: TrialSystem, trial: Trial) -> tuple[Engine, State]:
     """A new engine for a trial, and a state at the start."""
-    method = subject.methods[trial.integrator]
+    method = trial_system.methods[trial.integrator]
     engine = method.engine()
-    return engine, engine.begin(subject.state, _how(method, trial))
+    return engine, engine.begin(trial_system.state, _scheme_of(method, trial))
 
 
-def _how(method: Method, trial: Trial) -> Scheme | Solver:
+def _scheme_of(method: Method, trial: Trial) -> Scheme | Solver:
     """The method's scheme or solver, with the tolerance of a trial if it has one."""
     if not method.chooses_steps:
-        return method.how
-    return method.how._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
+        return method.scheme
+    return method.scheme._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
 
 
-def _advance(subject: Subject, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
-    method = subject.methods[trial.integrator]
-    how = _how(method, trial)
-    dt = subject.span / trial.steps if method.chooses_steps else trial.timestep * subject.time_size
+def _advance(trial_system: TrialSystem, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
+    method = trial_system.methods[trial.integrator]
+    how = _scheme_of(method, trial)
+    dt = trial_system.span / trial.steps if method.chooses_steps else trial.timestep * trial_system.time_size
     engine.advance(state, how, dt, done + steps)
 
 
-def end_of(subject: Subject, method: Method, steps: int) -> State:
+def final_state(trial_system: TrialSystem, method: Method, steps: int) -> State:
     """The state at the end of the span after this many steps."""
     engine = method.engine()
-    state = engine.begin(subject.state, method.how)
-    engine.advance(state, method.how, subject.span / steps, steps)
+    state = engine.begin(trial_system.state, method.scheme)
+    engine.advance(state, method.scheme, trial_system.span / steps, steps)
     return state
 
 
-def gap(a: State, b: State) -> tuple[float, float]:
+def state_difference(a: State, b: State) -> tuple[float, float]:
     """Largest differences of rotations and positions; NaN if a state has none."""
-    return _furthest(a.rotation, b.rotation), _furthest(a.position, b.position)
+    return _largest_difference(a.rotation, b.rotation), _largest_difference(a.position, b.position)
 
 
-def _furthest(x: np.ndarray, y: np.ndarray) -> float:
+def _largest_difference(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.abs(x - y).max()) if len(x) else np.nan
 
 
-def look(subject: Subject, trial: Trial, exact: State | None, looks: int = LOOKS) -> None:
+def measure_errors(trial_system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS) -> None:
     """One run that measures all errors of a trial. Its end is compared with `exact`."""
-    engine, state = _begun(subject, trial)
-    first = subject.energy(engine, state)
+    engine, state = _begin_trial(trial_system, trial)
+    first = trial_system.energy(engine, state)
     times, energies = [0.0], [0.0]
-    every, done = max(1, trial.steps // looks), 0
+    every, done = max(1, trial.steps // observations), 0
     while done < trial.steps:
         now = min(every, trial.steps - done)
         try:
-            _advance(subject, engine, state, trial, now, done)
-            energy = subject.energy(engine, state) - first
+            _advance(trial_system, engine, state, trial, now, done)
+            energy = trial_system.energy(engine, state) - first
         except NotFiniteError:
             energy = np.inf
         except SimulationError as error:
-            trial.fault = str(error)
+            trial.failure = str(error)
             return
-        if not abs(energy) < DIVERGED * subject.kinetic:
-            trial.fault = "diverges"
+        if not abs(energy) < DIVERGED * trial_system.kinetic:
+            trial.failure = "diverges"
             return
         done += now
         times.append(done / trial.steps)
-        energies.append(energy / subject.energy_size)
-        for name, error in subject.kept(state).items():
-            trial.kept[name] = max(abs(error), trial.kept.get(name, 0.0))
+        energies.append(energy / trial_system.energy_size)
+        for name, error in trial_system.conserved_errors(state).items():
+            trial.conserved_errors[name] = max(abs(error), trial.conserved_errors.get(name, 0.0))
     trial.energies = energies
     trial.energy_rms = float(np.sqrt(np.mean(np.square(energies[1:]))))
     line = slope(times, energies)
     trial.energy_drift, trial.energy_drift_error = float(line.value), float(line.error)
     if exact is not None:
-        trial.rotation_error, trial.position_error = gap(state, exact)
+        trial.rotation_error, trial.position_error = state_difference(state, exact)
     if len(state.rotation):
         trial.orthogonality_error = orthogonality_error(state.rotation)
     if isinstance(engine, OdeEngine) and trial.tolerance is not None:
         trial.forces = engine.evaluations
-        trial.timestep = subject.span / engine.own_steps / subject.time_size
+        trial.timestep = trial_system.span / engine.own_steps / trial_system.time_size
 
 
-def _average(subject: Subject, trial: Trial, length: float) -> None:
+def _average(trial_system: TrialSystem, trial: Trial, length: float) -> None:
     """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and unbiased."""
-    observe = subject.observe
+    observe = trial_system.observe
     if observe is None:
         raise ValueError("averages are for molecules in a box")
-    engine, state = _begun(subject, trial)
-    dt = trial.timestep * subject.time_size
+    engine, state = _begin_trial(trial_system, trial)
+    dt = trial.timestep * trial_system.time_size
     verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
-    every = max(1, round(LOOK_PS / dt))
+    every = max(1, round(SAMPLING_INTERVAL_PS / dt))
     seen: list[Observation] = []
     for k in range(max(2, round(length / dt / every))):
         try:
-            _advance(subject, engine, state, trial, every, k * every)
+            _advance(trial_system, engine, state, trial, every, k * every)
         except SimulationError:
             return
         seen.append(observe(engine, state, verlet_step))
@@ -421,7 +421,7 @@ def _average(subject: Subject, trial: Trial, length: float) -> None:
     def series(name: str) -> np.ndarray:
         return np.array([getattr(observation, name) for observation in seen])
 
-    found = {"potential": series("potential") / KJ_PER_MOL / subject.molecules, "pressure": series("pressure_bar")}
+    found = {"potential": series("potential") / KJ_PER_MOL / trial_system.molecules, "pressure": series("pressure_bar")}
     for name, key in (("T_trans", "translation"), ("T_rot", "rotation")):
         on, unbiased = series(f"temperature_{key}"), series(f"temperature_{key}_unbiased")
         # unbiased = (on the steps + twice between the kicks)/3

@@ -25,10 +25,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.integrators import DRIFT, KICK, Scheme
-from rigidmd.run.pilot.trials import Subject, Trial, look
+from rigidmd.run.pilot.trials import TrialSystem, Trial, measure_errors
 
 #: The integrator of the pilot runs: its own regular error is small beside the walk.
-QUIET = "srkn_6"
+PILOT_INTEGRATOR = "srkn_6"
 #: Steps of the first pilot run; the second takes twice as many of half the length.
 STEPS = 32
 #: Steps between energies that are compared. The shortest are the most, but a regular error counts there.
@@ -36,7 +36,7 @@ LAGS = (1, 2, 4, 8)
 JUMPS = (-1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 
 
-class Walk(NamedTuple):
+class EnergyWalk(NamedTuple):
     """D = scale w dt^(2 jump + 2), in squares of the subject's energy unit per unit of time of its span."""
 
     scale: float
@@ -66,31 +66,31 @@ def weight(scheme: Scheme, jump: float) -> float:
     return float(np.sum(np.abs(total) ** 2 / n ** (2 * jump + 2)))
 
 
-def walk(subject: Subject, timestep: float) -> Walk:
+def energy_walk(trial_system: TrialSystem, timestep: float) -> EnergyWalk:
     """The walk, from runs at about this step (in the subject's unit) and at half of it."""
-    scheme, rates = subject.methods[QUIET].how, []
+    scheme, rates = trial_system.methods[PILOT_INTEGRATOR].scheme, []
     if not isinstance(scheme, Scheme):
-        raise TypeError(f"{QUIET} is no scheme of this subject")
+        raise TypeError(f"{PILOT_INTEGRATOR} is no scheme of this subject")
     for _ in range(3):
-        rates = [_rate(subject, timestep / part, part * STEPS) for part in (1, 2)]
+        rates = [_rate(trial_system, timestep / part, part * STEPS) for part in (1, 2)]
         if None not in rates:
             break
         timestep /= 2
     fast, slow = rates
     if not fast or not slow:
-        return Walk(0.0, JUMPS[-1], subject.freedom)
+        return EnergyWalk(0.0, JUMPS[-1], trial_system.freedom)
     jump = min(JUMPS, key=lambda k: abs(log(fast / slow) - (2 * k + 2) * log(2)))
-    dt = timestep * subject.time_size
-    unit = Walk(1.0, jump, subject.freedom)
+    dt = timestep * trial_system.time_size
+    unit = EnergyWalk(1.0, jump, trial_system.freedom)
     scale = (fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2
     return unit._replace(scale=scale)
 
 
-def _rate(subject: Subject, timestep: float, steps: int) -> float | None:
+def _rate(trial_system: TrialSystem, timestep: float, steps: int) -> float | None:
     """D in a run, from below by its regular error at the shortest lags; None if it diverges."""
-    trial = Trial(QUIET, timestep, steps, 0)
-    look(subject, trial, None, STEPS)
+    trial = Trial(PILOT_INTEGRATOR, timestep, steps, 0)
+    measure_errors(trial_system, trial, None, STEPS)
     if trial.diverged:
         return None
-    energy, spacing = np.array(trial.energies), steps / STEPS * timestep * subject.time_size
+    energy, spacing = np.array(trial.energies), steps / STEPS * timestep * trial_system.time_size
     return min(float(np.mean((energy[m:] - energy[:-m]) ** 2)) / (m * spacing) for m in LAGS)

@@ -6,8 +6,8 @@ from math import inf
 from rigidmd.core.integrators import RADAU, SCHEMES, SOLVERS
 from rigidmd.errors import SceneError
 from rigidmd.run.force_errors import rounding
-from rigidmd.run.pilot.subjects import COMPARATORS, SPAN_PS, body_subject, molecular_subject
-from rigidmd.run.pilot.trials import Precision, Subject, measure, plan
+from rigidmd.run.pilot.trial_systems import COMPARATORS, SPAN_PS, body_trial_system, molecular_trial_system
+from rigidmd.run.pilot.trials import IntegratorAccuracy, TrialSystem, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_is_at_home, start_of_last_stage
@@ -34,7 +34,7 @@ def precision(
     repeats: int = 3,
     averages: float | None = None,
     say: Callable[[float], object] = lambda share: None,
-) -> Precision:
+) -> IntegratorAccuracy:
     """Error against run time of integrators at time steps, on the start of a scene.
 
     integrators : names; default: the scene's own and those that suit it, the others are in `left_out`. rk4, dop853 and
@@ -56,24 +56,24 @@ def precision(
         reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
         raise SceneError(scene.source, reasons)
     say(0.0)
-    subject, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
-    if averages and subject.observe is None:
+    trial_system, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
+    if averages and trial_system.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])
-    if refused := [name for name in integrators if name not in subject.methods]:
-        reasons = [f"{name} does not suit this scene: {subject.refused[name]}" for name in refused]
+    if refused := [name for name in integrators if name not in trial_system.methods]:
+        reasons = [f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused]
         raise SceneError(scene.source, reasons)
     left_out = {}
     if not integrators:
         usual = USUAL if isinstance(scene, BodyScene) else [name for name in USUAL if name in SCHEMES]
-        left_out = {name: why for name, why in subject.refused.items() if name in usual}
-        left_out |= {name: AT_A_POLE for name in subject.singular if name in usual}
+        left_out = {name: why for name, why in trial_system.refused.items() if name in usual}
+        left_out |= {name: AT_A_POLE for name in trial_system.singular if name in usual}
         wanted = dict.fromkeys((*usual, _own(scene)))
-        integrators = [name for name in wanted if name in subject.methods and name not in left_out]
+        integrators = [name for name in wanted if name in trial_system.methods and name not in left_out]
     steps = {
-        name: timesteps or [base * rung * subject.methods[name].force_evaluations for rung in LADDER]
+        name: timesteps or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
         for name in integrators
     }
-    found = measure(subject, plan(subject, steps), repeats, averages, say, not timesteps)
+    found = measure(trial_system, plan(trial_system, steps), repeats, averages, say, not timesteps)
     found.left_out = left_out
     return found
 
@@ -92,20 +92,20 @@ def _own(scene: MolecularScene | BodyScene) -> str:
     return _named(scene.run.integrator if isinstance(scene, BodyScene) else scene.stages[-1].integrator, scene)
 
 
-def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[Subject, float]:
+def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[TrialSystem, float]:
     """The subject, and the scene's time step per force evaluation (fs)."""
     last = scene.stages[-1]
     if last.is_minimisation:
         raise SceneError(scene.source, ["the last stage is a minimisation: precision needs one in which time passes"])
     simulation, state = start_of_last_stage(scene)
-    subject = molecular_subject(simulation.system, state, last.rotor, span or SPAN_PS)
-    subject.rounding = rounding(simulation.system, state)
+    trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
+    trial_system.rounding = rounding(simulation.system, state)
     own = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
-    return subject, last.timestep_fs / own
+    return trial_system, last.timestep_fs / own
 
 
-def _of_body(scene: BodyScene, span: float | None) -> tuple[Subject, float]:
+def _of_body(scene: BodyScene, span: float | None) -> tuple[TrialSystem, float]:
     """As `_of_molecules`, in s."""
-    subject, speed = body_subject(scene, span)
+    trial_system, speed = body_trial_system(scene, span)
     own = SCHEMES[scene.run.integrator].force_evaluations if scene.run.integrator in SCHEMES else 1
-    return subject, RADIANS / speed if speed else AT_REST * scene.run.timestep_s / own
+    return trial_system, RADIANS / speed if speed else AT_REST * scene.run.timestep_s / own

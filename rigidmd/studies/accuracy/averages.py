@@ -5,14 +5,14 @@ from math import floor, inf, log10, nan
 
 import numpy as np
 
-from rigidmd.core.integrators import SCHEMES, WITH_BATH
+from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean
 from rigidmd.dynamics.momenta import remove_momentum
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run.molecular import MolecularSimulation
 from rigidmd.run.observers import Every
-from rigidmd.run.pilot.stable_step import stable_angle, stiffest
+from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.stage import ERROR_TARGETS, THERMOSTAT_TIMES, Stage
 from rigidmd.scene.validation import did_you_mean
@@ -30,12 +30,12 @@ SAMPLE_PS = 20.0
 #: Time before sampling, in the time sampled: the start is from a distribution of another step.
 SETTLING = 0.2
 #: Averages are taken from looks this far apart, ps, and of long runs from no more than so many.
-LOOK_PS, MOST_LOOKS = 0.02, 4000
+SAMPLING_INTERVAL_PS, MOST_LOOKS = 0.02, 4000
 
 
 def check_is_at_home(scene: MolecularScene | BodyScene) -> None:
     """Raise SceneError if another engine computes a scene: what is measured are rigidmd's own integrators."""
-    if isinstance(scene, MolecularScene) and scene.engine.is_other:
+    if isinstance(scene, MolecularScene) and scene.engine.is_external:
         raise SceneError(
             scene.source, [f"engine.name = {scene.engine.name!r}: precision measures rigidmd; leave it out"]
         )
@@ -67,10 +67,10 @@ def averages(
     say(0.0)
     simulation, state = start_of_last_stage(scene)
     remove_momentum(simulation.system.model, state.velocity)
-    found = stiffest(simulation.system, state)
+    found = stiffest_mode(simulation.system, state)
     plan: list[tuple[Stage, AverageRun]] = []
     for integrator, thermostat in told:
-        scheme = (SCHEMES | WITH_BATH)[integrator]
+        scheme = (SCHEMES | WITH_THERMOSTAT)[integrator]
         if timesteps:
             steps = list(timesteps)
         elif found is None:
@@ -147,19 +147,19 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
 
 
 def _usual(stage: Stage) -> list[tuple[str, str]]:
-    own = [] if stage.is_open else [(stage.integrator, stage.thermostat_kind)]
+    own = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
     return list(dict.fromkeys([*own, *(_method(name, stage) for name in USUAL)]))
 
 
 def _method(told: str, stage: Stage) -> tuple[str, str]:
     """Integrator and thermostat of "integrator+thermostat"; Langevin's of a lone baoab, else the stage's."""
     integrator, _, thermostat = (part.strip() for part in told.partition("+"))
-    known = (*SCHEMES, *WITH_BATH)
+    known = (*SCHEMES, *WITH_THERMOSTAT)
     if integrator not in known:
         raise SceneError(
             "--integrators", [f"there is no {integrator}{did_you_mean(integrator, known)} (known: {', '.join(known)})"]
         )
-    thermostat = thermostat or ("langevin" if integrator in WITH_BATH else stage.thermostat_kind)
+    thermostat = thermostat or ("langevin" if integrator in WITH_THERMOSTAT else stage.thermostat_kind)
     if thermostat not in THERMOSTATS:
         fault = f"there is no thermostat {thermostat}{did_you_mean(thermostat, THERMOSTATS)} (known: {', '.join(THERMOSTATS)})"
         raise SceneError("--integrators", [fault])
@@ -180,7 +180,7 @@ def _changed(stage: Stage, integrator: str, thermostat: str, step: float, sample
 
 def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, sample: float, progress: Every) -> None:
     """Run a stage from a state, and put means and cost into `run`."""
-    interval = max(LOOK_PS, sample / MOST_LOOKS)
+    interval = max(SAMPLING_INTERVAL_PS, sample / MOST_LOOKS)
     output = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
     changed = scene.model_copy(update={"stages": (stage,), "output": output})
     simulation = MolecularSimulation(changed, observers=progress, warn=lambda warning: None)

@@ -7,7 +7,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from rigidmd.errors import Faults, RigidMDError, SceneError
+from rigidmd.errors import InputError, RigidMDError, SceneError
 from rigidmd.run.provenance import APART, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.studies.sweep.axes import Axis, settings
@@ -40,8 +40,8 @@ def points_of(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
             if (wrong := checked[kind]) is not None:
                 raise wrong
         except RigidMDError as error:
-            where = f"{error.where}: " if isinstance(error, Faults) and error.where != str(path) else ""
-            for fault in error.faults if isinstance(error, Faults) else [str(error)]:
+            where = f"{error.where}: " if isinstance(error, InputError) and error.where != str(path) else ""
+            for fault in error.faults if isinstance(error, InputError) else [str(error)]:
                 faults.setdefault(f"{where}{fault}", []).append(told)
             continue
         if asked is None:
@@ -56,7 +56,7 @@ def points_of(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
 
 def common_part(scene: Scene, apart: Sequence[str], digest: "Digests") -> tuple[dict[str, Any], dict[str, str]]:
     """Keys of a scene and digests of its inputs, without the swept keys."""
-    keys = keys_of(plain(scene), (*APART, *apart, *scene.inputs, *scene.held))
+    keys = keys_of(plain(scene), (*APART, *apart, *scene.inputs, *scene.embedded_files))
     keys = {key: str(value) if value in (inf, -inf) else value for key, value in keys.items()}  # JSON has no infinity
     inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in apart}
     return keys, inputs
@@ -92,7 +92,7 @@ def _fault_of(scene: MolecularScene | BodyScene) -> RigidMDError | None:
     try:
         if not isinstance(scene, BodyScene):
             build(scene)
-        elif not scene.run.is_open:
+        elif not scene.run.is_auto:
             build_body(scene)
     except RigidMDError as error:
         return error

@@ -191,4 +191,4 @@ def code_kind(scene: Scene) -> str:
 
     from rigidmd.run.provenance import APART, keys_of, plain
 
-    return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.held, *APART))))
+    return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *APART))))

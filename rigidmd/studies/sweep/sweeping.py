@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rigidmd.core.toml import shortened
+from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock
 from rigidmd.scene import MolecularScene
@@ -123,7 +123,7 @@ def _with_seeds(wanted: Wanted, data: Mapping[str, Any]) -> list[Axis]:
         raise SceneError("--replicas", ["are seeds, and --set gives them too; leave out one of them"])
     seed = own[0].values[0] if own else data.get(SEED, MolecularScene.model_fields[SEED].default)
     if not isinstance(seed, int):
-        raise SceneError(str(wanted.path), [f"seed is {shortened(seed)}, must be a whole number"])
+        raise SceneError(str(wanted.path), [f"seed is {shorten_repr(seed)}, must be a whole number"])
     return [
         *(axis for axis in wanted.axes if axis not in own),
         Axis((SEED,), tuple(range(seed, seed + (wanted.replicas or 1)))),
