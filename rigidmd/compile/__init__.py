@@ -5,40 +5,40 @@ The names that the author of a term needs are exported here; `lanes` has the vec
 
 from rigidmd.compile import settings  # noqa: F401  (before Numba is loaded)
 from rigidmd.compile.code import (
-    Bound,
+    BoundTask,
     Code,
-    Parcel,
     Task,
+    TaskArguments,
     call,
     call_blocks,
     compile_together,
-    opened,
-    packed,
+    load_arguments,
+    pack_arguments,
     task,
 )
 from rigidmd.compile.kernels import implements, is_a, kernel
-from rigidmd.compile.layout import Laid
+from rigidmd.compile.layout import NumbaStruct
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
-from rigidmd.compile.thread_pool import jump_to, set_threads
+from rigidmd.compile.thread_pool import call_address, set_threads
 
 __all__ = [
     "BLOCKS",
     "MOST_BLOCKS",
     "SIMD_BITS",
-    "Bound",
+    "BoundTask",
     "Code",
-    "Laid",
-    "Parcel",
+    "NumbaStruct",
     "Task",
+    "TaskArguments",
     "call",
+    "call_address",
     "call_blocks",
     "compile_together",
     "implements",
     "is_a",
-    "jump_to",
     "kernel",
-    "opened",
-    "packed",
+    "load_arguments",
+    "pack_arguments",
     "set_threads",
     "task",
 ]

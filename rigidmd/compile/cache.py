@@ -61,14 +61,14 @@ def shared_folder() -> str | None:
     return str(folder) if cache_folder() != str(folder) and folder.is_dir() else None
 
 
-def is_lasting() -> bool:
+def is_persistent() -> bool:
     """Whether what is compiled is kept where other processes read it."""
     return cache_folder() == str(_named_folder())
 
 
-def kept_in_words() -> str:
+def describe_cache() -> str:
     """Whether what is compiled is kept, for messages."""
-    if is_lasting():
+    if is_persistent():
         return "kept on disk: the next run starts at once"
     folder = _named_folder().parent
     return f"not kept, as {folder} cannot be written: the next run compiles again; RIGIDMD_CACHE names another folder"

@@ -16,14 +16,14 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
 
 from rigidmd.compile import second_process, thread_pool
-from rigidmd.compile.kernels import kernel, options_of
-from rigidmd.compile.layout import Laid, Word
-from rigidmd.compile.numba_private import LINKED, callback, kept_callback, uncounted
+from rigidmd.compile.kernels import compiler_options, kernel
+from rigidmd.compile.layout import AddressType, NumbaStruct
+from rigidmd.compile.numba_private import LINKED_OPTIONS, compile_callback, load_callback, reference_counting
 
 ADDRESS = ir.IntType(8).as_pointer()
 
 
-class Parcel(types.Type):
+class TaskArguments(types.Type):
     """Numba type of the address of a value of any type."""
 
     def __init__(self, content):
@@ -36,24 +36,24 @@ class Parcel(types.Type):
         return self.content
 
 
-@register_model(Parcel)
+@register_model(TaskArguments)
 class _ParcelModel(models.PrimitiveModel):
     def __init__(self, manager, parcel):
         super().__init__(manager, parcel, ADDRESS)
 
 
 @intrinsic
-def packed(typing, content):
+def pack_arguments(typing, content):
     """The parcel of a value. It must be opened before the calling function returns."""
 
     def emit(context, builder, signature, arguments):
         return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), ADDRESS)
 
-    return Parcel(content)(content), emit
+    return TaskArguments(content)(content), emit
 
 
 @intrinsic
-def opened(typing, parcel):
+def load_arguments(typing, parcel):
     """The value in a parcel."""
 
     def emit(context, builder, signature, arguments):
@@ -75,12 +75,12 @@ class Task:
         self.function, self.options = function, options
         self.compiled = {}
 
-    def address(self, parcel: Parcel) -> int:
+    def address(self, parcel: TaskArguments) -> int:
         """Address of the machine code for a parcel of this type, which is compiled or read from the cache."""
         if parcel not in self.compiled:
             second_process.wait_for(*self.name, parcel)
-            thread_pool.begin()
-            code = callback(self.function, (parcel, types.intp), self.options)
+            thread_pool.start_workers()
+            code = compile_callback(self.function, (parcel, types.intp), self.options)
             self.compiled.setdefault(parcel, code)  # another thread may use what it has made meanwhile
         return self.compiled[parcel].address
 
@@ -89,11 +89,11 @@ class Task:
         """Its module, and its name there."""
         return self.function.__module__, self.function.__name__
 
-    def is_ready(self, parcel: Parcel) -> bool:
+    def is_ready(self, parcel: TaskArguments) -> bool:
         """Whether `address` has nothing to compile."""
         if parcel not in self.compiled:
-            thread_pool.begin()
-            code = kept_callback(self.function, (parcel, types.intp), self.options)
+            thread_pool.start_workers()
+            code = load_callback(self.function, (parcel, types.intp), self.options)
             if code is None:
                 return False
             self.compiled.setdefault(parcel, code)
@@ -102,13 +102,13 @@ class Task:
 
 def task(*, counted=True):
     """Turn a function into a `Task`; the options are those of `kernel`."""
-    return lambda function: Task(function, **options_of(False), **uncounted(counted))
+    return lambda function: Task(function, **compiler_options(False), **reference_counting(counted))
 
 
 #: Held while codes are compiled together: of several runs at once, one compiles what the others then read.
 _compiling = threading.RLock()
 #: Tasks of each `Code` that this thread makes, while it compiles nothing; None otherwise.
-_plan: ContextVar[list[tuple[Task, Parcel]] | None] = ContextVar("plan", default=None)
+_plan: ContextVar[list[tuple[Task, TaskArguments]] | None] = ContextVar("plan", default=None)
 
 
 def compile_together(make: Callable[[], object]) -> None:
@@ -117,18 +117,18 @@ def compile_together(make: Callable[[], object]) -> None:
     The function is first called for the tasks and types of its codes alone: these have no addresses, and it must not
     call them.
     """
-    if second_process.compilers() == 1:
+    if second_process.compiler_processes() == 1:
         return
     with _compiling:
-        wanted: list[tuple[Task, Parcel]] = []
+        wanted: list[tuple[Task, TaskArguments]] = []
         before = _plan.set(wanted)
         try:
             make()
         finally:
             _plan.reset(before)
         missing = [(*one.name, parcel) for one, parcel in dict.fromkeys(wanted) if not one.is_ready(parcel)]
-        if len(missing) >= second_process.FEWEST:
-            with second_process.helped(missing):
+        if len(missing) >= second_process.FEWEST_TASKS:
+            with second_process.use_helper(missing):
                 make()
 
 
@@ -139,7 +139,7 @@ class Code:
     """
 
     def __init__(self, **tasks: tuple[Task, object]):
-        parcels = {name: Parcel(numba.typeof(content)) for name, (_, content) in tasks.items()}
+        parcels = {name: TaskArguments(numba.typeof(content)) for name, (_, content) in tasks.items()}
         of = [(tasks[name][0], parcel) for name, parcel in parcels.items()]
         plan = _plan.get()
         if plan is not None:
@@ -153,18 +153,18 @@ class Code:
         """Address of a task."""
         return int(self._addresses[self._names.index(name)])
 
-    def lay_down(self, content: object) -> Laid:
+    def lay_down(self, content: object) -> NumbaStruct:
         """A content in memory, for every task. Raises TypingError if one was compiled for another type."""
-        laid = Laid(content)
+        laid = NumbaStruct(content)
         for name in self._names:
-            self.numba_type.place(name, Parcel(laid.kind))
+            self.numba_type.place(name, TaskArguments(laid.kind))
         return laid
 
 
-class CodeType(Word):
+class CodeType(AddressType):
     """Numba type of a `Code`: its tasks, and the type of parcel that each accepts."""
 
-    def __init__(self, parcels: tuple[tuple[str, Parcel], ...]):
+    def __init__(self, parcels: tuple[tuple[str, TaskArguments], ...]):
         self.parcels = parcels
         # a digest, because this name becomes part of the name of every function compiled for it
         digest = hashlib.sha256(repr(parcels).encode()).hexdigest()[:16]
@@ -181,7 +181,7 @@ class CodeType(Word):
         """The tasks."""
         return self.parcels
 
-    def place(self, name: str, parcel: Parcel) -> int:
+    def place(self, name: str, parcel: TaskArguments) -> int:
         """Index of a task's address. Raises TypingError if there is no such task, or not for this type of parcel."""
         names = [known for known, _ in self.parcels]
         if name not in names:
@@ -236,7 +236,7 @@ def _jump(typing, address, parcel, block):
     return types.void(types.intp, parcel, types.intp), emit
 
 
-class Bound:
+class BoundTask:
     """A task with its content, for Python to call without holding its lock.
 
     A call takes a microsecond. Numba would look at every array in every call: after a stretch of computing the core has
@@ -259,7 +259,7 @@ def _jump_blocks(address, parcel, blocks):
     if blocks == 1:
         _jump(address, parcel, 0)
     else:
-        thread_pool.share_out(address, parcel, blocks)
+        thread_pool.run_on_all_threads(address, parcel, blocks)
 
 
 def call(code, name, parcel):
@@ -272,11 +272,11 @@ def call_blocks(code, name, parcel, blocks):
     raise TypeError("compiled code only")
 
 
-@overload(call, prefer_literal=True, jit_options=options_of(True) | LINKED)
+@overload(call, prefer_literal=True, jit_options=compiler_options(True) | LINKED_OPTIONS)
 def _call(code, name, parcel):
     return lambda code, name, parcel: _jump(address_of(code, name, parcel), parcel, 0)
 
 
-@overload(call_blocks, prefer_literal=True, jit_options=options_of(True) | LINKED)
+@overload(call_blocks, prefer_literal=True, jit_options=compiler_options(True) | LINKED_OPTIONS)
 def _call_blocks(code, name, parcel, blocks):
     return lambda code, name, parcel, blocks: _jump_blocks(address_of(code, name, parcel), parcel, blocks)

@@ -4,10 +4,12 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import numba
 from numba import types
+from numba.core.errors import NumbaError
 from numba.extending import overload
 
-from rigidmd.compile.numba_private import LINKED, dispatcher, uncounted
+from rigidmd.compile.numba_private import LINKED_OPTIONS, dispatcher, reference_counting
 
 
 def kernel(function: Callable | None = None, *, inline=False, counted=True, outer=False) -> Any:
@@ -27,7 +29,7 @@ def kernel(function: Callable | None = None, *, inline=False, counted=True, oute
     """
     if function is None:
         return lambda f: kernel(f, inline=inline, counted=counted, outer=outer)
-    return dispatcher(function, options_of(inline) | uncounted(counted), outer)
+    return dispatcher(function, compiler_options(inline) | reference_counting(counted), outer)
 
 
 def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=False, counted=True) -> Any:
@@ -36,7 +38,7 @@ def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=Fa
     kinds : NamedTuple classes; the function is then what `stub` does if its first argument is of one of these. Without
         them the function is called with the types of the arguments, and returns what `stub` does for them, or None
     """
-    register = overload(stub, jit_options=options_of(inline) | uncounted(counted) | LINKED)
+    register = overload(stub, jit_options=compiler_options(inline) | reference_counting(counted) | LINKED_OPTIONS)
     if not kinds:
         return register
     classes = kinds if isinstance(kinds, tuple) else (kinds,)
@@ -52,7 +54,7 @@ def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=Fa
     return register_for_kinds
 
 
-def options_of(inline: bool) -> dict:
+def compiler_options(inline: bool) -> dict:
     """Options that every kernel has."""
     return {"error_model": "numpy"} | ({"forceinline": True} if inline else {})
 
@@ -60,3 +62,12 @@ def options_of(inline: bool) -> dict:
 def is_a(numba_type, named_tuple) -> bool:
     """Whether a Numba type is that of the given NamedTuple class; overloads use this to choose."""
     return isinstance(numba_type, types.BaseNamedTuple) and numba_type.instance_class is named_tuple
+
+
+#: What compiling a user's code may raise.
+CompileError = NumbaError
+
+
+def compile_user_function(function: Callable, inline: bool = False) -> Callable:
+    """A user's function for compiled code, with the options that a kernel has; it is not kept on disk by itself."""
+    return numba.njit(**compiler_options(inline))(getattr(function, "py_func", function))

@@ -12,12 +12,12 @@ import numba
 from numba import types
 
 #: C types of the numbers of compiled code.
-NUMBERS = {types.boolean: ctypes.c_bool, types.float64: ctypes.c_double, types.float32: ctypes.c_float} | {
+C_TYPES = {types.boolean: ctypes.c_bool, types.float64: ctypes.c_double, types.float32: ctypes.c_float} | {
     kind: getattr(ctypes, f"c_{kind.name}") for kind in sorted(types.integer_domain, key=str) if kind.bitwidth <= 64
 }
 
 
-class Laid:
+class NumbaStruct:
     """A value in memory, for a task to open at `address`. References to arrays are not counted there, but kept here.
 
     Raises TypeError if there is something in it besides numbers, arrays, None, codes, and tuples of these
@@ -30,7 +30,7 @@ class Laid:
         self.address = ctypes.addressof(self._memory)
 
 
-class Word(types.Type):
+class AddressType(types.Type):
     """Base of types whose values are whole numbers of 64 bits: what `word` of the value says."""
 
 
@@ -45,13 +45,13 @@ def _c_type(kind: types.Type) -> Any:
         return _array(kind.ndim)
     if isinstance(kind, types.BaseTuple):
         return _struct(_fields(kind))
-    if isinstance(kind, Word):
+    if isinstance(kind, AddressType):
         return ctypes.c_int64
     if kind is types.none:
         return ctypes.c_void_p
-    if kind not in NUMBERS:
+    if kind not in C_TYPES:
         raise TypeError(f"a value of type {kind} cannot be laid down for compiled code")
-    return NUMBERS[kind]
+    return C_TYPES[kind]
 
 
 @cache
@@ -76,7 +76,7 @@ def _fill(struct: ctypes.Structure, fields: tuple[tuple[str, types.Type], ...], 
             there.shape[:], there.strides[:] = value.shape, value.strides
         elif isinstance(kind, types.BaseTuple):
             _fill(getattr(struct, name), _fields(kind), value)
-        elif isinstance(kind, Word):
+        elif isinstance(kind, AddressType):
             setattr(struct, name, value.word)
         elif kind is not types.none:
             setattr(struct, name, value)

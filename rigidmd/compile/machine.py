@@ -60,6 +60,6 @@ SIMD_BITS = _simd_bits()
 MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
-def threads_for(asked: int | None) -> int:
+def usable_threads(asked: int | None) -> int:
     """Number of threads that compute when so many are asked for; None: all."""
     return min(asked or MOST_THREADS, MOST_THREADS)

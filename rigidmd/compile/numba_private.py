@@ -1,7 +1,7 @@
 """The private parts of Numba that this package relies on. tests/test_compile.py tests each assumption.
 
 - `FunctionCache` reads its folder from `numba.config.CACHE_DIR` when it is created, and keeps its index in an
-  `IndexDataCacheFile`, whose class may be changed. That loads and saves index and data by the methods that `Index` has.
+  `IndexDataCacheFile`, whose class may be changed. That loads and saves index and data by the methods that `CacheIndex` has.
 - A dispatcher uses `_cache` only when it compiles.
 - `get_call_template` compiles for the types of arguments that it is given.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for Python.
@@ -25,11 +25,7 @@ from pathlib import Path
 
 import numba
 from llvmlite import binding
-from llvmlite.binding.newpassmanagers import (
-    FunctionPassManager,
-    create_pass_builder,
-    create_pipeline_tuning_options,
-)
+from llvmlite.binding.newpassmanagers import FunctionPassManager, create_pass_builder, create_pipeline_tuning_options
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
@@ -38,11 +34,11 @@ from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 
 from rigidmd.compile.cache import cache_folder, shared_folder
-from rigidmd.core.user_modules import BY_CONTENT
+from rigidmd.core.user_modules import GENERATED_PREFIX
 from rigidmd.errors import RigidMDWarning
 
 
-class Index(IndexDataCacheFile):
+class CacheIndex(IndexDataCacheFile):
     """Index of a cache: compiled functions by the types of their arguments.
 
     Code for types from outside the package has an index of its own, because no index can be read where one of its types
@@ -63,14 +59,14 @@ class Index(IndexDataCacheFile):
         """Keep a compiled function."""
         own = self._apart(key)
         if own is not None:
-            super(Index, own).save(key, data)
+            super(CacheIndex, own).save(key, data)
 
-    def _apart(self, key) -> "Index | None":
+    def _apart(self, key) -> "CacheIndex | None":
         """The index for the types of a key; None if it is not kept."""
         modules = sorted(set(_foreign(getattr(key[0], "args", key[0]))))
         if not modules:
             return self
-        if not all(name.startswith(BY_CONTENT) for name in modules):
+        if not all(name.startswith(GENERATED_PREFIX) for name in modules):
             return None
         there = copy.copy(self)
         digest = hashlib.sha256(" ".join(modules).encode()).hexdigest()[:16]
@@ -84,7 +80,7 @@ class Index(IndexDataCacheFile):
             there = copy.copy(self)
             there._cache_path = self._cache_path.replace(cache_folder(), shared, 1)
             there._index_path = self._index_path.replace(cache_folder(), shared, 1)
-            found = super(Index, there).load(key)
+            found = super(CacheIndex, there).load(key)
         return found
 
     def _data_name(self, number):
@@ -116,7 +112,7 @@ class Index(IndexDataCacheFile):
         size = hashlib.sha256().digest_size
         if hashlib.sha256(data[size:]).digest() != data[:size]:
             fault = f"{path} is damaged; its code is compiled again"
-            say_once(fault)
+            warn_once(fault)
             raise OSError(fault)
         return pickle.loads(data[size:])
 
@@ -137,7 +133,7 @@ def _foreign(kind) -> Iterator[str]:
 
 
 @functools.cache
-def say_once(sentence: str) -> None:
+def warn_once(sentence: str) -> None:
     """Warn of something, the first time."""
     warnings.warn(sentence, RigidMDWarning, stacklevel=2)
 
@@ -146,7 +142,7 @@ def _of_any_value(kind: types.Type) -> types.Type:
     return types.unliteral(kind) if isinstance(kind, types.IntegerLiteral | types.BooleanLiteral) else kind
 
 
-class Kernel(CPUDispatcher):
+class KernelDispatcher(CPUDispatcher):
     """A dispatcher with our own cache, which is opened at the first compilation."""
 
     @property
@@ -165,7 +161,7 @@ class Kernel(CPUDispatcher):
         return super().get_call_template(tuple(map(_of_any_value, args)), {k: _of_any_value(v) for k, v in kws.items()})
 
 
-class LinkedCode(JITCodeLibrary):
+class LinkedLibrary(JITCodeLibrary):
     """The code of a function that only compiled code calls: it has no machine code of its own.
 
     Numba optimises the code of every function and makes machine code of it, links it into its callers, and does both
@@ -210,12 +206,12 @@ class LinkedCompiler(Compiler):
 
     def define_pipelines(self):
         """The passes, after the library is there."""
-        self.state.library = LinkedCode(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library = LinkedLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         self.state.library.enable_object_caching()
         return super().define_pipelines()
 
 
-class Inner(Kernel):
+class InnerKernel(KernelDispatcher):
     """A kernel that only compiled code calls. It has no wrapper for Python, which would unpack every term.
 
     Calling a kernel without a wrapper from Python would crash, so `__call__` raises TypeError. Without wrappers, and
@@ -228,7 +224,7 @@ class Inner(Kernel):
 
 
 #: Option of a function that only compiled code calls.
-LINKED = {"pipeline_class": LinkedCompiler}
+LINKED_OPTIONS = {"pipeline_class": LinkedCompiler}
 
 #: Held while Numba's setting is another one. Whoever has it waits for no other lock: Numba may hold its own here.
 _setting = threading.Lock()
@@ -237,7 +233,7 @@ _setting = threading.Lock()
 def _opened_cache(function: Callable) -> FunctionCache:
     with _setting, _own_folder():
         found = FunctionCache(function)
-    found._cache_file.__class__ = Index
+    found._cache_file.__class__ = CacheIndex
     return found
 
 
@@ -258,19 +254,19 @@ def dispatcher(function: Callable, options: dict, outer: bool) -> CPUDispatcher:
     outer : whether Python calls it, for which it needs a wrapper. Meanwhile other threads of Python go on
     """
     options = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer, "nogil": outer}
-    compiled = numba.njit(**options | ({} if outer else LINKED))(function)
-    compiled.__class__ = Kernel if outer else Inner
+    compiled = numba.njit(**options | ({} if outer else LINKED_OPTIONS))(function)
+    compiled.__class__ = KernelDispatcher if outer else InnerKernel
     return compiled
 
 
-def callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
+def compile_callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
     """A function compiled for these types of arguments, or read from our cache; it is called by address."""
     code = _not_yet_compiled(function, arguments, options)
     code.compile()
     return code
 
 
-def kept_callback(function: Callable, arguments: tuple, options: dict) -> CFunc | None:
+def load_callback(function: Callable, arguments: tuple, options: dict) -> CFunc | None:
     """The same if our cache has it; None if it must be compiled."""
 
     class NotKept(Exception):
@@ -294,6 +290,6 @@ def _not_yet_compiled(function: Callable, arguments: tuple, options: dict) -> CF
     return code
 
 
-def uncounted(counted: bool) -> dict:
+def reference_counting(counted: bool) -> dict:
     """Options of a function in which references to arrays are counted, or are not."""
     return {} if counted else {"_nrt": False}

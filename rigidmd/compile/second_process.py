@@ -15,33 +15,33 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 
-from rigidmd.compile.cache import is_lasting
+from rigidmd.compile.cache import is_persistent
 from rigidmd.errors import SettingError
 
 #: A helper is started for so many tasks; for fewer, loading the package in a second process takes longer.
-FEWEST = 3
+FEWEST_TASKS = 3
 #: (module of a task, its name there, the type of its parcel)
-Wanted = tuple[str, str, object]
+TaskKey = tuple[str, str, object]
 #: What the helper runs: it finds the package where this process does.
-CHILD = (
+HELPER_PROGRAM = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
     "from rigidmd.compile import ahead; ahead.serve()"
 )  # fmt: skip
 
 
-def compilers() -> int:
+def compiler_processes() -> int:
     """Number of processes that compile."""
     named = os.environ.get("RIGIDMD_COMPILERS", "2")
     if named not in ("1", "2"):
         raise SettingError(f"RIGIDMD_COMPILERS is {named[:40]!r}, must be 1 or 2")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return int(named) if cores > 1 and sys.executable and is_lasting() else 1
+    return int(named) if cores > 1 and sys.executable and is_persistent() else 1
 
 
-class Helper:
+class HelperProcess:
     """A process that compiles tasks, the last of them first."""
 
-    def __init__(self, wanted: Sequence[Wanted]):
+    def __init__(self, wanted: Sequence[TaskKey]):
         content = pickle.dumps(sys.path) + pickle.dumps(list(wanted))
         self._places = {one: k for k, one in enumerate(wanted)}
         self._begun: set[int] = set()
@@ -49,7 +49,7 @@ class Helper:
         self._news = threading.Condition()
         self._over = False
         self._process = subprocess.Popen(
-            [sys.executable, "-c", CHILD],
+            [sys.executable, "-c", HELPER_PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -73,7 +73,7 @@ class Helper:
             self._over = True
             self._news.notify_all()
 
-    def wait_for(self, one: Wanted) -> None:
+    def wait_for(self, one: TaskKey) -> None:
         """Wait until the helper has compiled a task that it has begun."""
         place = self._places.get(one)
         with self._news:
@@ -87,15 +87,15 @@ class Helper:
 
 
 #: The helper of this thread, if there is one.
-_helper: ContextVar[Helper | None] = ContextVar("helper", default=None)
+_helper: ContextVar[HelperProcess | None] = ContextVar("helper", default=None)
 
 
 @contextlib.contextmanager
-def helped(wanted: Sequence[Wanted]) -> Iterator[None]:
+def use_helper(wanted: Sequence[TaskKey]) -> Iterator[None]:
     """Within it a helper compiles the same tasks; nobody helps if another process cannot be told their types."""
     helper = None
     with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
-        helper = Helper(wanted)
+        helper = HelperProcess(wanted)
     before = _helper.set(helper)
     try:
         yield
@@ -112,7 +112,7 @@ def wait_for(module: str, name: str, parcel: object) -> None:
         helper.wait_for((module, name, parcel))
 
 
-def serve() -> None:
+def compile_requested() -> None:
     """The helper: compile what standard input says, and say so."""
     wanted = pickle.load(sys.stdin.buffer)
     for place in range(len(wanted) - 1, -1, -1):

@@ -3,24 +3,26 @@
 import os
 import warnings
 
-from rigidmd.core.memory import in_words, left_by_limit
+from rigidmd.core.process import address_space_left, format_gigabytes
 from rigidmd.errors import SettingError
 
-NUMBAS_LIMIT = 4096
+NUMBA_THREAD_LIMIT = 4096
 #: Bytes of addresses that LLVM and SciPy need to be loaded. With less they fail, and OpenBLAS may wait for ever.
-LIBRARIES = 4e8
+LIBRARY_BYTES = 4e8
 
 
 def _check_settings() -> None:
     """Raise SettingError for a setting with which libraries would stop, compile nothing, or print a traceback."""
-    if (left := left_by_limit()) < LIBRARIES:
+    if (left := address_space_left()) < LIBRARY_BYTES:
         raise SettingError(
-            f"not enough memory: libraries need {in_words(LIBRARIES)} of addresses, and the limit of this process "
-            f"leaves {in_words(left)}; raise it (ulimit -v)"
+            f"not enough memory: libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and the limit of this process "
+            f"leaves {format_gigabytes(left)}; raise it (ulimit -v)"
         )
     threads = os.environ.get("NUMBA_NUM_THREADS")
-    if threads and not (threads.isascii() and threads.isdigit() and 0 < int(threads[:9]) <= NUMBAS_LIMIT):
-        raise SettingError(f"NUMBA_NUM_THREADS is {threads[:40]!r}, must be a whole number from 1 to {NUMBAS_LIMIT}")
+    if threads and not (threads.isascii() and threads.isdigit() and 0 < int(threads[:9]) <= NUMBA_THREAD_LIMIT):
+        raise SettingError(
+            f"NUMBA_NUM_THREADS is {threads[:40]!r}, must be a whole number from 1 to {NUMBA_THREAD_LIMIT}"
+        )
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "Environment variable 'NUMBA_", RuntimeWarning)
         try:

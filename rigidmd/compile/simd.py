@@ -23,9 +23,9 @@ from rigidmd.compile import (
     simd_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
 )
 from rigidmd.compile.machine import IS_X86
-from rigidmd.compile.simd_types import COUNT, Lanes, Mask, filled, multiply_add
+from rigidmd.compile.simd_types import LANE_COUNTS, Lanes, Mask, emit_broadcast, multiply_add
 
-#: Whether this machine has the instruction that `picked` uses and estimates to 14 bits.
+#: Whether this machine has the instruction that `permute_two` uses and estimates to 14 bits.
 HAS_AVX512 = SIMD_BITS == 512
 
 
@@ -75,11 +75,11 @@ def _load(lanes, array):
 @intrinsic
 def load(typing, array, index):
     """The vector array[index], array[index + 1], ... of a contiguous array; of several axes the last counts first."""
-    return _load(Lanes(array.dtype, COUNT[array.dtype]), array) if _is_contiguous(array) else None
+    return _load(Lanes(array.dtype, LANE_COUNTS[array.dtype]), array) if _is_contiguous(array) else None
 
 
 @intrinsic
-def item(typing, array, index):
+def load_scalar(typing, array, index):
     """array[index] for an index that is not negative. Numba tests others at each access, inside the pair loop."""
     if not _is_row(array):
         return None
@@ -92,9 +92,9 @@ def item(typing, array, index):
 
 
 @intrinsic
-def load_beside(typing, array, index, other):
+def load_converted(typing, array, index, other):
     """`load` with the number of lanes that vectors of another array have."""
-    signature, emit = _load(Lanes(array.dtype, COUNT[other.dtype]), array)
+    signature, emit = _load(Lanes(array.dtype, LANE_COUNTS[other.dtype]), array)
     return signature.return_type(array, types.intp, other), lambda c, b, s, a: emit(c, b, s, a[:2])
 
 
@@ -111,15 +111,15 @@ def load_eight(typing, array, index):
 
 
 @intrinsic
-def spread(typing, array, index):
+def load_broadcast(typing, array, index):
     """A vector with array[index] in every lane."""
     if not _is_row(array):
         return None
-    lanes = Lanes(array.dtype, COUNT[array.dtype])
+    lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
 
     def emit(context, builder, signature, arguments):
         data = context.make_array(array)(context, builder, arguments[0]).data
-        return filled(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
+        return emit_broadcast(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
 
     return lanes(array, types.intp), emit
 
@@ -183,24 +183,24 @@ def _inverted(builder, value):
 
 
 @intrinsic
-def root(typing, x):
+def square_root(typing, x):
     """Square roots of a vector, accurate to about the last digit."""
     return x(x), lambda context, builder, signature, arguments: _square_root(builder, *arguments)
 
 
 @intrinsic
-def _quick_inverse(typing, x):
+def _approximate_inverse_root(typing, x):
     """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of 2e-7."""
     return x(x), lambda context, builder, signature, arguments: _inverted(builder, _square_root(builder, *arguments))
 
 
 @intrinsic
-def _quick_quotient(typing, x):
+def _approximate_inverse(typing, x):
     """1/x in float32, in the same way."""
     return x(x), lambda context, builder, signature, arguments: _inverted(builder, *arguments)
 
 
-def _converted(dtype):
+def _conversion(dtype):
     def converted(typing, x):
         lanes = Lanes(dtype, x.count)
 
@@ -216,45 +216,45 @@ def _converted(dtype):
     return converted
 
 
-single = intrinsic(_converted(types.float32))
-double = intrinsic(_converted(types.float64))
+to_single = intrinsic(_conversion(types.float32))
+to_double = intrinsic(_conversion(types.float64))
 
 
 #: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³ (p = 3/2).
 QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2, 15 / 8, 35 / 16, 315 / 128)
 
 
-def _terms(x) -> int:
+def _series_terms(x) -> int:
     """How many terms of a series correct the estimates of a type; 0 if it has none.
 
     The next term is below half the last digit: e is at most 1.2e-4 with AVX-512, 7.4e-4 with older instructions.
     """
     if not IS_X86 or x.count not in (2, 4, 8, 16):
         return 0
-    return (1 if x.dtype == types.float32 else 3) + (not _is_whole(x))
+    return (1 if x.dtype == types.float32 else 3) + (not _fills_avx512(x))
 
 
-def _is_whole(x) -> bool:
+def _fills_avx512(x) -> bool:
     """Whether a type of vectors fills the registers of AVX-512."""
-    return HAS_AVX512 and x.count == COUNT.get(x.dtype)
+    return HAS_AVX512 and x.count == LANE_COUNTS.get(x.dtype)
 
 
-def _estimated(name):
+def _estimate(name):
     def estimated(typing, x):
         def emit(context, builder, signature, arguments):
             value = arguments[0]
-            if _is_whole(x):
+            if _fills_avx512(x):
                 everywhere = ir.Constant(ir.IntType(max(8, x.count)), -1)
                 kind = {types.float32: "ps", types.float64: "pd"}[x.dtype]
                 return _call(builder, f"llvm.x86.avx512.{name}14.{kind}.512", value.type, value, value, everywhere)
             if x.dtype == types.float64:
                 value = builder.fptrunc(value, ir.VectorType(ir.FloatType(), x.count))
             if x.count == 2:
-                value = _shuffled(builder, value, value, (0, 1, 0, 1))
+                value = _shuffle(builder, value, value, (0, 1, 0, 1))
             kind = "avx.{}.ps.256" if x.count == 8 else "sse.{}.ps"
             value = _call(builder, f"llvm.x86.{kind.format(name)}", value.type, value)
             if x.count == 2:
-                value = _shuffled(builder, value, value, (0, 1))
+                value = _shuffle(builder, value, value, (0, 1))
             return value if x.dtype == types.float32 else builder.fpext(value, context.get_value_type(x))
 
         return x(x), emit
@@ -264,59 +264,59 @@ def _estimated(name):
 
 #: 1/sqrt(x) and 1/x of a vector by the machine's estimates: relative errors up to 2^-14 with AVX-512, else 1.5 2^-12.
 #: That of 1/x is used with AVX-512 only.
-_root_estimate = intrinsic(_estimated("rsqrt"))
-_quotient_estimate = intrinsic(_estimated("rcp"))
+_root_estimate = intrinsic(_estimate("rsqrt"))
+_quotient_estimate = intrinsic(_estimate("rcp"))
 
 
 @intrinsic
-def _nested(typing, coefficients, x):
+def _horner(typing, coefficients, x):
     """Sum of coefficients[k] x^k, by as few operations as there are."""
 
     def emit(context, builder, signature, arguments):
         kinds = signature.args[0].types
         found = None
         for k in reversed(range(len(kinds))):
-            own = filled(context, builder, builder.extract_value(arguments[0], k), kinds[k], x)
+            own = emit_broadcast(context, builder, builder.extract_value(arguments[0], k), kinds[k], x)
             found = own if found is None else multiply_add(builder, found, arguments[1], own)
         return found
 
     return x(coefficients, x), emit
 
 
-def inverse_root(x):
+def inverse_square_root(x):
     """1/sqrt(x), accurate to about the last digit."""
     raise TypeError("compiled code only")
 
 
 # The series are written out, since LLVM's own choice depends on the processor: for some it computes a root and divides,
 # for others it corrects an estimate of float32 by one step, and the cube is off by up to 5.8e-7 instead of 1.9e-7.
-@implements(inverse_root, inline=True)
+@implements(inverse_square_root, inline=True)
 def _inverse_root(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / sqrt(x)
-    if terms := _terms(x):
+    if terms := _series_terms(x):
         series = ROOT[:terms]
 
         def from_estimate(x):
             y = _root_estimate(x)
             e = 1.0 - x * y * y
-            return y + y * (e * _nested(series, e))
+            return y + y * (e * _horner(series, e))
 
         return from_estimate
 
     if x.dtype == types.float32:
-        return lambda x: _quick_inverse(x)
+        return lambda x: _approximate_inverse_root(x)
 
     def refined(x):
         # One step of third order takes the float32 result from 24 bits to 53; a float64 root and division are slower.
-        y = double(_quick_inverse(single(x)))
+        y = to_double(_approximate_inverse_root(to_single(x)))
         e = 1.0 - x * y * y
         return y + y * e * (0.5 + 0.375 * e)
 
     return refined
 
 
-def root_and_cube(x):
+def inverse_root_and_cube(x):
     """1/sqrt(x), and two numbers whose product is 1/sqrt(x)³, each accurate to about the last digit.
 
     The caller multiplies the two in one multiply-add with what is added to the cube. The root costs nothing where it is
@@ -325,10 +325,10 @@ def root_and_cube(x):
     raise TypeError("compiled code only")
 
 
-@implements(root_and_cube, inline=True)
+@implements(inverse_root_and_cube, inline=True)
 def _root_and_cube(x):
-    if isinstance(x, Lanes) and _terms(x):
-        series, of_root = (1.0, *CUBE[: _terms(x)]), ROOT[: _terms(x)]
+    if isinstance(x, Lanes) and _series_terms(x):
+        series, of_root = (1.0, *CUBE[: _series_terms(x)]), ROOT[: _series_terms(x)]
 
         def from_estimate(x):
             # A corrected root and its cube would take one multiplication more; pairs with a reaction field then take
@@ -336,19 +336,19 @@ def _root_and_cube(x):
             y = _root_estimate(x)
             y2 = y * y
             e = 1.0 - x * y2
-            return y + y * (e * _nested(of_root, e)), y * y2, _nested(series, e)
+            return y + y * (e * _horner(of_root, e)), y * y2, _horner(series, e)
 
         return from_estimate
 
     def cubed(x):
-        y = inverse_root(x)
+        y = inverse_square_root(x)
         return y, y, y * y
 
     return cubed
 
 
 @intrinsic
-def smaller_of_two(typing, x):
+def pairwise_minimum(typing, x):
     """The smaller of lanes 2 k and 2 k + 1, in both lanes."""
 
     def emit(context, builder, signature, arguments):
@@ -361,7 +361,7 @@ def smaller_of_two(typing, x):
 
 
 @intrinsic
-def store_whole_alternate(typing, array, index, x):
+def store_even_lanes(typing, array, index, x):
     """Write the whole parts of lanes 0, 2, 4, ... of a vector, from 0 to 127, to an array of bytes from an index on.
 
     Lane 1 must equal lane 0, lane 3 lane 2, and so on.
@@ -393,31 +393,31 @@ def inverse(x):
 def _inverse(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / x
-    if _is_whole(x):  # without AVX-512 a division in single precision is faster
-        series = QUOTIENT[: _terms(x)]
+    if _fills_avx512(x):  # without AVX-512 a division in single precision is faster
+        series = QUOTIENT[: _series_terms(x)]
 
         def from_estimate(x):
             y = _quotient_estimate(x)
             e = 1.0 - x * y
-            return y + y * (e * _nested(series, e))
+            return y + y * (e * _horner(series, e))
 
         return from_estimate
 
     if x.dtype == types.float32:
-        return lambda x: _quick_quotient(x)
+        return lambda x: _approximate_inverse(x)
 
     def refined(x):
-        y = double(_quick_quotient(single(x)))
+        y = to_double(_approximate_inverse(to_single(x)))
         e = 1.0 - x * y
         return y + y * e * (1.0 + e)
 
     return refined
 
 
-def _chosen(sign):
+def _selection(sign):
     def chosen(typing, x, y):
         def emit(context, builder, signature, arguments):
-            a, b = (filled(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
+            a, b = (emit_broadcast(context, builder, v, k, x) for v, k in zip(arguments, signature.args, strict=True))
             return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
         return x(x, y), emit
@@ -425,28 +425,28 @@ def _chosen(sign):
     return chosen
 
 
-_larger = intrinsic(_chosen(">"))
-_smaller = intrinsic(_chosen("<"))
+_larger = intrinsic(_selection(">"))
+_smaller = intrinsic(_selection("<"))
 
 
-def larger(x, y):
+def maximum(x, y):
     """The larger of x and y in each lane, y where x is NaN; y may be a scalar."""
     raise TypeError("compiled code only")
 
 
-@implements(larger, inline=True)
+@implements(maximum, inline=True)
 def _larger_of_both(x, y):
     if isinstance(x, Lanes):
         return lambda x, y: _larger(x, y)
     return lambda x, y: max(x, y)
 
 
-def smaller(x, y):
+def minimum(x, y):
     """The smaller of x and y in each lane, y where x is NaN; y may be a scalar."""
     raise TypeError("compiled code only")
 
 
-@implements(smaller, inline=True)
+@implements(minimum, inline=True)
 def _smaller_of_both(x, y):
     if isinstance(x, Lanes):
         return lambda x, y: _smaller(x, y)
@@ -458,13 +458,15 @@ def select(typing, mask, x, y):
     """x where the mask is set, y elsewhere; y may be a scalar."""
 
     def emit(context, builder, signature, arguments):
-        return builder.select(arguments[0], arguments[1], filled(context, builder, arguments[2], signature.args[2], x))
+        return builder.select(
+            arguments[0], arguments[1], emit_broadcast(context, builder, arguments[2], signature.args[2], x)
+        )
 
     return x(mask, x, y), emit
 
 
 @intrinsic
-def bits(typing, mask):
+def mask_bits(typing, mask):
     """The mask as an integer, bit k for lane k."""
 
     def emit(context, builder, signature, arguments):
@@ -485,7 +487,7 @@ def lowest_bit(typing, word):
 
 
 @intrinsic
-def mask_of(typing, word, lanes):
+def mask_from_bits(typing, word, lanes):
     """The mask for lanes of this type, with lane k from bit k of an integer."""
     mask = Mask(lanes.count)
 
@@ -496,60 +498,60 @@ def mask_of(typing, word, lanes):
 
 
 @intrinsic
-def total(typing, x):
+def sum_lanes(typing, x):
     """The sum of all lanes as a float64, added pairwise in a fixed order."""
 
     def emit(context, builder, signature, arguments):
         value = arguments[0]
         if x.dtype == types.float32:
             value = builder.fpext(value, ir.VectorType(ir.DoubleType(), x.count))
-        return builder.extract_element(_in_halves(builder, value, 1), ir.IntType(32)(0))
+        return builder.extract_element(_add_halves(builder, value, 1), ir.IntType(32)(0))
 
     return types.float64(x), emit
 
 
-def _shuffled(builder, a, b, lanes):
+def _shuffle(builder, a, b, lanes):
     """A vector of these lanes of two others; those of b have the numbers after those of a."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
 
 
-def _in_halves(builder, value, count):
+def _add_halves(builder, value, count):
     """The halves of a vector added, again and again until so many lanes are left."""
     while value.type.count > count:
         half = value.type.count // 2
-        value = builder.fadd(*(_shuffled(builder, value, value, range(k, k + half)) for k in (0, half)))
+        value = builder.fadd(*(_shuffle(builder, value, value, range(k, k + half)) for k in (0, half)))
     return value
 
 
 @intrinsic
-def add_totals(typing, array, index, step, x, y):
+def add_lane_sums(typing, array, index, step, x, y):
     """Add the sums of all lanes of vectors x[k] and y[k] to array[index + k step] and array[index + k step + 1].
 
     x, y : tuples of three vectors. All six are summed together, in the precision of the array, which takes fewer
-    instructions than six times `total`.
+    instructions than six times `sum_lanes`.
     """
     if not _is_row(array):
         return None
-    lanes = Lanes(array.dtype, COUNT[array.dtype])
+    lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
     three = types.UniTuple(lanes, 3)
     width, part = lanes.count, 128 // array.dtype.bitwidth  # part: lanes within which a processor shuffles fastest
 
     def merged(builder, a, b, first, second):
         """The sum of two choices of lanes of a and b, the same in each part."""
         both = [[start + k for start in range(0, width, part) for k in lanes] for lanes in (first, second)]
-        return builder.fadd(*(_shuffled(builder, a, b, lanes) for lanes in both))
+        return builder.fadd(*(_shuffle(builder, a, b, lanes) for lanes in both))
 
     def emit(context, builder, signature, arguments):
         into, index, step, *both = arguments
         found = [[builder.extract_value(of, k) for of in both] for k in range(3)]
         if part == 2:
-            sums = [_in_halves(builder, merged(builder, *of, (0, width), (1, width + 1)), 2) for of in found]
+            sums = [_add_halves(builder, merged(builder, *of, (0, width), (1, width + 1)), 2) for of in found]
         else:
             halves = (0, width, 1, width + 1), (2, width + 2, 3, width + 3)
             on_x, on_y, on_z = (merged(builder, *of, *halves) for of in found)
             halves = (0, 1, width, width + 1), (2, 3, width + 2, width + 3)
-            fours = [_in_halves(builder, merged(builder, *of, *halves), 4) for of in ((on_x, on_y), (on_z, on_z))]
-            sums = [_shuffled(builder, four, four, lanes) for four in fours for lanes in ((0, 1), (2, 3))][:3]
+            fours = [_add_halves(builder, merged(builder, *of, *halves), 4) for of in ((on_x, on_y), (on_z, on_z))]
+            sums = [_shuffle(builder, four, four, lanes) for four in fours for lanes in ((0, 1), (2, 3))][:3]
         data = context.make_array(array)(context, builder, into).data
         for own in sums:
             there = builder.bitcast(builder.gep(data, [index]), own.type.as_pointer())
@@ -562,7 +564,7 @@ def add_totals(typing, array, index, step, x, y):
 
 
 @intrinsic
-def largest(typing, x):
+def largest_lane(typing, x):
     """The largest of all lanes; undefined if a lane is NaN."""
 
     def emit(context, builder, signature, arguments):
@@ -573,7 +575,7 @@ def largest(typing, x):
 
 
 @intrinsic
-def lane(typing, x, k):
+def extract_lane(typing, x, k):
     """The number in lane k."""
 
     def emit(context, builder, signature, arguments):
@@ -598,14 +600,14 @@ def polynomial(typing, coefficients, x):
         def constant(k):
             number = builder.extract_value(values, k)
             if isinstance(x, Lanes):
-                return filled(context, builder, number, kinds[k], x)
+                return emit_broadcast(context, builder, number, kinds[k], x)
             return context.cast(builder, number, kinds[k], x)
 
         def chain(powers, y):
-            total = constant(powers[-1])
+            sum_lanes = constant(powers[-1])
             for k in powers[-2::-1]:
-                total = multiply_add(builder, total, y, constant(k))
-            return total
+                sum_lanes = multiply_add(builder, sum_lanes, y, constant(k))
+            return sum_lanes
 
         square = builder.fmul(x_value, x_value)
         even, odd = range(0, len(kinds), 2), range(1, len(kinds), 2)
@@ -618,7 +620,7 @@ def polynomial(typing, coefficients, x):
 
 
 @intrinsic
-def cubic_at(typing, coefficients, t):
+def evaluate_cubic(typing, coefficients, t):
     """(value, derivative) at t of cubic polynomials, number k of which is valid from t = k to k + 1.
 
     coefficients (4 n,) : four for each, of x = t - k in ascending order. Before 0 the first goes on in a straight line,
@@ -653,10 +655,10 @@ def cubic_at(typing, coefficients, t):
         curved = [builder.select(begins, zero, part) for part in parts[2:]]
 
         def sum_of(*terms):
-            total = terms[-1]
+            sum_lanes = terms[-1]
             for term in terms[-2::-1]:
-                total = multiply_add(builder, total, x, term)
-            return total
+                sum_lanes = multiply_add(builder, sum_lanes, x, term)
+            return sum_lanes
 
         def times(k, part):
             return builder.fmul(ir.Constant(vector, [float(k)] * lanes.count), part)
@@ -670,41 +672,41 @@ def cubic_at(typing, coefficients, t):
 
 
 @intrinsic
-def fill(typing, number, array):
+def broadcast(typing, number, array):
     """A vector of an array's type with the same number in every lane."""
-    lanes = Lanes(array.dtype, COUNT[array.dtype])
+    lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
 
     def emit(context, builder, signature, arguments):
-        return filled(context, builder, arguments[0], number, lanes)
+        return emit_broadcast(context, builder, arguments[0], number, lanes)
 
     return lanes(number, array), emit
 
 
-def width_of(array):
+def lanes_of(array):
     """Number of lanes in the vectors of an array, a constant at compile time."""
     raise TypeError("compiled code only")
 
 
-@implements(width_of, inline=True)
+@implements(lanes_of, inline=True)
 def _width_of(array):
-    count = COUNT[array.dtype]
+    count = LANE_COUNTS[array.dtype]
     return lambda array: count
 
 
-def narrowed(x, array):
+def convert_to(x, array):
     """A vector converted to the precision of an array."""
     raise TypeError("compiled code only")
 
 
-@implements(narrowed, inline=True)
+@implements(convert_to, inline=True)
 def _narrowed(x, array):
     if array.dtype == types.float32:
-        return lambda x, array: single(x)
+        return lambda x, array: to_single(x)
     return lambda x, array: x
 
 
 @intrinsic
-def parted(typing, x):
+def split_integer_part(typing, x):
     """(whole, rest) of float32 lanes: integers, rounded towards 0, and x less these; undefined from 2^31 on."""
     if not isinstance(x, Lanes) or x.dtype != types.float32:
         return None
@@ -720,7 +722,7 @@ def parted(typing, x):
 
 
 @intrinsic
-def picked(typing, low, high, index):
+def permute_two(typing, low, high, index):
     """In each lane, one of 32 numbers: 0 to 15 are the lanes of `low`, 16 to 31 those of `high`, all float32.
 
     Only the last five bits of an index count. This is one instruction of AVX-512, see HAS_AVX512: a table in registers.

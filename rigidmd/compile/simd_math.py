@@ -20,7 +20,7 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, type_callable
 
-from rigidmd.compile.simd_types import Lanes, filled
+from rigidmd.compile.simd_types import Lanes, emit_broadcast
 
 #: ln 2 in two parts, by the bits of a number; the first ends in zero bits, so that whole multiples of it are exact.
 LN2 = {64: (0.693147180369123816490, 1.90821492927058770002e-10), 32: (0.693359375, -2.12194440e-4)}
@@ -30,7 +30,7 @@ HALF_PI = (1.5707963267948966, 6.123233995736766e-17, -1.4973849048591833e-33)
 LONGEST_ANGLE = 1e13
 
 
-class Vector:
+class VectorOperations:
     """Operations on vectors of one type, each rounded as written."""
 
     def __init__(self, builder, lanes: Lanes):
@@ -105,7 +105,7 @@ class Vector:
         return total
 
 
-def exponential(v: Vector, x, low=None):
+def exponential(v: VectorOperations, x, low=None):
     """exp(x + low), with low a small correction."""
     least, most = (-746.0, 710.0) if v.is_double else (-104.0, 89.0)
     x = v.choose(v.compare("<", x, v.number(least)), v.number(least), x)
@@ -125,7 +125,7 @@ def exponential(v: Vector, x, low=None):
     return result
 
 
-def _mantissa(v: Vector, x):
+def _mantissa(v: VectorOperations, x):
     """(e, f) with x = 2^e (1 + f), 1 + f from sqrt(1/2) to sqrt(2); for x > 0."""
     b = v.builder
     least = 2.0 ** (1 - v.bias)
@@ -138,19 +138,19 @@ def _mantissa(v: Vector, x):
     return v.of_integer(e), v.sub(m, v.number(1.0))
 
 
-def _odd_series(v: Vector, s2):
+def _odd_series(v: VectorOperations, s2):
     """(log((1 + s)/(1 - s)) - 2 s)/s³ from s²."""
     return v.polynomial([2 / (2 * j + 3) for j in range(11 if v.is_double else 5)], s2)
 
 
-def _special(v: Vector, x, result):
+def _logarithm_limits(v: VectorOperations, x, result):
     """The logarithm at infinity, at zero and below."""
     result = v.choose(v.compare("==", x, v.number(math.inf)), v.number(math.inf), result)
     below = v.choose(v.compare("==", x, v.number(0.0)), v.number(-math.inf), v.number(math.nan))
     return v.choose(v.compare(">", x, v.number(0.0)), result, below)
 
 
-def logarithm(v: Vector, x):
+def logarithm(v: VectorOperations, x):
     """log(x)."""
     e, f = _mantissa(v, x)
     s = v.div(f, v.add(v.number(2.0), f))
@@ -158,10 +158,10 @@ def logarithm(v: Vector, x):
     half = v.mul(v.number(0.5), v.mul(f, f))
     high, low = LN2[v.bits]
     inner = v.fma(e, v.number(low), v.mul(s, v.fma(s2, _odd_series(v, s2), half)))
-    return _special(v, x, v.fma(e, v.number(high), v.sub(f, v.sub(half, inner))))
+    return _logarithm_limits(v, x, v.fma(e, v.number(high), v.sub(f, v.sub(half, inner))))
 
 
-def raised(v: Vector, x, y):
+def power(v: VectorOperations, x, y):
     """x^y in double precision, for x >= 0; NaN for x < 0."""
     e, f = _mantissa(v, x)
     g = v.add(v.number(2.0), f)
@@ -176,7 +176,7 @@ def raised(v: Vector, x, y):
     log_low = v.fma(e, v.number(ln2_low), log_low)
     log_low = v.fma(v.number(2.0), v.div(rest, g), log_low)
     log_low = v.fma(v.mul(s, s2), _odd_series(v, s2), log_low)
-    log_high = _special(v, x, log_high)
+    log_high = _logarithm_limits(v, x, log_high)
     product = v.mul(y, log_high)
     low = v.fma(y, log_low, v.fma(y, log_high, v.negative(product)))
     low = v.choose(v.compare("<", v.call("fabs", product), v.number(750.0)), low, v.number(0.0))
@@ -184,7 +184,7 @@ def raised(v: Vector, x, y):
     return v.choose(v.compare("==", y, v.number(0.0)), v.number(1.0), result)
 
 
-def _circular(v: Vector, x, quarter: int):
+def _sine(v: VectorOperations, x, quarter: int):
     """sin(x + quarter pi/2)."""
     b = v.builder
     n, k = v.nearest(v.mul(x, v.number(2 / math.pi)))
@@ -209,7 +209,7 @@ def _circular(v: Vector, x, quarter: int):
 
 def _in_double(builder, lanes: Lanes, emit, *values):
     """A function of vectors that is computed in double precision whatever their type."""
-    wide = Vector(builder, Lanes(types.float64, lanes.count))
+    wide = VectorOperations(builder, Lanes(types.float64, lanes.count))
     if wide.bits == lanes.dtype.bitwidth:
         return emit(wide, *values)
     narrow = values[0].type
@@ -217,19 +217,19 @@ def _in_double(builder, lanes: Lanes, emit, *values):
 
 
 def _root(builder, lanes, x):
-    return Vector(builder, lanes).call("sqrt", x)
+    return VectorOperations(builder, lanes).call("sqrt", x)
 
 
 def _absolute(builder, lanes, x):
-    return Vector(builder, lanes).call("fabs", x)
+    return VectorOperations(builder, lanes).call("fabs", x)
 
 
 #: What Python's functions are for vectors: emit(builder, type, value).
 FUNCTIONS = {
-    math.exp: lambda builder, lanes, x: exponential(Vector(builder, lanes), x),
-    math.log: lambda builder, lanes, x: logarithm(Vector(builder, lanes), x),
-    math.sin: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _circular(v, x, 0), x),
-    math.cos: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _circular(v, x, 1), x),
+    math.exp: lambda builder, lanes, x: exponential(VectorOperations(builder, lanes), x),
+    math.log: lambda builder, lanes, x: logarithm(VectorOperations(builder, lanes), x),
+    math.sin: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _sine(v, x, 0), x),
+    math.cos: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _sine(v, x, 1), x),
     math.sqrt: _root,
     math.fabs: _absolute,
     abs: _absolute,
@@ -253,7 +253,7 @@ for _function, _emit in FUNCTIONS.items():
     _define(_function, _emit)
 
 
-def _whole_power(v: Vector, x, n: int):
+def _whole_power(v: VectorOperations, x, n: int):
     """x^n by squaring, for a constant integer."""
     if n == 0:
         return v.number(1.0)
@@ -281,10 +281,10 @@ class _PowerType(AbstractTemplate):
 
 def _power(context, builder, signature, arguments):
     lanes, (of_x, of_y) = signature.return_type, signature.args
-    x = filled(context, builder, arguments[0], of_x, lanes)
+    x = emit_broadcast(context, builder, arguments[0], of_x, lanes)
     if isinstance(of_y, types.IntegerLiteral):
-        return _whole_power(Vector(builder, lanes), x, of_y.literal_value)
-    return _in_double(builder, lanes, raised, x, filled(context, builder, arguments[1], of_y, lanes))
+        return _whole_power(VectorOperations(builder, lanes), x, of_y.literal_value)
+    return _in_double(builder, lanes, power, x, emit_broadcast(context, builder, arguments[1], of_y, lanes))
 
 
 for _function in (operator.pow, operator.ipow, math.pow):

@@ -8,7 +8,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from rigidmd.compile.simd_types import COUNT, Lanes
+from rigidmd.compile.simd_types import LANE_COUNTS, Lanes
 
 
 def _transposed(builder, rows: list) -> list:
@@ -40,7 +40,7 @@ def _loader(size: int):
     def load(typing, array, first):
         if not isinstance(array, types.Array) or array.layout != "C":
             return None
-        lanes = Lanes(array.dtype, COUNT[array.dtype])
+        lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
         found = types.UniTuple(lanes, size)
         count, align = lanes.count, array.dtype.bitwidth // 8
 
@@ -67,7 +67,7 @@ def _storer(size: int):
     def store(typing, array, first, columns):
         if not isinstance(array, types.Array) or array.layout != "C":
             return None
-        lanes = Lanes(array.dtype, COUNT[array.dtype])
+        lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
         count, align = lanes.count, array.dtype.bitwidth // 8
 
         def emit(context, builder, signature, arguments):

@@ -13,7 +13,7 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 from rigidmd.compile.machine import SIMD_BITS
 
 #: Lanes of a vector on this machine, by the type of its numbers.
-COUNT = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
+LANE_COUNTS = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
 
 
 class Lanes(types.Type):
@@ -54,7 +54,7 @@ def _common(a, b) -> Lanes | None:
     return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
 
 
-def filled(context, builder, value, kind, lanes):
+def emit_broadcast(context, builder, value, kind, lanes):
     """The value as a vector: itself, or a scalar in every lane."""
     if kind == lanes:
         return value
@@ -80,7 +80,8 @@ def _operator(functions, emit, result=lambda lanes: lanes):
         def lower(context, builder, signature, arguments):
             lanes = _common(*signature.args)
             left, right = (
-                filled(context, builder, v, kind, lanes) for v, kind in zip(arguments, signature.args, strict=True)
+                emit_broadcast(context, builder, v, kind, lanes)
+                for v, kind in zip(arguments, signature.args, strict=True)
             )
             return emit(builder, left, right)
 

@@ -23,9 +23,9 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from rigidmd.compile.kernels import kernel, options_of
+from rigidmd.compile.kernels import compiler_options, kernel
 from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS
-from rigidmd.compile.numba_private import callback, uncounted
+from rigidmd.compile.numba_private import compile_callback, reference_counting
 
 WORD = ir.IntType(64)
 #: Cells of the crew's memory, 8 to a line of cache: cells that different threads write are on lines of their own.
@@ -128,7 +128,7 @@ def _ring(typing, bell):
 
 
 @intrinsic
-def jump_to(typing, address, parcel, block):
+def call_address(typing, address, parcel, block):
     """Call the task at an address for a parcel, or a `Laid` value, at another."""
 
     def emit(context, builder, signature, arguments):
@@ -155,7 +155,7 @@ def _take(crew, job, address, parcel, blocks, own, threads):
         # A part of an earlier job has this number or a later one: all were claimed before the next job was written.
         if claimed < job and _replace(crew, CLAIMED + part, claimed, job):
             for block in range(part * blocks // parts, (part + 1) * blocks // parts):
-                jump_to(address, parcel, block)
+                call_address(address, parcel, block)
             last |= _add(crew, DONE, 1) + 1 == parts
         part = (part + (1 if up else parts - 1)) % parts
     return last
@@ -189,7 +189,7 @@ def _lead(crew, address, parcel, blocks):
     helpers = _read(crew, HELPERS)
     if helpers == 0 or not _replace(crew, AT_WORK, 0, 1):
         for block in range(blocks):
-            jump_to(address, parcel, block)
+            call_address(address, parcel, block)
         return
     parts = min(blocks, PARTS)
     job = (_read(crew, JOB) // 2 + 1) * 2
@@ -225,8 +225,8 @@ def _look(crew, looks):
 
 
 @intrinsic
-def share_out(typing, address, parcel, blocks):
-    """Call the task at an address for every block of its parcel, on all threads. `begin` must have been called."""
+def run_on_all_threads(typing, address, parcel, blocks):
+    """Call the task at an address for every block of its parcel, on all threads. `start_workers` must have been called."""
 
     def emit(context, builder, signature, arguments):
         memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, WORD, SYMBOL)
@@ -254,13 +254,13 @@ class _Crew:
         self.code: list = []
         self._hiring = threading.RLock()
 
-    def begin(self) -> None:
+    def start_workers(self) -> None:
         """Compile what the crew does, or read it from the cache, and hire the helpers that are wanted."""
         with self._hiring:
             if not self.code:
-                options = options_of(False) | uncounted(False)
+                options = compiler_options(False) | reference_counting(False)
                 self.code = [
-                    callback(function, (types.int64,) * count, options)
+                    compile_callback(function, (types.int64,) * count, options)
                     for function, count in ((_lead, 4), (_help, 2), (_look, 2))
                 ]
                 self.cells[LEAD] = self.code[0].address
@@ -269,7 +269,7 @@ class _Crew:
             self.hire()
 
     def hire(self) -> None:
-        """Hire the helpers that are missing, and let as many help as are wanted. Does nothing before `begin`."""
+        """Hire the helpers that are missing, and let as many help as are wanted. Does nothing before `start_workers`."""
         if not self.code:
             return
         with self._hiring:
@@ -321,7 +321,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_crew.forget)
 
 
-def begin() -> None:
+def start_workers() -> None:
     """Make the crew ready, at the first call: a leader can then share out blocks."""
     _crew.begin()
 

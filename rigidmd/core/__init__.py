@@ -1,1 +1,1 @@
-"""What every package may import, and compiles nothing: the state, status codes, integrators, file helpers."""
+"""Used by every package, without compiled code: the state, status codes, integrators, statistics, files, TOML."""

@@ -11,12 +11,12 @@ PROVIDERS: list[str] = []
 
 @singledispatch
 def html(value: object) -> str | None:
-    """HTML of a value, registered for its type; None where nothing is registered."""
+    """HTML of a value, by a function registered for its type; None without one."""
     return None
 
 
 class Displayed:
-    """Base of classes that notebooks display by `html`."""
+    """Base of classes that notebooks display with `html`."""
 
     def _repr_html_(self) -> str | None:
         while PROVIDERS:

@@ -1,53 +1,49 @@
-"""Integrators as data: rows of flows, kicks (forces and torques), drifts (free flight and free rotation), baths, boxes.
+"""Integrators as data: rows of flows such as kick, drift, thermostat and barostat.
 
-A row holds the flows of a step with their fractions of the time step. Kick and drift are symplectic and
-time-reversible, so any palindrome of them is too; the coefficients determine its order.
+A row contains the flows of a step with their fractions of the time step. Kick (forces and torques) and drift (free
+flight and free rotation) are symplectic and time-reversible, so any palindrome of them is too; the coefficients
+determine its order.
 
-Compositions of whole Verlet steps keep their order with any rotor, because such a step is symmetric whatever the rotor
-does. All other rows need a drift that is the exact free motion: with the split rotor their order falls to 2.
+Compositions of whole Verlet steps keep their order with any rotor, because such a step is symmetric for every symmetric
+rotor. All other rows need a drift that is the exact free motion: with the split rotor their order falls to 2.
 """
 
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-#: The flows that a step is made of: by the forces, free flight and free rotation, by a bath; removal of the total
-#: momentum; by a pressure, and of a volume by its own inertia.
-KICK, DRIFT, BATH, REST, BOX, STRETCH = 0, 1, 2, 3, 4, 5
-
-
-#: Error of sums and mirrored fractions of a row, from coefficients in print.
+#: Kinds of flows: forces; free flight and rotation; thermostat; removal of the total momentum; barostat; change of the
+#: volume by the inertia of a piston.
+KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT, SCALE_BOX = 0, 1, 2, 3, 4, 5
+#: Error of sums and mirrored fractions of a row, from printed coefficients.
 ROUNDING = 1e-10
 
 
 class Flow(NamedTuple):
     """One flow of a step."""
 
-    kind: int  # KICK, DRIFT, BATH, REST, BOX or STRETCH
-    fraction: float  # of the time step; of what is taken in every so many steps, of as many
-    gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.gradient)
-    every: int = 1  # it is taken in every so many steps of a stretch
+    kind: int  # KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT or SCALE_BOX
+    fraction: float  # of the time step; of `every` time steps for a flow that acts every `every` steps
+    gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.force_gradient)
+    every: int = 1  # it acts at every n-th step of a segment
 
-    @property
-    def in_words(self) -> str:
-        """Of a kick or drift."""
+    def describe(self) -> str:
+        """Description of a kick or drift for messages."""
         gradient = f", gradient {self.gradient:.12g}" if self.gradient else ""
         return f"{'kick' if self.kind == KICK else 'drift'} {self.fraction:.12g}{gradient}"
 
 
-class _Row(NamedTuple):
-    """The fields of a scheme."""
-
+class _SchemeFields(NamedTuple):
     name: str
     flows: tuple[Flow, ...]  # kicks sum to 1, drifts too
     order: int
-    exact_rotor: bool  # whether its order needs one
+    exact_rotor: bool  # whether its order needs the exact rotor
     source: str
-    bath: tuple | None = None  # whose flow BATH is (dynamics.baths)
-    box: tuple | None = None  # whose flows BOX and STRETCH are (dynamics.boxes)
+    thermostat: tuple | None = None  # with the flow THERMOSTAT (dynamics.thermostats)
+    barostat: tuple | None = None  # with the flows BAROSTAT and SCALE_BOX (dynamics.barostats)
 
 
-class Scheme(_Row):
-    """A step as a row of flows, with its name, order and needs.
+class Scheme(_SchemeFields):
+    """A step as a row of flows, with its name, order and requirements.
 
     Raises ValueError unless kicks and drifts each sum to 1 and read the same from both ends, so that the step is
     consistent and time-reversible.
@@ -64,7 +60,7 @@ class Scheme(_Row):
         moving = [flow for flow in made.flows if flow.kind in (KICK, DRIFT)]
         for k, (one, other) in enumerate(zip(moving, reversed(moving), strict=True)):
             if not max(abs(a - b) for a, b in zip(one[:3], other[:3], strict=True)) <= ROUNDING:
-                n, pair = len(moving), f"{one.in_words} and {other.in_words}"
+                n, pair = len(moving), f"{one.describe()} and {other.describe()}"
                 wrong = f"its flows {k + 1} and {n - k} of {n} differ ({pair}), so that it is not time-reversible"
                 raise ValueError(f"integrator {made.name}: {wrong}; odd() and even() mirror fractions")
         return made
@@ -74,23 +70,24 @@ class Scheme(_Row):
         return self if rotor is None else self._replace(exact_rotor=rotor == "exact")
 
     @property
-    def has_bath(self) -> bool:
-        """Whether a bath has its place in the row itself."""
-        return any(flow.kind == BATH for flow in self.flows)
+    def has_thermostat(self) -> bool:
+        """Whether the row itself contains a thermostat flow."""
+        return any(flow.kind == THERMOSTAT for flow in self.flows)
 
-    def with_bath(self, bath: tuple, halved: bool = False) -> "Scheme":
-        """This scheme with a bath: where its row says; or else half before and half after a step, or all after it."""
-        if self.has_bath:
-            return self._replace(bath=bath)
+    def with_thermostat(self, thermostat: tuple, halved: bool = False) -> "Scheme":
+        """This scheme with a thermostat where its row has one; else half before and half after a step, or all after."""
+        if self.has_thermostat:
+            return self._replace(thermostat=thermostat)
         if halved:
-            return self._replace(flows=(Flow(BATH, 0.5), *self.flows, Flow(BATH, 0.5)), bath=bath)
-        return self._replace(flows=(*self.flows, Flow(BATH, 1.0)), bath=bath)
+            flows = (Flow(THERMOSTAT, 0.5), *self.flows, Flow(THERMOSTAT, 0.5))
+            return self._replace(flows=flows, thermostat=thermostat)
+        return self._replace(flows=(*self.flows, Flow(THERMOSTAT, 1.0)), thermostat=thermostat)
 
-    def with_box(self, box: tuple, every: int) -> "Scheme":
-        """This scheme with a box that moves at the end of every so many steps."""
-        return self._replace(flows=(*self.flows, Flow(BOX, float(every), every=every)), box=box)
+    def with_barostat(self, barostat: tuple, every: int) -> "Scheme":
+        """This scheme with a barostat that acts at the end of every `every` steps."""
+        return self._replace(flows=(*self.flows, Flow(BAROSTAT, float(every), every=every)), barostat=barostat)
 
-    def with_piston(self, box: tuple) -> "Scheme":
+    def with_piston(self, piston: tuple) -> "Scheme":
         """This scheme, a composition of Verlet steps, with a volume that has inertia.
 
         Each step kicks the volume before its first and after its last kick, and moves it before and after its drift;
@@ -98,13 +95,13 @@ class Scheme(_Row):
         """
         steps, flows = self.drifts, []
         for before, after in pairwise((0.0, *steps, 0.0)):
-            flows += [Flow(KICK, before / 2), Flow(BOX, (before + after) / 2), Flow(KICK, after / 2)]
-            flows += [Flow(STRETCH, after / 2), Flow(DRIFT, after), Flow(STRETCH, after / 2)]
-        return self._replace(flows=tuple(flow for flow in flows if flow.fraction), box=box)
+            flows += [Flow(KICK, before / 2), Flow(BAROSTAT, (before + after) / 2), Flow(KICK, after / 2)]
+            flows += [Flow(SCALE_BOX, after / 2), Flow(DRIFT, after), Flow(SCALE_BOX, after / 2)]
+        return self._replace(flows=tuple(flow for flow in flows if flow.fraction), barostat=piston)
 
-    def with_rest(self, every: int) -> "Scheme":
+    def with_momentum_removal(self, every: int) -> "Scheme":
         """This scheme with the total momentum of all molecules removed at the end of every `every` steps."""
-        return self._replace(flows=(*self.flows, Flow(REST, 0.0, every=every)))
+        return self._replace(flows=(*self.flows, Flow(REMOVE_MOMENTUM, 0.0, every=every)))
 
     @property
     def kicks(self) -> tuple[float, ...]:
@@ -123,9 +120,9 @@ class Scheme(_Row):
 
     @property
     def force_evaluations(self) -> int:
-        """In a step: one for each kick after a drift; the first kick of a step uses that of the last kick before it.
+        """Force evaluations per step: one for each kick after a drift, and one more for each gradient.
 
-        A gradient takes one more.
+        The first kick of a step uses the forces of the last kick before it.
         """
         moving = [flow for flow in self.flows if flow.kind in (KICK, DRIFT)]
         after_drift = sum(b.kind == KICK and a.kind == DRIFT for a, b in pairwise((moving[-1], *moving)))
@@ -139,14 +136,10 @@ def composed(name: str, steps: tuple[float, ...], order: int, source: str) -> Sc
 
 
 def split(
-    name: str,
-    kicks: tuple[float, ...],
-    drifts: tuple[float, ...],
-    order: int,
-    source: str,
+    name: str, kicks: tuple[float, ...], drifts: tuple[float, ...], order: int, source: str,
     gradients: tuple[float, ...] | None = None,
-) -> Scheme:
-    """kick(kicks[0] dt) drift(drifts[0] dt) ... kick(kicks[-1] dt) as they are, for an exact rotor.
+) -> Scheme:  # fmt: skip
+    """kick(kicks[0] dt) drift(drifts[0] dt) ... kick(kicks[-1] dt), for an exact rotor.
 
     gradients : of each kick, see `Flow.gradient`
     """
@@ -160,7 +153,7 @@ def split(
 def _alternating(
     kicks: tuple[float, ...], drifts: tuple[float, ...], gradients: tuple[float, ...] | None = None
 ) -> tuple[Flow, ...]:
-    """Kick, drift, ..., kick without those of length 0."""
+    """Kick, drift, ..., kick, without flows of length 0."""
     flows = []
     for k, (kick, tau) in enumerate(zip(kicks, gradients or (0.0,) * len(kicks), strict=True)):
         flows.append(Flow(KICK, kick, tau))
@@ -180,21 +173,21 @@ def even(*half: float) -> tuple[float, ...]:
 
 
 Rotor = Literal["split", "exact"]
-AUTO = "auto"  # in place of a name: pilot runs find the cheapest one for an accuracy
+AUTO = "auto"  # instead of a name: pilot runs find the cheapest integrator for an accuracy
 
 
-def auto_faults(integrator: str, asked: dict[str, float | None], idle: list[str]) -> list[str]:
-    """Faults between an integrator, the requested errors (key -> value) and keys that pilot runs decide."""
-    given = [key for key, value in asked.items() if value is not None]
+def auto_errors(integrator: str, requested: dict[str, float | None], unused: list[str]) -> list[str]:
+    """Conflicts between an integrator, the requested errors (key -> value) and keys that pilot runs decide."""
+    given = [key for key, value in requested.items() if value is not None]
     if integrator != AUTO:
         return [f"{', '.join(given)} would do nothing without integrator = 'auto'"] if given else []
-    faults = [f"{', '.join(idle)} would do nothing with integrator = 'auto', which chooses it"] if idle else []
+    errors = [f"{', '.join(unused)} would do nothing with integrator = 'auto', which chooses it"] if unused else []
     if len(given) != 1:
-        faults.append(f"integrator = 'auto' needs one of {', '.join(asked)}")
-    return faults
+        errors.append(f"integrator = 'auto' needs one of {', '.join(requested)}")
+    return errors
 
 
-def rotor_fault(integrator: str, rotor: Rotor | None) -> str:
+def rotor_error(integrator: str, rotor: Rotor | None) -> str:
     """Why a scheme and a rotor do not fit; empty if they do."""
     if rotor == "split" and integrator != AUTO and SCHEMES[integrator].exact_rotor:
         return f"{integrator} needs rotor = 'exact': with the split rotor it would be of order 2"
@@ -208,13 +201,13 @@ FORMULATIONS = ("matrix", "quaternion", "euler_angles")
 
 
 class Solver(NamedTuple):
-    """A general ODE solver in place of a scheme of flows."""
+    """A general ODE solver instead of a scheme of flows."""
 
     name: str  # RK4, DOP853 or RADAU
     formulation: str  # of FORMULATIONS
     duration: float = 1.0  # of the whole run
     relative_tolerance: float = 1e-12  # of DOP853 and RADAU
-    absolute_tolerance: float = 1e-12  # the same, in parts of the sizes that the variables have in this run
+    absolute_tolerance: float = 1e-12  # of DOP853 and RADAU, relative to the sizes of the variables in this run
 
 
 BLANES_MOAN = "Blanes & Moan 2002, J. Comput. Appl. Math. 142, 313"
@@ -224,125 +217,51 @@ OMELYAN = "Omelyan, Mryglod & Folk 2002, Comput. Phys. Commun. 146, 188"
 SCHEMES = {
     scheme.name: scheme
     for scheme in (
-        composed(
-            "velocity_verlet",
-            (1.0,),
-            order=2,
-            source="Swope et al. 1982, J. Chem. Phys. 76, 637; for rigid bodies Dullweber et al. 1997",
-        ),
-        split(
-            "position_verlet",
-            (0.0, 1.0, 0.0),
-            (0.5, 0.5),
-            order=2,
-            source="Tuckerman, Berne & Martyna 1992, J. Chem. Phys. 97, 1990",
-        ),
-        split(
-            "two_stage",
-            odd(0.1931833275037836),
-            (0.5, 0.5),
-            order=2,
-            source="McLachlan 1995, SIAM J. Sci. Comput. 16, 151; van Zon, Omelyan & Schofield 2008",
-        ),
-        composed(
-            "yoshida_4",
-            odd(1.3512071919596578),
-            order=4,
-            source="Yoshida 1990, Phys. Lett. A 150, 262",
-        ),
-        composed(
-            "suzuki_4",
-            odd(0.4144907717943757, 0.4144907717943757),
-            order=4,
-            source="Suzuki 1990, Phys. Lett. A 146, 319",
-        ),
-        split(
-            "pefrl",
-            (0.0, *even(0.7123418310626054), 0.0),
-            odd(0.1786178958448091, -0.06626458266981849),
-            order=4,
-            source=OMELYAN,
-        ),
-        split(
-            "vefrl",
-            odd(0.1644986515575760, 1.235692651138917),
-            even(0.52094339103989808),
-            order=4,
-            source=OMELYAN,
-        ),
-        split(
-            "blanes_moan_4",
-            (0.0, *even(0.209515106613362, -0.143851773179818), 0.0),
-            odd(0.0792036964311957, 0.353172906049774, -0.0420650803577195),
-            order=4,
-            source=f"{BLANES_MOAN}, S6",
-        ),
-        split(
-            "srkn_4",
-            odd(0.0829844064174052, 0.396309801498368, -0.0390563049223486),
-            even(0.245298957184271, 0.604872665711080),
-            order=4,
-            source=f"{BLANES_MOAN}, SRKN6b",
-        ),
-        split(
-            "takahashi_imada",
-            (0.0, 1.0, 0.0),
-            (0.5, 0.5),
-            order=2,
+        composed("velocity_verlet", (1.0,), order=2,
+            source="Swope et al. 1982, J. Chem. Phys. 76, 637; for rigid bodies Dullweber et al. 1997"),
+        split("position_verlet", (0.0, 1.0, 0.0), (0.5, 0.5), order=2,
+            source="Tuckerman, Berne & Martyna 1992, J. Chem. Phys. 97, 1990"),
+        split("two_stage", odd(0.1931833275037836), (0.5, 0.5), order=2,
+            source="McLachlan 1995, SIAM J. Sci. Comput. 16, 151; van Zon, Omelyan & Schofield 2008"),
+        composed("yoshida_4", odd(1.3512071919596578), order=4, source="Yoshida 1990, Phys. Lett. A 150, 262"),
+        composed("suzuki_4", odd(0.4144907717943757, 0.4144907717943757), order=4,
+            source="Suzuki 1990, Phys. Lett. A 146, 319"),
+        split("pefrl", (0.0, *even(0.7123418310626054), 0.0), odd(0.1786178958448091, -0.06626458266981849), order=4,
+            source=OMELYAN),
+        split("vefrl", odd(0.1644986515575760, 1.235692651138917), even(0.52094339103989808), order=4,
+            source=OMELYAN),
+        split("blanes_moan_4", (0.0, *even(0.209515106613362, -0.143851773179818), 0.0),
+            odd(0.0792036964311957, 0.353172906049774, -0.0420650803577195), order=4, source=f"{BLANES_MOAN}, S6"),
+        split("srkn_4", odd(0.0829844064174052, 0.396309801498368, -0.0390563049223486),
+            even(0.245298957184271, 0.604872665711080), order=4, source=f"{BLANES_MOAN}, SRKN6b"),
+        split("takahashi_imada", (0.0, 1.0, 0.0), (0.5, 0.5), order=2,
             source="Takahashi & Imada 1984, J. Phys. Soc. Jpn. 53, 3765; of order 4 but for a change of variables",
-            gradients=(0.0, 1 / 12, 0.0),
-        ),
-        split(
-            "chin_4a",
-            odd(1 / 6),
-            (0.5, 0.5),
-            order=4,
-            source="Chin 1997, Phys. Lett. A 226, 344, scheme A",
-            gradients=(0.0, 1 / 24, 0.0),
-        ),
-        composed(
-            "kahan_li_6",
+            gradients=(0.0, 1 / 12, 0.0)),
+        split("chin_4a", odd(1 / 6), (0.5, 0.5), order=4, source="Chin 1997, Phys. Lett. A 226, 344, scheme A",
+            gradients=(0.0, 1 / 24, 0.0)),
+        composed("kahan_li_6",
             odd(0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230),
-            order=6,
-            source=f"{KAHAN_LI}, s9odr6a",
-        ),
-        split(
-            "blanes_moan_6",
+            order=6, source=f"{KAHAN_LI}, s9odr6a"),
+        split("blanes_moan_6",
             (0.0, *even(0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175), 0.0),
             odd(0.0502627644003922, 0.413514300428344, 0.0450798897943977, -0.188054853819569, 0.541960678450780),
-            order=6,
-            source=f"{BLANES_MOAN}, S10",
-        ),
-        split(
-            "srkn_6",
+            order=6, source=f"{BLANES_MOAN}, S10"),
+        split("srkn_6",
             even(0.0414649985182624, 0.198128671918067, -0.0400061921041533, 0.0752539843015807, -0.0115113874206879),
             odd(0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075, 0.357208872795928),
-            order=6,
-            source=f"{BLANES_MOAN}, SRKN11b",
-        ),
-        composed(
-            "kahan_li_8",
-            odd(
-                0.13020248308889008088,
-                0.56116298177510838456,
-                -0.38947496264484728641,
-                0.15884190655515560090,
-                -0.39590389413323757734,
-                0.18453964097831570709,
-                0.25837438768632204729,
-                0.29501172360931029887,
-            ),
-            order=8,
-            source=f"{KAHAN_LI}, s17odr8a",
-        ),
+            order=6, source=f"{BLANES_MOAN}, SRKN11b"),
+        composed("kahan_li_8",
+            odd(0.13020248308889008088, 0.56116298177510838456, -0.38947496264484728641, 0.15884190655515560090,
+                -0.39590389413323757734, 0.18453964097831570709, 0.25837438768632204729, 0.29501172360931029887),
+            order=8, source=f"{KAHAN_LI}, s17odr8a"),
     )
-}
+}  # fmt: skip
 
-#: Rows that have a place for a bath and are nothing without one.
-WITH_BATH = {
+#: Rows that contain a thermostat flow and need a thermostat.
+WITH_THERMOSTAT = {
     "baoab": Scheme(
         "baoab",
-        (Flow(KICK, 0.5), Flow(DRIFT, 0.5), Flow(BATH, 1.0), Flow(DRIFT, 0.5), Flow(KICK, 0.5)),
+        (Flow(KICK, 0.5), Flow(DRIFT, 0.5), Flow(THERMOSTAT, 1.0), Flow(DRIFT, 0.5), Flow(KICK, 0.5)),
         order=2,
         exact_rotor=False,
         source="Leimkuhler & Matthews 2013, Appl. Math. Res. Express 34; for rigid bodies Davidchack et al. 2015",

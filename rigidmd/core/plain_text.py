@@ -1,26 +1,26 @@
-"""Names and paths of users in generated files that are code: there they are data, whatever they hold."""
+"""Names and paths of users, made safe for generated files that are code."""
 
 import re
 from collections.abc import Sequence
 
 from rigidmd.errors import OutputError
 
-#: Characters of lines and of terminals, which no path in a script may have, and what Slurm obeys between quotes.
+#: Line ends, control characters and characters that Slurm interprets within quotes: not allowed in paths of scripts.
 UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\"\\]")
 
 
 def in_comment(text: str) -> str:
-    """A text in one line for comments and titles: what some language obeys there becomes an underscore."""
+    """A text in one line for comments and titles; characters with a meaning in some language become underscores."""
     return re.sub(r"[^\w .,:;=()+/@-]", "_", text)
 
 
 def as_word(text: str) -> str:
-    """A text as a word of a file with columns."""
+    """A text as one word in a file with columns."""
     return re.sub(r"[^A-Za-z0-9_.+*'-]", "_", text) or "_"
 
 
 def distinct(texts: Sequence[str]) -> list[str]:
-    """Texts as identifiers, each another one."""
+    """Texts as distinct identifiers."""
     found: list[str] = []
     for text in texts:
         name, n = re.sub("[^A-Za-z0-9_]", "_", text) or "_", 1
@@ -32,7 +32,7 @@ def distinct(texts: Sequence[str]) -> list[str]:
 
 
 def check_script_paths(paths: Sequence[str]) -> None:
-    """Raise OutputError if a path cannot stand in the script of a job."""
+    """Raise OutputError if a path cannot be written into a job script."""
     for path in paths:
         if UNSAFE.search(path):
             raise OutputError(

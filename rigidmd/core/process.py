@@ -1,18 +1,71 @@
-"""What belongs to the whole process: runs in several threads change it one at a time."""
+"""Settings and memory of the process, which runs in several threads share."""
 
 import contextlib
+import importlib
 import threading
 import warnings
 from collections.abc import Iterator
+from math import inf
+from pathlib import Path
 
-#: Held while settings of the process are changed for a moment, and while a run compiles, which changes some too. Who
-#: holds it may wait for the locks of Numba and of `compile`; who holds one of those must not wait for it.
-ONE_AT_A_TIME = threading.RLock()
+#: Held while settings of the process change temporarily, and while a run compiles, which changes some too. A thread
+#: that holds it may wait for the locks of Numba and of `compile`, but not the other way round.
+PROCESS_LOCK = threading.RLock()
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Within it no warning is shown. Python has one list of filters for all threads."""
-    with ONE_AT_A_TIME, warnings.catch_warnings():
+def ignore_warnings() -> Iterator[None]:
+    """Hide all warnings within the block. Python has one list of warning filters for all threads."""
+    with PROCESS_LOCK, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
+
+
+resource = None
+with contextlib.suppress(ImportError):  # not on Windows
+    resource = importlib.import_module("resource")
+#: Fraction of the free memory that is reserved for Python, machine code and files.
+RESERVED = 0.05
+
+
+def free_memory() -> float:
+    """Free bytes of this machine, within the limits of container and process; infinite where the system has no data."""
+    free = _system_number("/proc/meminfo", "MemAvailable:") * 1024
+    for limit, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
+        free = min(
+            free, _system_number(f"/sys/fs/cgroup/{limit}") - min(_system_number(f"/sys/fs/cgroup/{used}"), 1e18)
+        )
+    return max(0.0, min(free, address_space_left()))
+
+
+def memory_shortage(needed: float, what: str) -> str:
+    """Why `what` cannot have this many bytes of memory; empty if it can."""
+    free = free_memory()
+    if needed <= (1 - RESERVED) * free:
+        return ""
+    return f"{what} needs {format_gigabytes(needed)} of memory, and this machine has {format_gigabytes(free)} free"
+
+
+def format_gigabytes(size: float) -> str:
+    return f"{size / 1e9:.3g} GB"
+
+
+def address_space_left() -> float:
+    """Bytes of address space left by the limit of this process (`ulimit -v`); infinite without a limit."""
+    if resource is None:
+        return inf
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    used = 1024 * _system_number("/proc/self/status", "VmSize:", 0.0)
+    return inf if soft == resource.RLIM_INFINITY else soft - used
+
+
+def _system_number(file: str, label: str = "", absent: float = inf) -> float:
+    """The number after a label in a system file; `absent` if there is none."""
+    try:
+        words = Path(file).read_text(encoding="ascii", errors="replace").split()
+        return float(words[words.index(label) + 1 if label else 0])
+    except (OSError, ValueError, IndexError):
+        return absent

@@ -1,49 +1,49 @@
-"""The state: everything that evolves during a run, and nothing else. Loads on it, and status codes."""
+"""The state: everything that evolves during a run, and nothing else. The load on its bodies, and status codes."""
 
 from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
-# What a kernel reports; the largest one wins, Python acts on it (engines.cpu).
+# Status codes of kernels. The largest one wins, and Python acts on it (engines.cpu).
 OK = 0
-ASK = 1  # a Python function has to be asked for its force: ask it and call again
-LIST_FULL = 2  # a neighbour list needs more room: enlarge it and call again
-CELL_CHANGED = 3  # the cell is now too small for the skin of a list: fit the list and call again
+NEEDS_PYTHON_FORCES = 1  # a Python function has to compute its force: do so and call the kernel again
+LIST_FULL = 2  # a neighbour list needs more memory: enlarge it and call the kernel again
+CELL_CHANGED = 3  # the cell is now too small for the skin of a list: fit the list and call the kernel again
 BEHIND_WALL = 4  # a site is on a wall that it cannot pass, or behind it
-NOT_FINITE = 5  # a position is not a number, or so large that it says nothing any more
+NOT_FINITE = 5  # a position is not a number, or too large to be meaningful
 
-#: Columns of `State.books`, energies put in so far: heat of baths, work of what drives or brakes, and what goes (below
-#: zero) with total momentum that is taken out.
-HEAT, WORK, TAKEN = 0, 1, 2
-#: Columns of `State.time` and `State.step`: now, and where the present stretch of equal steps began.
+#: Columns of `State.energy_ledger`, energies added so far: heat of thermostats, work of driving and braking forces and
+#: of barostats, and the (negative) kinetic energy of total momentum that was removed.
+HEAT, WORK, REMOVED = 0, 1, 2
+#: Columns of `State.time` and `State.step`: now, and where the present segment of equal steps began.
 NOW, ORIGIN = 0, 1
 
 # A tally is a float64 array (10,): energy, then the molecular virial tensor sum F (x) R in rows (u Å²/ps²).
-# None in its place compiles the kernels without energies.
+# None instead of it compiles the kernels without energies.
 TALLY_SIZE = 10
 
 
 class State(NamedTuple):
-    """Everything that evolves. float64 but for `step`; n bodies; molecules in Å, ps, u, single bodies in SI.
+    """Everything that evolves. float64 except `step`; n bodies; molecules in Å, ps, u, single bodies in SI.
 
-    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3): what does not turn is not stored. Nor is
-    the position and velocity of a body that is pinned at a point: (0, 3). Time is told by steps: within a stretch of
-    equal steps it is time[ORIGIN] + (step[NOW] - step[ORIGIN]) dt, so a run in parts has the very times of a whole.
+    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3), because points do not rotate. A pinned
+    body has position and velocity (0, 3). Within a segment of equal steps the time is computed from the step,
+    time[ORIGIN] + (step[NOW] - step[ORIGIN]) dt, so a run in parts has exactly the times of an uninterrupted one.
     """
 
     position: np.ndarray  # (n, 3) centre of mass, lab frame, never wrapped
     velocity: np.ndarray  # (n, 3) lab frame
     rotation: np.ndarray  # (n, 3, 3) Q, body to lab
     angular_momentum_body: np.ndarray  # (n, 3)
-    cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges where there is no box
-    time: np.ndarray  # (2,) now; when this stretch of equal steps began
-    step: np.ndarray  # (2,) int64 steps since the start; those when this stretch began
-    books: np.ndarray  # (3,) energies put in so far, see HEAT; the energy less their sum is conserved
-    bath: np.ndarray  # (m,) what a bath or a textbook formulation evolves besides; (0,) of most
+    cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges without a box
+    time: np.ndarray  # (2,) now; when this segment of equal steps began
+    step: np.ndarray  # (2,) int64, steps since the start; those when this segment began
+    energy_ledger: np.ndarray  # (3,) energies added so far, see HEAT; the energy less their sum is conserved
+    extra_variables: np.ndarray  # (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
 
     def copy(self) -> "State":
-        """A state that shares nothing with this one."""
+        """A state with copies of all arrays."""
         return State(*(array.copy() for array in self))
 
     def __repr__(self) -> str:
@@ -54,21 +54,23 @@ class State(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Volume of the cell, Å³; infinite where there is no box."""
+        """Volume of the cell, Å³; infinite without a box."""
         (a, _, _), (_, b, _), (_, _, c) = self.cell.tolist()
         return a * b * c
 
     @property
     def is_finite(self) -> bool:
         """Whether all variables are finite."""
-        return all(bool(np.isfinite(array).all()) for array in (*self[:4], self.books, self.bath))
+        return all(bool(np.isfinite(array).all()) for array in (*self[:4], self.energy_ledger, self.extra_variables))
 
-    def begin_stretch(self, time: float | None = None) -> None:
-        """Begin a stretch of equal steps here, in place; at a time that is known better than the sum of steps."""
+    def begin_segment(self, time: float | None = None) -> None:
+        """Begin a segment of equal steps, in place; `time` is the present time if it is known exactly."""
         self.time[:] = self.time[NOW] if time is None else time
         self.step[ORIGIN] = self.step[NOW]
 
 
+#: Names of a state's arrays in files, in the order of `State`; two differ, so that older files can be read.
+STORED_NAMES = (*State._fields[:7], "books", "bath")
 #: The cell of a scene without a box.
 NO_CELL = np.diag([inf, inf, inf])
 
@@ -80,17 +82,17 @@ def state_of(
     angular_momentum_body: np.ndarray | None = None,
     cell: np.ndarray | None = None,
 ) -> State:
-    """A state at time 0 with these arrays, contiguous copies; at rest and without a box where they are not given.
+    """A state at time 0 with contiguous copies of these arrays; by default at rest and without a box.
 
-    Without position it is a body pinned at a point; without rotation, points.
+    Without position it is a pinned body; without rotation, points.
     """
-    where = _array(np.zeros((0, 3)) if position is None else position)
-    turned = _array(np.zeros((0, 3, 3)) if rotation is None else rotation)
+    position = _array(np.zeros((0, 3)) if position is None else position)
+    rotation = _array(np.zeros((0, 3, 3)) if rotation is None else rotation)
     return State(
-        where,
-        np.zeros_like(where) if velocity is None else _array(velocity),
-        turned,
-        np.zeros((len(turned), 3)) if angular_momentum_body is None else _array(angular_momentum_body),
+        position,
+        np.zeros_like(position) if velocity is None else _array(velocity),
+        rotation,
+        np.zeros((len(rotation), 3)) if angular_momentum_body is None else _array(angular_momentum_body),
         _array(NO_CELL if cell is None else cell),
         np.zeros(2),
         np.zeros(2, np.int64),
@@ -104,13 +106,13 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 class Load(NamedTuple):
-    """What acts on the bodies at the present positions."""
+    """Forces and torques on the bodies at the present positions."""
 
     force: np.ndarray  # (n, 3) lab frame; (0, 3) for a pinned body
     torque_body: np.ndarray  # (n, 3) body frame; (0, 3) for points
 
 
-#: What states and loads are: compiled code is made for these types of arrays.
+#: A state and a load with the array types for which code is compiled.
 EXAMPLE = (state_of(), Load(np.zeros((0, 3)), np.zeros((0, 3))))
 
 

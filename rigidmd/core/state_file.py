@@ -1,4 +1,4 @@
-"""A state on disk, every bit of it: `final.npz`. The one function that writes it, and the one that reads it."""
+"""Reading and writing a state, to the bit, as `final.npz`."""
 
 import zipfile
 from pathlib import Path
@@ -6,53 +6,47 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import file_fault, whole_file
-from rigidmd.core.memory import in_words, memory_fault
-from rigidmd.core.state import NO_CELL, State, state_of
+from rigidmd.core.files import atomic_file, unreadable_reason
+from rigidmd.core.process import format_gigabytes, memory_shortage
+from rigidmd.core.state import NO_CELL, STORED_NAMES, State, state_of
 from rigidmd.errors import StructureError
 
-#: Of the files. Version 1 (rigidmd 0.1) did not say its version and held no step, books and bath.
+#: Version of the format. Version 1 (rigidmd 0.1) had neither a version number nor the arrays from `step` on.
 SCHEMA = 2
-LARGEST = 1e30  # of any number in a state
+LARGEST = 1e30  # largest magnitude of any number in a state
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 
 
 class Saved(NamedTuple):
-    """What a file holds."""
+    """The content of a file."""
 
     state: State
     names: list[str]  # of species
     species: np.ndarray  # (n,) index into the names
     residue_number: np.ndarray | None  # (n,); older files have none
-    models: np.ndarray | None = (
-        None  # (names, 5) mass, u, moments of inertia, u Å², and number of sites of each species
-    )
+    #: (names, 5) mass (u), moments of inertia (u Å²) and number of sites of each species
+    models: np.ndarray | None = None
 
 
 def write_state(path: Path, saved: Saved) -> None:
-    """Write a state of molecules. No pickle in it. Raises OutputError."""
+    """Write a state of molecules, without pickle. Raises OutputError."""
     more = {"residue_number": saved.residue_number, "models": saved.models}
     more = {name: array for name, array in more.items() if array is not None}
-    with whole_file(path) as temporary:
-        np.savez(
-            temporary,
-            schema=SCHEMA,
-            species_names=np.array(saved.names),
-            species=saved.species,
-            **more,
-            **saved.state._asdict(),
-        )
+    with atomic_file(path) as temporary:
+        arrays = dict(zip(STORED_NAMES, saved.state, strict=True))
+        names = np.array(saved.names)
+        np.savez(temporary, schema=SCHEMA, species_names=names, species=saved.species, **more, **arrays)
 
 
 def read_state(path: Path) -> Saved:
-    """Read a state back, to the bit. Raises StructureError with all that is wrong with the file."""
-    if fault := file_fault(path):
-        raise StructureError(str(path), [fault])
+    """Read a state, to the bit. Raises StructureError with all errors found in the file."""
+    if reason := unreadable_reason(path):
+        raise StructureError(str(path), [reason])
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if fault := memory_fault(2 * size, f"reading its {in_words(size)}"):
-            raise ValueError(f"not enough memory: {fault}")
+        if reason := memory_shortage(2 * size, f"reading its {format_gigabytes(size)}"):
+            raise ValueError(f"not enough memory: {reason}")
         with np.load(path, allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
         schema = int(arrays.pop("schema", 1))
@@ -61,24 +55,25 @@ def read_state(path: Path) -> Saved:
     except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: {error}"]) from None
     if schema > SCHEMA:
-        fault = f"was written by a later rigidmd (version {schema} of the format; this one reads up to {SCHEMA})"
-        raise StructureError(str(path), [fault])
+        reason = f"was written by a later rigidmd (version {schema} of the format; this one reads up to {SCHEMA})"
+        raise StructureError(str(path), [reason])
     example = state_of()
     if schema == 1:
-        known = ("species", "residue_number", *State._fields[:5])
+        known = ("species", "residue_number", *STORED_NAMES[:5])
         arrays = {key: arrays[key] for key in known if key in arrays}
-        arrays |= {key: getattr(example, key) for key in State._fields[5:]}
-    if missing := [key for key in State._fields if key not in arrays]:
+        arrays |= dict(zip(STORED_NAMES[5:], example[5:], strict=True))
+    if missing := [key for key in STORED_NAMES if key not in arrays]:
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])
     if bad := _damaged(arrays, names):
         raise StructureError(str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"])
-    kinds = (getattr(example, key).dtype for key in State._fields)
-    state = State(*(np.asarray(arrays[key], kind, order="C") for key, kind in zip(State._fields, kinds, strict=True)))
+    state = State(
+        *(np.asarray(arrays[k], like.dtype, order="C") for k, like in zip(STORED_NAMES, example, strict=True))
+    )
     return Saved(state, names, species, arrays.get("residue_number"), arrays.get("models"))
 
 
 def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
-    """Arrays with a shape or values that no state has."""
+    """Names of arrays with a shape or values that no state has."""
     n = len(arrays["species"]) if arrays["species"].ndim else 0
     m = n if len(np.atleast_1d(arrays["rotation"])) else 0
     shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3), "rotation": (m, 3, 3)}
@@ -100,13 +95,13 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
 
 
 def are_rotations(matrices: np.ndarray) -> bool:
-    """Whether matrices (n, 3, 3) are rotations, as far as those at the end of a run are."""
+    """Whether matrices (n, 3, 3) are rotations, within NOT_A_ROTATION."""
     gap = np.swapaxes(matrices, 1, 2) @ matrices - np.eye(3)
     return bool(np.abs(gap).max(initial=0.0) <= NOT_A_ROTATION and (np.linalg.det(matrices) > 0).all())
 
 
 def is_cell(cell: np.ndarray) -> bool:
-    """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or infinite edges, which are none."""
+    """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or the infinite edges of NO_CELL."""
     if not np.isfinite(cell).all():
         return np.array_equal(cell, NO_CELL)
     return bool((cell.diagonal() > 0).all() and not np.triu(cell, 1).any() and np.abs(cell).max() <= LARGEST)

@@ -1,4 +1,4 @@
-"""TOML from strangers: files are read within bounds, and what no table may hold is found before anything else is."""
+"""Reading untrusted TOML within limits of size and depth, and finding the line of a key."""
 
 import os
 import re
@@ -9,36 +9,35 @@ from pathlib import Path
 from tomllib import TOMLDecodeError
 from typing import Any, NamedTuple
 
-from rigidmd.core.files import file_fault
-from rigidmd.errors import UNSEEN, Faults
+from rigidmd.core.files import unreadable_reason
+from rigidmd.errors import UNPRINTABLE, InputError
 
-#: Bytes of a file of TOML. Reading takes a second per megabyte; a molecule of 10,000 sites has one.
+#: Largest TOML file in bytes. Reading takes a second per megabyte; a molecule of 10,000 sites has one megabyte.
 LARGEST = 4_000_000
-#: Tables and lists inside one another; scenes need six.
-DEEPEST = 32
-#: TOML's whole numbers have 64 bits.
+DEEPEST = 32  # levels of nested tables and lists; scenes need six
+#: Whole numbers in TOML have 64 bits.
 LEAST_WHOLE, LARGEST_WHOLE = -(2**63), 2**63 - 1
 
 _LONG_KEY = re.compile(rf"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST}}}")
 
 
-def read_toml(path: Path, refusal: type[Faults]) -> tuple[dict[str, Any], str]:
-    """The tables of a file, and its text. Raises `refusal`."""
+def read_toml(path: Path, error_class: type[InputError]) -> tuple[dict[str, Any], str]:
+    """The tables of a file, and its text. Raises `error_class`."""
     try:
-        if fault := file_fault(path, LARGEST):
-            raise refusal(str(path), [fault])
-        text = path.read_text(encoding="utf-8-sig")  # Windows begins files with a mark of the encoding
+        if reason := unreadable_reason(path, LARGEST):
+            raise error_class(str(path), [reason])
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows write a byte order mark
         return parse_toml(text), text
     except OSError as error:
-        raise refusal(str(path), [f"cannot be read: {error.strerror}"]) from None
+        raise error_class(str(path), [f"cannot be read: {error.strerror}"]) from None
     except UnicodeDecodeError as error:
-        raise refusal(str(path), [f"is not TOML: {error}"]) from None
+        raise error_class(str(path), [f"is not TOML: {error}"]) from None
     except TOMLDecodeError as error:
-        raise refusal(str(path), [toml_fault(error, text)]) from None
+        raise error_class(str(path), [describe_toml_error(error, text)]) from None
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a text. Raises TOMLDecodeError, also for what the library cannot take: depth, digits."""
+    """The tables of a text. Raises TOMLDecodeError, also for depths and numbers that `tomllib` cannot read."""
     if long := _LONG_KEY.search(text):
         line = text.count("\n", 0, long.start()) + 1
         raise TOMLDecodeError(f"a key of more than {DEEPEST} parts (at line {line}, column 1)")
@@ -48,7 +47,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise TOMLDecodeError(f"lists or tables more than {DEEPEST} deep") from None
     except TOMLDecodeError:
         raise
-    except ValueError as error:  # of int(), which takes 4300 digits
+    except ValueError as error:  # from int(), which accepts 4300 digits
         number = re.search(r"\d{4301}", text)
         line = text.count("\n", 0, number.start()) + 1 if number else 1
         why = "a whole number of more than 64 bits" if number else str(error)
@@ -56,9 +55,9 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def plain_values(data: Any, depth: int = 0) -> Any:
-    """Tables from Python as those of a file: texts for paths and numbers of keys, numbers and lists for NumPy's."""
+    """Tables from Python with the types of a file: str for paths and integer keys, numbers and lists for arrays."""
     match data:
-        case _ if depth > DEEPEST + 1:  # which `impossible_values` reports
+        case _ if depth > DEEPEST + 1:  # reported by `impossible_values`
             return data
         case Mapping():
             return {
@@ -69,16 +68,15 @@ def plain_values(data: Any, depth: int = 0) -> Any:
             return [plain_values(value, depth + 1) for value in data]
         case os.PathLike():
             return os.fspath(data)
-        case _ if hasattr(data, "tolist"):  # NumPy's, without importing it
+        case _ if hasattr(data, "tolist"):  # NumPy types, without importing NumPy
             return data.tolist()
     return data
 
 
 def impossible_values(data: Any) -> list[tuple[list, str]]:
-    """Values that no table may hold, each with its path of keys and what is wrong with it.
+    """Values that are not allowed in any table, each with its path of keys and what is wrong with it.
 
-    These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts that a terminal would not show
-    as they are.
+    These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with unprintable characters.
     """
     found: list[tuple[list, str]] = []
     rest: list[tuple[list, Any]] = [([], data)]
@@ -89,48 +87,50 @@ def impossible_values(data: Any) -> list[tuple[list, str]]:
                 return [(keys[:DEEPEST], f"has lists or tables more than {DEEPEST} deep")]
             case dict():
                 rest += [([*keys, key], inner) for key, inner in value.items()]
-                found += [([*keys, key], "has a control character in its name") for key in value if _hides(key)]
+                found += [
+                    ([*keys, key], "has a control character in its name") for key in value if _is_unprintable(key)
+                ]
             case list() | tuple():
                 rest += [([*keys, k], inner) for k, inner in enumerate(value)]
             case int() if not LEAST_WHOLE <= value <= LARGEST_WHOLE:
                 found.append((keys, "is a whole number of more than 64 bits"))
-            case str() if _hides(value):
-                found.append((keys, f"is {shortened(value)}: control characters are not allowed"))
+            case str() if _is_unprintable(value):
+                found.append((keys, f"is {shorten_repr(value)}: control characters are not allowed"))
     return found
 
 
-def _hides(text: Any) -> bool:
-    return isinstance(text, str) and UNSEEN.search(text) is not None
+def _is_unprintable(text: Any) -> bool:
+    return isinstance(text, str) and UNPRINTABLE.search(text) is not None
 
 
-def cut(text: str, most: int = 80) -> str:
-    """A text without its middle where it is long."""
+def shorten_text(text: str, most: int = 80) -> str:
+    """A text, without its middle if it is longer than `most` characters."""
     return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
 
 
-def shortened(value: Any) -> str:
-    """repr of a value, cut where it is long."""
+def shorten_repr(value: Any) -> str:
+    """repr of a value, without its middle if it is long."""
     try:
-        return cut(repr(value))
-    except (ValueError, RecursionError):  # a whole number of thousands of digits; lists in lists
+        return shorten_text(repr(value))
+    except (ValueError, RecursionError):  # thousands of digits; deeply nested lists
         return "too large to show"
 
 
-def whole_number(text: str) -> int | None:
-    """The number that a text of up to 18 ASCII digits says; None for any other text."""
+def parse_whole_number(text: str) -> int | None:
+    """The number in a text of up to 18 ASCII digits; None for any other text."""
     return int(text) if re.fullmatch(r"[0-9]{1,18}", text) else None
 
 
-def toml_fault(error: TOMLDecodeError, text: str) -> str:
-    """What is wrong with a text that is not TOML. For a value without quotes the line and key are named."""
-    place = re.search(r"at line (\d+), column (\d+)", str(error))
-    number, column = map(int, place.groups()) if place else (0, 0)
+def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
+    """Message for a text that is not TOML. For a value without quotes it names the line and key."""
+    position = re.search(r"at line (\d+), column (\d+)", str(error))
+    number, column = map(int, position.groups()) if position else (0, 0)
     lines = text.split("\n")
     line = lines[number - 1] if 0 < number <= len(lines) else ""
-    # tomllib stops at the word, or within it: after the inf of "infinite"
+    # tomllib stops at the word, or within it, for example after the "inf" of "infinite"
     bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
     keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1:] if bare else []
-    if not keys or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after a list that is not closed
+    if not keys or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after an unclosed list
         return f"is not TOML: {error}"
     where = f"line {number}: {'.'.join(map(str, keys[0]))}: "
     match bare:
@@ -152,10 +152,10 @@ def line_of(keys: list, text: str) -> int | None:
 
 
 class _Index(NamedTuple):
-    """Lines (from 1) of a TOML text."""
+    """Lines (counted from 1) of a TOML text."""
 
-    entries: dict[tuple, int]  # the first that sets a path of keys
-    tables: dict[tuple, int]  # the last that opens a table
+    entries: dict[tuple, int]  # the first line that sets a path of keys
+    tables: dict[tuple, int]  # the last line that opens a table
 
 
 @lru_cache(maxsize=2)
@@ -172,7 +172,7 @@ def _index(text: str) -> _Index:
 def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
     """Lines (from 1) of a TOML text that open a table or set a key: the table's path, and the key's in it or []."""
     table: list = []
-    counts: dict[tuple, int] = {}  # of tables in lists, by their path with the numbers of lists around them
+    counts: dict[tuple, int] = {}  # of tables in lists, by path with the list indices around them
     for number, line in enumerate(text.split("\n"), 1):
         if header := re.match(r"\s*(\[\[?)\s*([\w.\"'-]+)\s*\]", line):
             table = []
@@ -190,5 +190,5 @@ def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
 
 
 def _parts(key: str) -> list[str]:
-    """The parts of a dotted key without quotes. A dot in quotes divides too: what it names has no line then."""
+    """The parts of a dotted key, without quotes. A dot within quotes also divides; such a key has no line."""
     return [part.strip("\"'") for part in key.split(".")]

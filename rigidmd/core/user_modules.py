@@ -1,16 +1,16 @@
-"""Code from outside: modules that are named by their contents.
+"""Python modules of generated and user code, named by a digest of their source.
 
-Compiled code is found again by the types that it was compiled for. A class from a file that has changed is then another
-class, and a class from the same text is the same in every process. What is compiled for modules that rigidmd writes is
-kept on disk. What is compiled for files of users is not: it may hold values that they import or read.
+The cache finds compiled code by the types of its arguments. With such names, a class from a changed file is a different
+type, and a class from the same text is the same type in every process. Code compiled for generated modules is cached on
+disk. Code compiled for user files is not, because it may contain values that they import or read.
 """
 
 import hashlib
 import sys
 from types import ModuleType
 
-#: How the names of modules begin: of those that rigidmd writes, and of files of users.
-BY_CONTENT, OF_FILE = "rigidmd_own_", "rigidmd_file_"
+#: Prefixes of the names of generated modules and of modules from user files.
+GENERATED_PREFIX, USER_FILE_PREFIX = "rigidmd_own_", "rigidmd_file_"
 
 
 def digest_of(source: bytes) -> str:
@@ -18,10 +18,10 @@ def digest_of(source: bytes) -> str:
     return hashlib.sha256(source).hexdigest()
 
 
-def module_of(source: bytes, file: str, prefix: str = BY_CONTENT) -> ModuleType:
-    """The module of a source, which is run if this process has not done so yet. Raises whatever the code raises.
+def module_of(source: bytes, file: str, prefix: str = GENERATED_PREFIX) -> ModuleType:
+    """The module of a source, executed once per process. Raises whatever the code raises.
 
-    file : where it comes from, for messages
+    file : its origin, for messages
     """
     name = f"{prefix}{digest_of(source)[:32]}"
     if name in sys.modules:
@@ -35,8 +35,8 @@ def module_of(source: bytes, file: str, prefix: str = BY_CONTENT) -> ModuleType:
     except BaseException:
         del sys.modules[name]
         raise
-    for own in vars(module).values():
-        if isinstance(own, type) and own.__module__ == name:
-            # Machine code is found by names: two classes of one name must not be taken for each other.
-            own.__name__ = f"{own.__name__}_{name[-8:]}"
+    for value in vars(module).values():
+        if isinstance(value, type) and value.__module__ == name:
+            # Machine code is found by name, so that classes need distinct names.
+            value.__name__ = f"{value.__name__}_{name[-8:]}"
     return module

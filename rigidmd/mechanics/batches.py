@@ -6,11 +6,11 @@ Rotations have a body in each lane: with one body at a time, each part of a rota
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.simd import align_stack, bits, fill, lane_count, load, select, store, total
+from rigidmd.compile.simd import align_stack, broadcast, lane_count, load, mask_bits, select, store, sum_lanes
 from rigidmd.compile.simd_records import load_matrices, load_vectors, store_matrices, store_vectors
-from rigidmd.mechanics.free_rotor import SHORT, SplitRotor, series_of_square, turn, turned
+from rigidmd.mechanics.free_rotor import SHORT_ANGLE2, SplitRotor, rotate, rotate_vector, rotation_coefficient_series
 
-TOGETHER = lane_count(np.float64)  # bodies that turn together
+LANES = lane_count(np.float64)  # bodies that turn together
 #: Rows of what the lanes have to know of their species: axes a and b (as numbers), h g, h (1/I - g) about a, b and c,
 #: the square of the largest of these, and 1 if the axes a, b, c are left-handed, -1 if right-handed.
 AXIS_A, AXIS_B, SHARE, RATE, FASTEST2, TURN, ROWS = 0, 1, 2, 3, 6, 7, 8
@@ -20,22 +20,22 @@ AXIS_A, AXIS_B, SHARE, RATE, FASTEST2, TURN, ROWS = 0, 1, 2, 3, 6, 7, 8
 def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end, h):
     """V += h F/m, L += h n_body of molecules first ... end - 1; no momentum gathers on an axis without inertia."""
     velocity, momentum, force, torque = state.velocity, state.angular_momentum_body, acting.force, acting.torque_body
-    kinds = np.full(TOGETHER, -1)
-    shares, parts = np.empty(3 * TOGETHER), np.empty(3 * TOGETHER)
+    kinds = np.full(LANES, -1)
+    shares, parts = np.empty(3 * LANES), np.empty(3 * LANES)
     turns = len(momentum) > 0
-    while first + TOGETHER <= end:
+    while first + LANES <= end:
         if _are_others(kinds, species, first):
-            for n in range(3 * TOGETHER):
+            for n in range(3 * LANES):
                 kind = kinds[n // 3]
                 shares[n] = h * inverse_mass[kind]
                 parts[n] = h if inverse_inertia[kind, n % 3] > 0 else 0.0
-        for n in range(0, 3 * TOGETHER, TOGETHER):
+        for n in range(0, 3 * LANES, LANES):
             at = 3 * first + n
             store(velocity, at, load(velocity, at) + load(shares, n) * load(force, at))
             if turns:
                 before, part = load(momentum, at), load(parts, n)
                 store(momentum, at, select(part == 0.0, before, before + part * load(torque, at)))
-        first += TOGETHER
+        first += LANES
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
@@ -47,37 +47,37 @@ def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end
 @kernel
 def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, end):
     """Translational and rotational kinetic energy of molecules first ... end - 1."""
-    kinds = np.full(TOGETHER, -1)
-    masses, inverses = np.empty(3 * TOGETHER), np.empty(3 * TOGETHER)
+    kinds = np.full(LANES, -1)
+    masses, inverses = np.empty(3 * LANES), np.empty(3 * LANES)
     turns = len(momentum) > 0
-    zero = fill(0.0, velocity)
+    zero = broadcast(0.0, velocity)
     moving, turning = (zero, zero, zero), (zero, zero, zero)
-    while first + TOGETHER <= end:
+    while first + LANES <= end:
         if _are_others(kinds, species, first):
-            for n in range(3 * TOGETHER):
+            for n in range(3 * LANES):
                 masses[n], inverses[n] = mass[kinds[n // 3]], inverse_inertia[kinds[n // 3], n % 3]
         moving = _with_squares(moving, masses, velocity, 3 * first)
         if turns:
             turning = _with_squares(turning, inverses, momentum, 3 * first)
-        first += TOGETHER
-    moved, turned = total(moving[0] + moving[1] + moving[2]), total(turning[0] + turning[1] + turning[2])
+        first += LANES
+    moved, rotate_vector = sum_lanes(moving[0] + moving[1] + moving[2]), sum_lanes(turning[0] + turning[1] + turning[2])
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
             moved += mass[kind] * velocity[m, k] ** 2
             if turns:
-                turned += inverse_inertia[kind, k] * momentum[m, k] ** 2
-    return 0.5 * moved, 0.5 * turned
+                rotate_vector += inverse_inertia[kind, k] * momentum[m, k] ** 2
+    return 0.5 * moved, 0.5 * rotate_vector
 
 
 @kernel(inline=True)
 def _with_squares(sums, weights, values, at):
     """Three vectors of sums, with the weighted squares of the values (n, 3) of as many molecules as lanes added."""
-    x, y, z = load(values, at), load(values, at + TOGETHER), load(values, at + 2 * TOGETHER)
+    x, y, z = load(values, at), load(values, at + LANES), load(values, at + 2 * LANES)
     return (
         sums[0] + load(weights, 0) * x * x,
-        sums[1] + load(weights, TOGETHER) * y * y,
-        sums[2] + load(weights, 2 * TOGETHER) * z * z,
+        sums[1] + load(weights, LANES) * y * y,
+        sums[2] + load(weights, 2 * LANES) * z * z,
     )
 
 
@@ -85,15 +85,15 @@ def _with_squares(sums, weights, values, at):
 def scale_group(values, first, end, scale):
     """Multiply rows first ... end - 1 of an array (n, 3) by a number, in place."""
     at = 3 * first
-    while at + TOGETHER <= 3 * end:
+    while at + LANES <= 3 * end:
         store(values, at, load(values, at) * scale)
-        at += TOGETHER
+        at += LANES
     for n in range(at, 3 * end):
         values[n // 3, n % 3] *= scale
 
 
 @kernel
-def stir_group(model, state, keep, keep_turning, new, numbers, first, end):
+def apply_langevin_group(model, state, keep, keep_turning, new, numbers, first, end):
     """Friction and noise: v <- keep v + size xi, and so the angular momenta, of molecules first ... end - 1.
 
     new (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) : number j of molecule
@@ -101,32 +101,32 @@ def stir_group(model, state, keep, keep_turning, new, numbers, first, end):
     energy gained.
     """
     species, velocity, momentum = model.species, state.velocity, state.angular_momentum_body
-    kinds, known = np.full(TOGETHER, -1), np.empty(8 * TOGETHER)
+    kinds, known = np.full(LANES, -1), np.empty(8 * LANES)
     turns, apart = len(momentum) > 0, len(numbers) // 6
-    gained, at = fill(0.0, velocity), 0
-    while first + TOGETHER <= end:
+    gained, at = broadcast(0.0, velocity), 0
+    while first + LANES <= end:
         if _are_others(kinds, species, first):
-            for n in range(TOGETHER):
+            for n in range(LANES):
                 kind = kinds[n]
                 for k in range(3):
-                    known[k * TOGETHER + n] = new[kind, k]
-                    known[(4 + k) * TOGETHER + n] = model.inverse_inertia[kind, k]
-                known[3 * TOGETHER + n], known[7 * TOGETHER + n] = new[kind, 3], model.mass[kind]
-        size = load(known, 3 * TOGETHER)
+                    known[k * LANES + n] = new[kind, k]
+                    known[(4 + k) * LANES + n] = model.inverse_inertia[kind, k]
+                known[3 * LANES + n], known[7 * LANES + n] = new[kind, 3], model.mass[kind]
+        size = load(known, 3 * LANES)
         before = load_vectors(velocity, first)
         after = _stirred(before, keep, (size, size, size), numbers, at, apart)
         store_vectors(velocity, first, after)
         x, y, z = _growth(before, after)
-        gained += load(known, 7 * TOGETHER) * (x + y + z)
+        gained += load(known, 7 * LANES) * (x + y + z)
         if turns:
-            sizes = load(known, 0), load(known, TOGETHER), load(known, 2 * TOGETHER)
+            sizes = load(known, 0), load(known, LANES), load(known, 2 * LANES)
             before = load_vectors(momentum, first)
             after = _stirred(before, keep_turning, sizes, numbers, 3 * apart + at, apart)
             store_vectors(momentum, first, after)
             x, y, z = _growth(before, after)
-            gained += load(known, 4 * TOGETHER) * x + load(known, 5 * TOGETHER) * y + load(known, 6 * TOGETHER) * z
-        first, at = first + TOGETHER, at + TOGETHER
-    heat = total(gained)
+            gained += load(known, 4 * LANES) * x + load(known, 5 * LANES) * y + load(known, 6 * LANES) * z
+        first, at = first + LANES, at + LANES
+    heat = sum_lanes(gained)
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
@@ -161,12 +161,12 @@ def _growth(before, after):
     )
 
 
-def turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
-    """`turn` of molecules first ... end - 1."""
+def rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h):
+    """`rotate` of molecules first ... end - 1."""
     raise TypeError("compiled code only")
 
 
-@implements(turn_group)
+@implements(rotate_group)
 def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
     if not is_a(rotor, SplitRotor):
         return lambda rotor, species, rotation, angular_momentum_body, first, end, h: _turn_one_by_one(
@@ -175,23 +175,23 @@ def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
 
     def turn_together(rotor, species, rotation, angular_momentum_body, first, end, h):
         align_stack()
-        known, kinds = np.empty(ROWS * TOGETHER), np.full(TOGETHER, -1)
-        whole = (1 << TOGETHER) - 1
+        known, kinds = np.empty(ROWS * LANES), np.full(LANES, -1)
+        whole = (1 << LANES) - 1
         about = (False, False, False)
-        while first + TOGETHER <= end:
+        while first + LANES <= end:
             if _are_others(kinds, species, first):
                 about = _learn(known, kinds, rotor, h)
             momentum = load_vectors(angular_momentum_body, first)
             x, y, z = momentum
-            if bits(load(known, FASTEST2 * TOGETHER) * (x * x + y * y + z * z) < SHORT) != whole:
-                _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, first + TOGETHER, h)
+            if mask_bits(load(known, FASTEST2 * LANES) * (x * x + y * y + z * z) < SHORT_ANGLE2) != whole:
+                _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, first + LANES, h)
             elif about[0] | about[1] | about[2]:
                 _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum)
             else:
-                share = load(known, SHARE * TOGETHER)
+                share = load(known, SHARE * LANES)
                 turned_lanes = _about_momenta(load_matrices(rotation, first), (share * x, share * y, share * z), -1.0)
                 store_matrices(rotation, first, turned_lanes)
-            first += TOGETHER
+            first += LANES
         _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
 
     return turn_together
@@ -200,7 +200,7 @@ def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
 @kernel
 def _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h):
     for m in range(first, end):
-        turn(rotor, species[m], rotation, angular_momentum_body, m, h)
+        rotate(rotor, species[m], rotation, angular_momentum_body, m, h)
 
 
 @kernel(inline=True)
@@ -219,17 +219,17 @@ def _are_others(kinds, species, first):
 def _learn(known, kinds, rotor, h):
     """Fill the rows that the lanes have to know; returns about which of the axes a, b, c there are rotations."""
     about_a = about_b = about_c = False
-    for n in range(TOGETHER):
+    for n in range(LANES):
         kind = kinds[n]
         a, b, c = rotor.order[kind, 0], rotor.order[kind, 1], rotor.order[kind, 2]
         share, rates = h * rotor.common[kind], rotor.excess[kind]
-        known[AXIS_A * TOGETHER + n], known[AXIS_B * TOGETHER + n] = a, b
-        known[SHARE * TOGETHER + n] = share
-        known[RATE * TOGETHER + n] = h * rates[a]
-        known[(RATE + 1) * TOGETHER + n] = h * rates[b]
-        known[(RATE + 2) * TOGETHER + n] = h * rates[c]
-        known[FASTEST2 * TOGETHER + n] = max(abs(share), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c])) ** 2
-        known[TURN * TOGETHER + n] = -1.0 if (b - a) % 3 == 1 else 1.0
+        known[AXIS_A * LANES + n], known[AXIS_B * LANES + n] = a, b
+        known[SHARE * LANES + n] = share
+        known[RATE * LANES + n] = h * rates[a]
+        known[(RATE + 1) * LANES + n] = h * rates[b]
+        known[(RATE + 2) * LANES + n] = h * rates[c]
+        known[FASTEST2 * LANES + n] = max(abs(share), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c])) ** 2
+        known[TURN * LANES + n] = -1.0 if (b - a) % 3 == 1 else 1.0
         about_a |= rates[a] != 0.0
         about_b |= rates[b] != 0.0
         about_c |= rates[c] != 0.0
@@ -239,33 +239,33 @@ def _learn(known, kinds, rotor, h):
 @kernel(inline=True)
 def _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum):
     """`rotor.turn_by_parts` of the bodies in lanes, in the frame of the rotor's axes a, b, c."""
-    a, b, turn = load(known, AXIS_A * TOGETHER), load(known, AXIS_B * TOGETHER), load(known, TURN * TOGETHER)
+    a, b, rotate = load(known, AXIS_A * LANES), load(known, AXIS_B * LANES), load(known, TURN * LANES)
     axes = (a == 0.0, b == 0.0, a == 1.0, b == 1.0)
     q = load_matrices(rotation, first)
     L = _in_order(momentum, axes)
-    share = load(known, SHARE * TOGETHER)
+    share = load(known, SHARE * LANES)
     along = (share * L[0], share * L[1], share * L[2])
     ordered = _in_order(q[:3], axes) + _in_order(q[3:6], axes) + _in_order(q[6:], axes)
-    q0, q1, q2, q3, q4, q5, q6, q7, q8 = _about_momenta(ordered, along, turn)
+    q0, q1, q2, q3, q4, q5, q6, q7, q8 = _about_momenta(ordered, along, rotate)
     L0, L1, L2 = L
     if about[0]:
-        angle = 0.5 * load(known, RATE * TOGETHER) * L0
-        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, turn, L1, L2, q1, q2, q4, q5, q7, q8)
+        angle = 0.5 * load(known, RATE * LANES) * L0
+        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, rotate, L1, L2, q1, q2, q4, q5, q7, q8)
     if about[1]:
-        angle = 0.5 * load(known, (RATE + 1) * TOGETHER) * L1
-        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, turn, L2, L0, q2, q0, q5, q3, q8, q6)
+        angle = 0.5 * load(known, (RATE + 1) * LANES) * L1
+        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, rotate, L2, L0, q2, q0, q5, q3, q8, q6)
     if about[2]:
-        angle = load(known, (RATE + 2) * TOGETHER) * L2
-        L0, L1, q0, q1, q3, q4, q6, q7 = _about_axis(angle, turn, L0, L1, q0, q1, q3, q4, q6, q7)
+        angle = load(known, (RATE + 2) * LANES) * L2
+        L0, L1, q0, q1, q3, q4, q6, q7 = _about_axis(angle, rotate, L0, L1, q0, q1, q3, q4, q6, q7)
     if about[1]:
-        angle = 0.5 * load(known, (RATE + 1) * TOGETHER) * L1
-        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, turn, L2, L0, q2, q0, q5, q3, q8, q6)
+        angle = 0.5 * load(known, (RATE + 1) * LANES) * L1
+        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, rotate, L2, L0, q2, q0, q5, q3, q8, q6)
     if about[0]:
-        angle = 0.5 * load(known, RATE * TOGETHER) * L0
-        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, turn, L1, L2, q1, q2, q4, q5, q7, q8)
+        angle = 0.5 * load(known, RATE * LANES) * L0
+        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, rotate, L1, L2, q1, q2, q4, q5, q7, q8)
     x, y, z = _in_place((L0, L1, L2), axes)
-    still = load(known, RATE * TOGETHER) == 0.0  # its momentum is kept, with the signs of zeros
-    still = still & (load(known, (RATE + 1) * TOGETHER) == 0.0) & (load(known, (RATE + 2) * TOGETHER) == 0.0)
+    still = load(known, RATE * LANES) == 0.0  # its momentum is kept, with the signs of zeros
+    still = still & (load(known, (RATE + 1) * LANES) == 0.0) & (load(known, (RATE + 2) * LANES) == 0.0)
     kept = select(still, momentum[0], x), select(still, momentum[1], y), select(still, momentum[2], z)
     store_vectors(angular_momentum_body, first, kept)
     back = _in_place((q0, q1, q2), axes) + _in_place((q3, q4, q5), axes) + _in_place((q6, q7, q8), axes)
@@ -297,23 +297,23 @@ def _in_place(vector, axes):
 
 
 @kernel(inline=True)
-def _about_momenta(q, along, turn):
+def _about_momenta(q, along, rotate):
     """Rows of rotations (nine numbers) after a rotation along a vector: `rotor.turn_along`."""
     x, y, z = along
-    odd, even = series_of_square(x * x + y * y + z * z)
-    odd = turn * odd
+    odd, even = rotation_coefficient_series(x * x + y * y + z * z)
+    odd = rotate * odd
     return (
-        turned(q[0], q[1], q[2], x, y, z, odd, even)
-        + turned(q[3], q[4], q[5], x, y, z, odd, even)
-        + turned(q[6], q[7], q[8], x, y, z, odd, even)
+        rotate_vector(q[0], q[1], q[2], x, y, z, odd, even)
+        + rotate_vector(q[3], q[4], q[5], x, y, z, odd, even)
+        + rotate_vector(q[6], q[7], q[8], x, y, z, odd, even)
     )
 
 
 @kernel(inline=True)
-def _about_axis(angle, turn, La, Lb, a0, b0, a1, b1, a2, b2):
+def _about_axis(angle, rotate, La, Lb, a0, b0, a1, b1, a2, b2):
     """`rotor.about_axis`: the other two components of the momenta, and of each row of the rotations."""
-    odd, even = series_of_square(angle * angle)
-    s = turn * (angle * odd)
+    odd, even = rotation_coefficient_series(angle * angle)
+    s = rotate * (angle * odd)
     versine = angle * angle * even
     return (
         _rotated(La, Lb, s, versine)

@@ -1,6 +1,6 @@
 """Free-rotor flows: the rotation of a body without torque.
 
-A rotor is a term: `turn(rotor, ...)` is chosen by its type at compile time, so a scene of points compiles no rotation.
+A rotor is a term: `rotate(rotor, ...)` is chosen by its type at compile time, so a scene of points compiles no rotation.
 """
 
 from math import cos, inf, nan, sin, sqrt
@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import WORK
-from rigidmd.mechanics.time_functions import Course, rate, value
+from rigidmd.mechanics.time_functions import TimeFunction, rate, value
 
 
 class SplitRotor(NamedTuple):
@@ -54,12 +54,12 @@ class ExactRotor(NamedTuple):
     order: np.ndarray
 
 
-NONE, ROUND = -1, 3  # of SplitRotor.symmetry
+NO_SYMMETRY, SPHERICAL = -1, 3  # of SplitRotor.symmetry
 MOST_TERMS = 30
 #: rad in one drift. A body that gains energy without bound would otherwise be rotated in parts for hours; its momentum
 #: is set to NaN, which stops the run.
-LONGEST_TURN = 1e4
-SHORT = 0.0625  # square of an angle, rad²
+LARGEST_ANGLE = 1e4
+SHORT_ANGLE2 = 0.0625  # square of an angle, rad²
 LONGEST_PART = 0.5  # rad; 0.3 rad takes 14 terms, 1 rad 26
 
 
@@ -69,7 +69,7 @@ def split_rotor(inertia: np.ndarray) -> SplitRotor:
         inverse = np.where(inertia > 0, 1 / inertia, 0.0)
     symmetry = np.array([_symmetry(moments) for moments in inertia])
     common, order = (np.array(part) for part in zip(*map(_parts, inverse), strict=True))
-    excess = np.where(symmetry[:, None] == ROUND, 0.0, inverse - common[:, None])
+    excess = np.where(symmetry[:, None] == SPHERICAL, 0.0, inverse - common[:, None])
     return SplitRotor(inverse, symmetry, common, excess, order)
 
 
@@ -83,8 +83,8 @@ def _parts(inverse: np.ndarray) -> tuple[float, tuple[int, int, int]]:
 
 def _symmetry(moments: np.ndarray) -> int:
     if len(set(moments[moments > 0])) <= 1:
-        return ROUND
-    return next((k for k in range(3) if moments[k - 1] == moments[k - 2]), NONE)
+        return SPHERICAL
+    return next((k for k in range(3) if moments[k - 1] == moments[k - 2]), NO_SYMMETRY)
 
 
 class DrivenRotor(NamedTuple):
@@ -96,8 +96,8 @@ class DrivenRotor(NamedTuple):
     and counted as work done on the body.
     """
 
-    inertia: Course
-    momentum: Course
+    inertia: TimeFunction
+    momentum: TimeFunction
 
 
 class NoRotor(NamedTuple):
@@ -106,52 +106,54 @@ class NoRotor(NamedTuple):
     inverse_inertia: float = 0.0
 
 
-def turn(rotor, species, rotation, angular_momentum_body, m, h):
+def rotate(rotor, species, rotation, angular_momentum_body, m, h):
     """Rotate molecule m of the given species freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1 L, in place."""
     raise TypeError(f"{type(rotor).__name__} is not a rotor, or this was called outside compiled code")
 
 
-@implements(turn, NoRotor, inline=True)
+@implements(rotate, NoRotor, inline=True)
 def _turn_points(rotor, species, rotation, angular_momentum_body, m, h):
     return None
 
 
-@implements(turn, inline=True)
+@implements(rotate, inline=True)
 def _turn_body(rotor, species, rotation, angular_momentum_body, m, h):
     if is_a(rotor, SplitRotor):
 
         def turn_split(rotor, species, rotation, angular_momentum_body, m, h):
-            turn_by_parts(rotor, species, rotation, angular_momentum_body, m, h)
+            rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h)
 
         return turn_split
     if is_a(rotor, ExactRotor):
 
         def turn_exact(rotor, species, rotation, angular_momentum_body, m, h):
-            if rotor.symmetry[species] == NONE:
-                turn_by_series(rotation, angular_momentum_body, m, rotor.inverse_inertia[species], h)
+            if rotor.symmetry[species] == NO_SYMMETRY:
+                rotate_by_series(rotation, angular_momentum_body, m, rotor.inverse_inertia[species], h)
             else:
-                turn_by_parts(rotor, species, rotation, angular_momentum_body, m, h)
+                rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h)
 
         return turn_exact
 
 
 @kernel(inline=True)
-def turn_by_parts(rotor, species, rotation, angular_momentum_body, m, h):
+def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
     """Rotate about L, then about the axes; the two flows commute."""
-    about_momentum(rotation, angular_momentum_body, m, h * rotor.common[species])
+    rotate_about_momentum(rotation, angular_momentum_body, m, h * rotor.common[species])
     a, b, c = rotor.order[species, 0], rotor.order[species, 1], rotor.order[species, 2]
     excess = rotor.excess[species]
-    turn_by_axes(rotation, angular_momentum_body, m, (a, b, c), (excess[a], excess[b], excess[c]), (0.0, 0.0, 0.0), h)
+    rotate_about_axes(
+        rotation, angular_momentum_body, m, (a, b, c), (excess[a], excess[b], excess[c]), (0.0, 0.0, 0.0), h
+    )
 
 
 @kernel
-def turn_by_series(rotation, angular_momentum_body, m, inverse, h):
+def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
     """Free motion of an asymmetric body by the Taylor series of omega and of the quaternion of the rotation."""
     L = angular_momentum_body[m]
     fastest = abs(L[0] * inverse[0]) + abs(L[1] * inverse[1]) + abs(L[2] * inverse[2])
     if not 0.0 < fastest * abs(h) < inf:
         return
-    if fastest * abs(h) > LONGEST_TURN:
+    if fastest * abs(h) > LARGEST_ANGLE:
         L[:] = nan
         return
     parts = int(fastest * abs(h) / LONGEST_PART) + 1
@@ -198,21 +200,21 @@ def turn_by_series(rotation, angular_momentum_body, m, inverse, h):
             z += q3
             if abs(q0) + abs(q1) + abs(q2) + abs(q3) < 1e-17:
                 break
-        apply_turn(rotation, angular_momentum_body, m, w, x, y, z)
+        apply_quaternion(rotation, angular_momentum_body, m, w, x, y, z)
 
 
 @kernel(inline=True)
-def apply_turn(rotation, angular_momentum_body, m, w, x, y, z):
+def apply_quaternion(rotation, angular_momentum_body, m, w, x, y, z):
     """Q <- Q R, L <- R^T L with R the rotation of the quaternion (1 + w, x, y, z), of any length."""
     share = 2 / ((1 + w) * (1 + w) + x * x + y * y + z * z)
     c = share * (1 + w)
     L = angular_momentum_body[m]
-    L[0], L[1], L[2] = turned(L[0], L[1], L[2], x, y, z, -c, share)
-    turn_rows(rotation[m], x, y, z, -c, share)
+    L[0], L[1], L[2] = rotate_vector(L[0], L[1], L[2], x, y, z, -c, share)
+    rotate_rows(rotation[m], x, y, z, -c, share)
 
 
 @kernel(inline=True)
-def turned(a, b, d, x, y, z, first, second):
+def rotate_vector(a, b, d, x, y, z, first, second):
     """v + first u x v + second u x (u x v) for v = (a, b, d), u = (x, y, z): a rotation, written as a change."""
     p = y * d - z * b
     q = z * a - x * d
@@ -225,31 +227,31 @@ def turned(a, b, d, x, y, z, first, second):
 
 
 @kernel(inline=True)
-def turn_rows(rotation, x, y, z, first, second):
-    """`turned` of each row of Q (3, 3), in place: a row of Q R is R^T times the row of Q."""
+def rotate_rows(rotation, x, y, z, first, second):
+    """`rotate_vector` of each row of Q (3, 3), in place: a row of Q R is R^T times the row of Q."""
     for row in range(3):
-        rotation[row, 0], rotation[row, 1], rotation[row, 2] = turned(
+        rotation[row, 0], rotation[row, 1], rotation[row, 2] = rotate_vector(
             rotation[row, 0], rotation[row, 1], rotation[row, 2], x, y, z, first, second
         )
 
 
 @kernel(inline=True)
-def turn_by_axes(rotation, angular_momentum_body, m, order, rate, offset, h):
+def rotate_about_axes(rotation, angular_momentum_body, m, order, rate, offset, h):
     """Five exact rotations about the axes in this order, by angles h rate (L_k - offset).
 
     The offset of a gyrostat is the momentum of its rotors.
     """
     L = angular_momentum_body
     a, b, c = order
-    about_axis(rotation, L, m, a, 0.5 * h * rate[0] * (L[m, a] - offset[0]))
-    about_axis(rotation, L, m, b, 0.5 * h * rate[1] * (L[m, b] - offset[1]))
-    about_axis(rotation, L, m, c, h * rate[2] * (L[m, c] - offset[2]))
-    about_axis(rotation, L, m, b, 0.5 * h * rate[1] * (L[m, b] - offset[1]))
-    about_axis(rotation, L, m, a, 0.5 * h * rate[0] * (L[m, a] - offset[0]))
+    rotate_about_axis(rotation, L, m, a, 0.5 * h * rate[0] * (L[m, a] - offset[0]))
+    rotate_about_axis(rotation, L, m, b, 0.5 * h * rate[1] * (L[m, b] - offset[1]))
+    rotate_about_axis(rotation, L, m, c, h * rate[2] * (L[m, c] - offset[2]))
+    rotate_about_axis(rotation, L, m, b, 0.5 * h * rate[1] * (L[m, b] - offset[1]))
+    rotate_about_axis(rotation, L, m, a, 0.5 * h * rate[0] * (L[m, a] - offset[0]))
 
 
 @kernel(inline=True)
-def about_axis(rotation, angular_momentum_body, m, k, angle):
+def rotate_about_axis(rotation, angular_momentum_body, m, k, angle):
     """Exact flow of (L_k - offset)²/(2 I_k): L <- R_k(angle)^T L, Q <- Q R_k(angle)."""
     if angle != 0.0:
         i = k + 1 if k < 2 else 0
@@ -273,15 +275,15 @@ def sine_and_versine(angle):
     cos² + sin² is 1 only to rounding, and a rotation by the same angle would repeat the same error at every step.
     Written as a change, the error is smaller by the angle squared, and only the sum rounds, differently each time.
     """
-    odd, even = of_square(angle * angle)
+    odd, even = rotation_coefficients(angle * angle)
     return angle * odd, angle * angle * even
 
 
 @kernel(inline=True)
-def of_square(x):
+def rotation_coefficients(x):
     """sin(angle)/angle and (1 - cos(angle))/angle² of x = angle²."""
-    if x < SHORT:
-        return series_of_square(x)
+    if x < SHORT_ANGLE2:
+        return rotation_coefficient_series(x)
     angle = sqrt(x)
     s = sin(angle)
     c = cos(angle)
@@ -289,8 +291,8 @@ def of_square(x):
 
 
 @kernel(inline=True)
-def series_of_square(x):
-    """`of_square` by Taylor series: accurate to rounding below SHORT, and faster than sin and cos of the library."""
+def rotation_coefficient_series(x):
+    """`rotation_coefficients` by Taylor series: accurate to rounding below SHORT, and faster than sin and cos of the library."""
     x2 = x * x
     odd = (1 - 1 / 6 * x) + x2 * (
         (1 / 120 - 1 / 5040 * x) + x2 * ((1 / 362880 - 1 / 39916800 * x) + 1 / 6227020800 * x2)
@@ -302,28 +304,28 @@ def series_of_square(x):
 
 
 @kernel(inline=True)
-def about_momentum(rotation, angular_momentum_body, m, share):
+def rotate_about_momentum(rotation, angular_momentum_body, m, share):
     """Rotate about L by the angle share |L|: L is constant, Q <- Q R(share L)."""
     L = angular_momentum_body[m]
-    turn_along(rotation[m], share * L[0], share * L[1], share * L[2])
+    rotate_by_vector(rotation[m], share * L[0], share * L[1], share * L[2])
 
 
 @kernel(inline=True)
-def turn_along(rotation, x, y, z):
+def rotate_by_vector(rotation, x, y, z):
     """Q <- Q R with the rotation vector (x, y, z) of R, body frame. It avoids the length, which is a third faster."""
-    odd, even = of_square(x * x + y * y + z * z)
-    turn_rows(rotation, x, y, z, -odd, even)
+    odd, even = rotation_coefficients(x * x + y * y + z * z)
+    rotate_rows(rotation, x, y, z, -odd, even)
 
 
-def turn_alone(rotor, state, time, h):
+def rotate_body(rotor, state, time, h):
     """Rotate a single body freely from `time` to time + h, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(turn_alone, inline=True)
+@implements(rotate_body, inline=True)
 def _turn_alone(rotor, state, time, h):
     if not is_a(rotor, DrivenRotor):
-        return lambda rotor, state, time, h: turn(rotor, 0, state.rotation, state.angular_momentum_body, 0, h)
+        return lambda rotor, state, time, h: rotate(rotor, 0, state.rotation, state.angular_momentum_body, 0, h)
 
     def turn_driven(rotor, state, time, h):
         L = state.angular_momentum_body
@@ -335,9 +337,9 @@ def _turn_alone(rotor, state, time, h):
             1 / value(rotor.inertia, middle, 2),
         )
         offset = (value(rotor.momentum, middle, 0), value(rotor.momentum, middle, 1), value(rotor.momentum, middle, 2))
-        state.books[WORK] += driven_energy(rotor, L, middle) - before
-        turn_by_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
-        state.books[WORK] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
+        state.energy_ledger[WORK] += driven_energy(rotor, L, middle) - before
+        rotate_about_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
+        state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
 
     return turn_driven
 
@@ -362,10 +364,7 @@ def _moments(rotor, time, k):
     if is_a(rotor, SplitRotor) or is_a(rotor, ExactRotor):
         return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
     if is_a(rotor, DrivenRotor):
-        return lambda rotor, time, k: (
-            1 / value(rotor.inertia, time, k),
-            value(rotor.momentum, time, k),
-        )
+        return lambda rotor, time, k: (1 / value(rotor.inertia, time, k), value(rotor.momentum, time, k))
     if is_a(rotor, NoRotor):
         return lambda rotor, time, k: (0.0, 0.0)
 

@@ -33,7 +33,7 @@ def inertia_tensor(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
     )
 
 
-def shifted(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
+def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
     """Inertia tensor (3, 3) about a point at `offset` (3,) from the centre of mass, from that about it (parallel axes).
 
     A negative mass gives the inverse.
@@ -41,7 +41,7 @@ def shifted(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
     return tensor + inertia_tensor(np.array([mass]), np.array([offset], dtype=float))
 
 
-def impossible(tensor: np.ndarray, scale: float = 0.0) -> str:
+def inertia_error(tensor: np.ndarray, scale: float = 0.0) -> str:
     """Why no mass distribution has this inertia tensor (3, 3); empty if one exists.
 
     Moments must not be negative, and none may exceed the sum of the others. The tolerance for rounding is 1e-12 of the

@@ -25,7 +25,7 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def direction(vector: ArrayLike) -> np.ndarray:
+def unit_vector(vector: ArrayLike) -> np.ndarray:
     """Unit vector along a non-zero vector (k,) of any length, without overflow or underflow."""
     given = np.asarray(vector, dtype=float)
     scaled = given / np.abs(given).max()
@@ -131,9 +131,7 @@ def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray)
     phi_dot, theta_dot, psi_dot = np.moveaxis(np.asarray(rates, dtype=float), -1, 0)
     return np.stack(
         np.broadcast_arrays(
-            phi_dot * st * sp + theta_dot * cp,
-            phi_dot * st * cp - theta_dot * sp,
-            phi_dot * ct + psi_dot,
+            phi_dot * st * sp + theta_dot * cp, phi_dot * st * cp - theta_dot * sp, phi_dot * ct + psi_dot
         ),
         axis=-1,
     )

@@ -33,7 +33,7 @@ class Shape(NamedTuple):
 
 
 #: How many numbers each dimension has.
-NUMBERS = {"radius_m": 1, "height_m": 1, "length_m": 1, "lengths_m": 3, "semi_axes_m": 3}
+COMPONENTS_PER_DIMENSION = {"radius_m": 1, "height_m": 1, "length_m": 1, "lengths_m": 3, "semi_axes_m": 3}
 
 
 def _ring(count: int, radius: float, z: float) -> np.ndarray:

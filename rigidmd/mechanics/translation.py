@@ -1,6 +1,6 @@
 """The translation of a single body: free, none, or through an ideal fluid with added mass.
 
-A flight is a term: `carry(flight, ...)` is chosen by its type at compile time, so that a pinned body compiles no
+A flight is a term: `translate(flight, ...)` is chosen by its type at compile time, so that a pinned body compiles no
 translation.
 """
 
@@ -9,22 +9,22 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.mechanics.free_rotor import turn_alone
+from rigidmd.mechanics.free_rotor import rotate_body
 
 
-class Free(NamedTuple):
+class FreeTranslation(NamedTuple):
     """The centre of mass moves freely."""
 
     mass: float
 
 
-class Pinned(NamedTuple):
+class NoTranslation(NamedTuple):
     """One point of the body is fixed at the origin; position and velocity are not stored."""
 
     mass: float
 
 
-class Immersed(NamedTuple):
+class FluidTranslation(NamedTuple):
     """A body in an ideal fluid: Kirchhoff's equations P' = P x omega, L' = L x omega + P x v with v = M^-1 P.
 
     `state.velocity` is the impulse of body and fluid over the body's mass, lab frame. The principal axes of M are those
@@ -36,39 +36,39 @@ class Immersed(NamedTuple):
     inertial_mass: np.ndarray  # (3,) mass and added mass along the body's axes
 
 
-def carry(flight, rotor, state, time, h):
+def translate(flight, rotor, state, time, h):
     """Flow of the kinetic energy of a single body, from `time` to time + h, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(carry, inline=True)
+@implements(translate, inline=True)
 def _carry(flight, rotor, state, time, h):
-    if is_a(flight, Pinned):
-        return lambda flight, rotor, state, time, h: turn_alone(rotor, state, time, h)
-    if is_a(flight, Free):
+    if is_a(flight, NoTranslation):
+        return lambda flight, rotor, state, time, h: rotate_body(rotor, state, time, h)
+    if is_a(flight, FreeTranslation):
 
         def fly(flight, rotor, state, time, h):
             for k in range(3):
                 state.position[0, k] += h * state.velocity[0, k]
-            turn_alone(rotor, state, time, h)
+            rotate_body(rotor, state, time, h)
 
         return fly
 
     def swim(flight, rotor, state, time, h):
-        glide(flight, state, 0.5 * h)
-        turn_alone(rotor, state, time, h)
-        glide(flight, state, 0.5 * h)
+        translate_in_fluid(flight, state, 0.5 * h)
+        rotate_body(rotor, state, time, h)
+        translate_in_fluid(flight, state, 0.5 * h)
 
     return swim
 
 
 @kernel(inline=True)
-def glide(flight, state, h):
+def translate_in_fluid(flight, state, h):
     """Exact flow of sum P_k²/(2 M_k): P and Q are constant, X += h Q v, L += h P x v."""
     q = state.rotation[0]
-    p0 = flight.mass * along(q, state.velocity[0], 0)
-    p1 = flight.mass * along(q, state.velocity[0], 1)
-    p2 = flight.mass * along(q, state.velocity[0], 2)
+    p0 = flight.mass * body_component(q, state.velocity[0], 0)
+    p1 = flight.mass * body_component(q, state.velocity[0], 1)
+    p2 = flight.mass * body_component(q, state.velocity[0], 2)
     v0 = p0 / flight.inertial_mass[0]
     v1 = p1 / flight.inertial_mass[1]
     v2 = p2 / flight.inertial_mass[2]
@@ -80,7 +80,7 @@ def glide(flight, state, h):
 
 
 @kernel(inline=True)
-def along(rotation, vector_lab, k):
+def body_component(rotation, vector_lab, k):
     """Component of a lab vector (3,) along body axis k."""
     return rotation[0, k] * vector_lab[0] + rotation[1, k] * vector_lab[1] + rotation[2, k] * vector_lab[2]
 
@@ -92,11 +92,11 @@ def inertial_mass(flight, k):
 
 @implements(inertial_mass, inline=True)
 def _inertial_mass(flight, k):
-    if is_a(flight, Immersed):
+    if is_a(flight, FluidTranslation):
         return lambda flight, k: flight.inertial_mass[k]
     return lambda flight, k: flight.mass
 
 
-def inertial_masses(flight: Free | Pinned | Immersed) -> np.ndarray:
+def inertial_masses(flight: FreeTranslation | NoTranslation | FluidTranslation) -> np.ndarray:
     """Mass, with added mass, along the body's axes (3,), for Python."""
-    return flight.inertial_mass if isinstance(flight, Immersed) else np.full(3, flight.mass)
+    return flight.inertial_mass if isinstance(flight, FluidTranslation) else np.full(3, flight.mass)
