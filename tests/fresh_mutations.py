@@ -85,7 +85,7 @@ FRESH: list[Mutation] = [
         "studies/accuracy/bias.py",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - own) * point.error) ** 2)",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + point.error**2)",
-        ("test_precision.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",),
+        ("test_accuracy.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",),
     ),
     Mutation(
         "F13", "drift in kT: degrees of freedom without the total momentum where Langevin changes it",
@@ -235,7 +235,7 @@ FRESH: list[Mutation] = [
         "studies/accuracy/averages.py",
         "    late = results[\"time\"] > SETTLING * sample",
         "    late = results[\"time\"] > 0",
-        ("test_precision.py::test_averages_leave_out_what_comes_before_equilibrium",),
+        ("test_accuracy.py::test_averages_leave_out_what_comes_before_equilibrium",),
     ),
     Mutation(
         "F34", "log: the pressures xz and yz exchanged",
@@ -274,7 +274,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F39", "ramps: one step late",
-        "dynamics/ramps.py",
+        "dynamics/thermostats.py",
         "(state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps)",
         "(state.step[NOW] - state.step[ORIGIN]) / ramp.steps)",
         ("test_wiring.py::test_a_ramp_is_even_over_the_steps_of_its_stage",),
@@ -282,8 +282,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F40", "a stage after Langevin: the energy of the momentum that is taken out is booked with the wrong sign",
         "run/molecular.py",
-        "            self.state.books[TAKEN] -= remove_momentum(",
-        "            self.state.books[TAKEN] += remove_momentum(",
+        "            self.state.energy_ledger[TAKEN] -= remove_momentum(",
+        "            self.state.energy_ledger[TAKEN] += remove_momentum(",
         ("test_baths.py::test_degrees_of_freedom_follow_the_thermostat",),
     ),
 ]  # fmt: skip

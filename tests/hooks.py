@@ -16,7 +16,7 @@ import pytest
 LONGEST = (
     "forces", "body_engine", "ewald", "docs", "dynamics", "sweep", "run", "analyse_runs", "ase", "python", "resume",
     "compile", "bodies", "boxes", "reference", "ensembles", "minimise", "baths", "own", "auto", "lammps", "lanes",
-    "rooms", "looking", "trajectory_structures", "fields", "threads", "body_run", "stability", "precision", "notebook",
+    "rooms", "looking", "trajectory_structures", "fields", "threads", "body_run", "stability", "accuracy", "notebook",
 )  # fmt: skip
 RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
 

@@ -119,8 +119,8 @@ RINGS = [
     Mutation(
         "B2", "Monte Carlo barostat: N + 1 in the rule of acceptance",
         "dynamics/barostats.py",
-        "            return box.molecules * log(after / before)",
-        "            return (box.molecules + 1) * log(after / before)",
+        "            return barostat.molecules * log(after / before)",
+        "            return (barostat.molecules + 1) * log(after / before)",
         (
             "test_wiring.py::test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecules",
             "test_changing_cells.py::test_an_ideal_gas_has_its_volumes_through_a_whole_run",
@@ -143,8 +143,8 @@ RINGS = [
     Mutation(
         "B5", "pressure ramp: the first pressure is kept",
         "dynamics/barostats.py",
-        "    return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * share",
-        "    return pressure.first[k] + 0.0 * share",
+        "    return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction",
+        "    return pressure.first[k] + 0.0 * fraction",
         (
             "test_wiring.py::test_a_ramp_is_even_over_the_steps_of_its_stage",
             "test_wiring.py::test_what_drives_the_cell_follows_a_ramp_of_the_pressure",
@@ -187,7 +187,7 @@ RINGS = [
     ),
     Mutation(
         "B11", "error of a drift: the random walk too small by a third",
-        "core/drift.py",
+        "core/statistics.py",
         "    walk = max(0.0, 3 * (slow * long - fast * short)",
         "    walk = max(0.0, 2 * (slow * long - fast * short)",
         ("test_drift.py::test_the_error_of_a_slope_is_as_large_as_its_scatter",),
@@ -258,7 +258,7 @@ RINGS = [
         "B20", "resume: Nose-Hoover chains and pistons start anew",
         "run/resume.py",
         "    if exact and not are_rotations(found.rotation):",
-        "    found.bath[:] = 0.0\n    if exact and not are_rotations(found.rotation):",
+        "    found.extra_variables[:] = 0.0\n    if exact and not are_rotations(found.rotation):",
         (
             "test_thermostat_states.py::test_a_checkpoint_gives_back_all_of_a_state",
             "test_thermostat_states.py::test_chains_go_on_to_the_same_bits_in_double_precision",

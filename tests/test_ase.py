@@ -22,7 +22,7 @@ from support import (
     ROOT,
     TrajFile,
     TrajReader,
-    _shares,
+    _transfer_matrices,
     build,
     contents,
     load_model,
@@ -374,13 +374,13 @@ def test_a_force_on_a_massless_site_is_spread_with_its_torque(model):
     heavy = found.positions_body[found.masses > 0]
     force = np.array([0.3, -1.1, 0.7])
     for site in np.flatnonzero(found.masses == 0):
-        spread = _shares(found, int(site)) @ force
+        spread = _transfer_matrices(found, int(site)) @ force
         assert spread.sum(axis=0) == pytest.approx(force, abs=1e-12)
         torque = np.cross(found.positions_body[site], force)
         assert np.cross(heavy, spread).sum(axis=0) == pytest.approx(torque, abs=1e-12)
     if model == "tip4p":  # M is 0.15 Å from O along the bisector, H 0.5859 Å
         share = 0.15 / 0.585882276618295 / 2
-        assert _shares(found, 3)[:, 0, 0] == pytest.approx([1 - 2 * share, share, share], abs=1e-12)
+        assert _transfer_matrices(found, 3)[:, 0, 0] == pytest.approx([1 - 2 * share, share, share], abs=1e-12)
 
 
 def strained(atoms: Atoms, strain: np.ndarray) -> float:

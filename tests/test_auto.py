@@ -11,9 +11,9 @@ from support import (
     ROOT,
     SCHEMES,
     SPRING,
+    EnergyWalk,
     Method,
-    Subject,
-    Walk,
+    TrialSystem,
     _fitted,
     averages,
     bias_of_potential,
@@ -140,27 +140,27 @@ def known(monkeypatch):
     """
 
     def make(jump):
-        true, rng = Walk(1e-9 / Walk(1.0, jump, 600).rate(SCHEMES["srkn_4"], 5e-3), jump, 600), np.random.default_rng(1)
+        true, rng = EnergyWalk(1e-9 / EnergyWalk(1.0, jump, 600).rate(SCHEMES["srkn_4"], 5e-3), jump, 600), np.random.default_rng(1)
 
         def regular(scheme, dt):
             return 1e-3 * (dt / 5e-3) ** scheme.order
 
-        def look(subject, trial, exact, looks=40):
+        def measure_errors(trial_system, trial, exact, observations=40):
             scheme, dt = SCHEMES[trial.integrator], 1e-3 * trial.timestep
-            trial.fault = "diverges" if dt > 5e-3 * scheme.force_evaluations else ""
+            trial.failure = "diverges" if dt > 5e-3 * scheme.force_evaluations else ""
             walked = true.rate(scheme, dt) * trial.steps * dt
-            trial.energies = [0.0, *np.cumsum(rng.standard_normal(looks) * np.sqrt(walked / looks))]
+            trial.energies = [0.0, *np.cumsum(rng.standard_normal(observations) * np.sqrt(walked / observations))]
             trial.energy_rms = float(np.hypot(regular(scheme, dt), np.sqrt(walked / 2)))
 
         def error(found):
             dt, scheme = 1e-3 * found.timestep, SCHEMES[found.integrator]
             return np.sqrt(regular(scheme, dt) ** 2 + true.square(scheme, dt, 20.0))
 
-        monkeypatch.setattr(choice, "look", look)
-        monkeypatch.setattr(walk, "look", look)
+        monkeypatch.setattr(choice, "measure_errors", measure_errors)
+        monkeypatch.setattr(walk, "measure_errors", measure_errors)
         methods = {name: Method(None, scheme) for name, scheme in SCHEMES.items()}
-        subject = Subject("", None, methods, None, "", "", 1.0, 1.0, 0.1, "fs", 1e-3, "", "", None, True, freedom=600)
-        return subject, {name: 5.0 * scheme.force_evaluations for name, scheme in SCHEMES.items()}, error
+        trial_system = TrialSystem("", None, methods, None, "", "", 1.0, 1.0, 0.1, "fs", 1e-3, "", "", None, True, freedom=600)
+        return trial_system, {name: 5.0 * scheme.force_evaluations for name, scheme in SCHEMES.items()}, error
 
     return make
 
@@ -168,17 +168,17 @@ def known(monkeypatch):
 @pytest.mark.parametrize("target", [1e-4, 1e-6])
 @pytest.mark.parametrize("jump", [0.0, 2.0, 5.0])
 def test_the_error_asked_for_holds_over_the_whole_run_and_not_only_the_pilot(jump, target, known):
-    subject, longest, error = known(jump)
-    found = choose(subject, target, "energy_rms", longest, 20.0)
+    trial_system, longest, error = known(jump)
+    found = choose(trial_system, target, "energy_rms", longest, 20.0)
     assert target / 5 < error(found) < target
     assert "over 20 ps for a target of" in found.reason
     assert found.error == pytest.approx(error(found), rel=0.5)
-    assert error(choose(subject, target, "energy_rms", longest)) > error(found)
+    assert error(choose(trial_system, target, "energy_rms", longest)) > error(found)
 
 
 def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
-    subject, longest, error = known(-1.0)
-    found = choose(subject, 2e-5, "energy_rms", longest, 20.0)
+    trial_system, longest, error = known(-1.0)
+    found = choose(trial_system, 2e-5, "energy_rms", longest, 20.0)
     assert found.error == pytest.approx(error(found), rel=0.5)
     assert found.error > 2e-5
     assert "no step tried keeps the target over that time: truncation = 'smooth_switch', a longer" in found.reason
@@ -212,7 +212,7 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
         ({"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0}, "timestep_fs would do nothing with"),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"}, "rotor would do nothing with"),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
-        ({"integrator": "auto", "bias_kT": 1e-3}, "bias_kT is of averages at a temperature, and nve has no thermostat"),
+        ({"integrator": "auto", "bias_kT": 1e-3}, "bias_kT is for averages at a temperature, and nve has no thermostat"),
         ({"bias_kT": 1e-3}, "bias_kT would do nothing without integrator = 'auto'"),
     ],
 )

@@ -12,10 +12,10 @@ from support import (
     build,
     check_folder,
     load_model,
-    long_steps,
     molecule,
     read_molecule,
     small_scene,
+    step_warnings,
 )
 
 from rigidmd.commands.cli import main
@@ -88,7 +88,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]", "[forces]\ncutoff_A = 6\nswitch_start_A = 7\n[start]", ["switch_start_A = 7", "below"]),
         ("[start]", '[output]\ntrajectory = "../t.xtc"\n[start]', ["output.trajectory", "plain file name"]),
         ("[start]", '[output]\ntrajectory = "t.mp4"\n[start]', ["output.trajectory", ".xtc"]),
-        ("[start]", "[output]\nvelocities = true\n[start]", ["trajectory.xtc holds none", ".trr or .nc"]),
+        ("[start]", "[output]\nvelocities = true\n[start]", ["trajectory.xtc cannot store them", ".trr or .nc"]),
         ("[start]", '[output]\ntrajectory = "t.dcd"\ntrajectory_interval_ps = 0.0035\n[start]', [".dcd", "one time between frames"]),
         ("[start]", '[output]\ntrajectory = "x.pdb"\ntopology = "x.pdb"\n[start]', ["both x.pdb"]),
         ("[start]", '[output]\ntrajectory = "input_a.pdb"\n[start]', ["input_"]),
@@ -132,7 +132,7 @@ def test_an_unknown_integrator_lists_the_names_once(capsys, tmp_path):
 
 def test_an_unknown_integrator_of_the_command(capsys, tmp_path):
     (tmp_path / "good.toml").write_text(GOOD)
-    assert main(["precision", str(tmp_path / "good.toml"), "--integrators", "velocity_verlet,SRKN6"]) == 2
+    assert main(["accuracy", str(tmp_path / "good.toml"), "--integrators", "velocity_verlet,SRKN6"]) == 2
     message = capsys.readouterr().err
     assert "--integrators: there is no SRKN6; did you mean srkn_6? (known: velocity_verlet" in message
 
@@ -167,7 +167,7 @@ def test_a_molecule_file_with_a_text_without_quotes(tmp_path):
 def test_check_warns_of_a_step_that_no_liquid_bears(
     model, density, temperature, fine, too_long, words, capsys, tmp_path
 ):
-    """Longest stable steps of these liquids, by `stiffest` after 3 ps: 10.7, 63 and 90 fs."""
+    """Longest stable steps of these liquids, by `stiffest_mode` after 3 ps: 10.7, 63 and 90 fs."""
     text = GOOD.replace("lengths_A = 20.0", f"density_g_cm3 = {density}").replace("= 300", f"= {temperature}")
     text = text.replace("spce", model).replace("count = 20", "count = 400").replace("0.01", "1.0")
     for step, long in ((fine, False), (too_long, True)):
@@ -184,7 +184,7 @@ def test_a_step_is_long_for_what_moves_and_for_its_scheme():
     def warned(**more):
         stage = {"duration_ps": 1.0, "timestep_fs": 15.0} | more.pop("stage", {})
         molecules = [{"model": "spce", "count": 5, "frozen": more.pop("frozen", False)}, {"model": "argon", "count": 5}]
-        return long_steps(small_scene({}, 20.0, molecules=molecules, stages=[stage], **more))
+        return step_warnings(small_scene({}, 20.0, molecules=molecules, stages=[stage], **more))
 
     assert len(warned()) == 1
     assert not warned(frozen=True)
@@ -197,7 +197,7 @@ def test_a_step_is_long_for_what_moves_and_for_its_scheme():
 
 @pytest.mark.parametrize("path", MOLECULES, ids=lambda path: path.stem)
 def test_no_shipped_scene_has_too_long_a_step(path):
-    assert long_steps(Scene.read(path)) == []
+    assert step_warnings(Scene.read(path)) == []
 
 
 def test_a_thermostat_cannot_warm_what_is_at_rest(capsys, tmp_path):
@@ -222,7 +222,7 @@ def test_all_faults_at_once(capsys, tmp_path):
         assert key in message
 
 
-@pytest.mark.parametrize("command", ["run", "check", "energy", "precision", "sweep"])
+@pytest.mark.parametrize("command", ["run", "check", "energy", "accuracy", "sweep"])
 @pytest.mark.parametrize(
     ("path", "expected"),
     [
@@ -245,13 +245,13 @@ def test_a_missing_scene(command, path, expected, capsys, monkeypatch, tmp_path)
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["analyze", "runs/x"], "there is no command 'analyze'; did you mean analyse?"),
-        (["precison", "x.toml"], "there is no command 'precison'; did you mean precision?"),
-        (["foo"], "there is no command 'foo'; `rigidmd --help` lists them"),
-        (["run", "x.toml", "--forse"], "rigidmd run: error: there is no argument '--forse'; did you mean --force?"),
+        (["analyze", "runs/x"], "unknown command 'analyze'; did you mean analyse?"),
+        (["acuracy", "x.toml"], "unknown command 'acuracy'; did you mean accuracy?"),
+        (["foo"], "unknown command 'foo'; `rigidmd --help` lists them"),
+        (["run", "x.toml", "--forse"], "rigidmd run: error: unknown argument '--forse'; did you mean --force?"),
         (["run", "x.toml", "--wall-time=1:00"], "'--wall-time=1:00'; did you mean --walltime?"),
-        (["film", "x", "--fps", "3"], "rigidmd film: error: there is no argument '--fps'"),
-        (["check", "x.toml", "y.toml"], "rigidmd check: error: there is no argument 'y.toml'"),
+        (["film", "x", "--fps", "3"], "rigidmd film: error: unknown argument '--fps'"),
+        (["check", "x.toml", "y.toml"], "rigidmd check: error: unknown argument 'y.toml'"),
     ],
 )
 def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, capsys):
@@ -288,9 +288,9 @@ def test_times_of_the_command_line_are_finite(until, capsys):
         (["--averages", "nan"], "must be finite and greater than 0"),
     ],
 )
-def test_times_of_precision_are_finite(options, expected, capsys, tmp_path):
+def test_times_of_accuracy_are_finite(options, expected, capsys, tmp_path):
     (tmp_path / "good.toml").write_text(GOOD)
-    assert main(["precision", str(tmp_path / "good.toml"), *options, "-o", str(tmp_path / "out")]) == 2
+    assert main(["accuracy", str(tmp_path / "good.toml"), *options, "-o", str(tmp_path / "out")]) == 2
     assert expected in capsys.readouterr().err
 
 

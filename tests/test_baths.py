@@ -17,6 +17,7 @@ from support import (
     apply_langevin_group,
     build,
     built,
+    constant_ramp,
     integrator_of_stage,
     kernel,
     key_of,
@@ -24,7 +25,6 @@ from support import (
     observe,
     remove_overlaps,
     small_scene,
-    steady,
 )
 
 from rigidmd.errors import SceneError
@@ -46,15 +46,15 @@ def kinetic(system, state):
     return 0.5 * moving.sum() + 0.5 * np.nansum(turning), moving, turning
 
 
-@pytest.mark.parametrize("bath", [Langevin(steady(THERMAL), 3.0, 7.0, key_of(2, THERMOSTAT)),
-                                  Andersen(steady(THERMAL), 0.3, key_of(2, THERMOSTAT))])  # fmt: skip
+@pytest.mark.parametrize("bath", [Langevin(constant_ramp(THERMAL), 3.0, 7.0, key_of(2, THERMOSTAT)),
+                                  Andersen(constant_ramp(THERMAL), 0.3, key_of(2, THERMOSTAT))])  # fmt: skip
 def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
     system = build(small_scene(MIXTURE, 150.0, start={"temperature_K": 30.0}))
     state, engine = system.state.copy(), Engine(system.model, {})
     before, *_ = kinetic(system, state)
-    move(engine, state, BAOAB.with_rotor("exact").with_bath(bath), 0.05, 60)  # the split rotor has an error of its own
+    move(engine, state, BAOAB.with_rotor("exact").with_thermostat(bath), 0.05, 60)  # the split rotor has an error of its own
     after, moving, turning = kinetic(system, state)
-    assert after - before == pytest.approx(state.books[HEAT], rel=1e-11)
+    assert after - before == pytest.approx(state.energy_ledger[HEAT], rel=1e-11)
     kind = np.array([m.name for m in system.species])[system.model.species]
     for name in MIXTURE:
         for squares in (moving, turning):
@@ -92,7 +92,7 @@ def test_friction_and_noise_of_many_molecules_are_those_of_each(first):
 def test_friction_is_that_of_each_motion():
     """Without noise, at 0 K, momenta fall by exactly exp(-friction t)."""
     system = build(small_scene({"spce": 5}, 40.0))
-    row = BAOAB.with_bath(Langevin(steady(0.0), 2.0, 5.0, key_of(1, THERMOSTAT)))
+    row = BAOAB.with_thermostat(Langevin(constant_ramp(0.0), 2.0, 5.0, key_of(1, THERMOSTAT)))
     state = system.state.copy()
     move(Engine(system.model, {}), state, row, 0.01, 10)
     assert state.velocity == pytest.approx(system.state.velocity * np.exp(-0.2), rel=1e-13)
@@ -102,7 +102,7 @@ def test_friction_is_that_of_each_motion():
 
 def test_collisions_come_after_their_mean_time():
     system = build(small_scene({"argon": 4000}, 200.0))
-    row = VERLET.with_bath(Andersen(steady(THERMAL), 0.5, key_of(4, THERMOSTAT)), halved=True)
+    row = VERLET.with_thermostat(Andersen(constant_ramp(THERMAL), 0.5, key_of(4, THERMOSTAT)), halved=True)
     state = system.state.copy()
     move(Engine(system.model, {}), state, row, 0.1, 3)
     kept = (state.velocity == system.state.velocity).all(axis=1).mean()
@@ -115,41 +115,41 @@ def liquid():
     system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
         "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
     remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
-    move(engine, state, BAOAB.with_bath(Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))), 0.001, 500)
-    return system, state._replace(books=np.zeros(3))
+    move(engine, state, BAOAB.with_thermostat(Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))), 0.001, 500)
+    return system, state._replace(energy_ledger=np.zeros(3))
 
 
 def test_chains_conserve_the_energy_of_molecules_and_chains_to_order_two(liquid):
     system, start = liquid
-    bath = NoseHoover(steady(THERMAL), 0.05, 3, system.freedom.translation, system.freedom.rotation)
-    row, spreads = VERLET.with_bath(bath, halved=True), []
+    bath = NoseHoover(constant_ramp(THERMAL), 0.05, 3, system.freedom.translation, system.freedom.rotation)
+    row, spreads = VERLET.with_thermostat(bath, halved=True), []
     for dt in (0.002, 0.001, 0.0005):
         engine = system.engine()
         state, found = engine.begin(start, row), []
         for _ in range(50):
             move(engine, state, row, dt, round(0.004 / dt))
-            found.append(observe(system, engine, state).energy - state.books.sum())
+            found.append(observe(system, engine, state).energy - state.energy_ledger.sum())
         spreads.append(np.std(found))
-        assert state.bath.any() and abs(state.books[HEAT]) > 20 * spreads[-1]
+        assert state.extra_variables.any() and abs(state.energy_ledger[HEAT]) > 20 * spreads[-1]
     assert np.log2(np.array(spreads[:-1]) / spreads[1:]) == pytest.approx([2, 2], abs=0.25)
 
 
 def test_chains_can_be_run_backwards(liquid):
     system, start = liquid
-    bath = NoseHoover(steady(THERMAL), 0.05, 4, system.freedom.translation, system.freedom.rotation)
-    row, engine = VERLET.with_bath(bath, halved=True), system.engine()
+    bath = NoseHoover(constant_ramp(THERMAL), 0.05, 4, system.freedom.translation, system.freedom.rotation)
+    row, engine = VERLET.with_thermostat(bath, halved=True), system.engine()
     state = engine.begin(start, row)
     move(engine, state, row, 0.001, 50)
     there = state.position.copy()
     for array in (state.velocity, state.angular_momentum_body):
         array *= -1
-    rates = state.bath.reshape(2, 2, 4)[:, 1]
+    rates = state.extra_variables.reshape(2, 2, 4)[:, 1]
     rates *= -1
     engine.forget()
     move(engine, state, row, 0.001, 50)
     assert np.abs(there - start.position).max() > 0.01
     assert state.position == pytest.approx(start.position, abs=1e-9)
-    assert state.bath.reshape(2, 2, 4)[:, 0] == pytest.approx(0, abs=1e-9)
+    assert state.extra_variables.reshape(2, 2, 4)[:, 0] == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("thermostat", [
@@ -160,12 +160,12 @@ def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermost
     scene = small_scene({"spce": 1000}, 32.0, stages=[stage], output={"trajectory": False})
     found = [Simulation(scene.model_copy(update={"threads": k})).run().state for k in (1, None)]
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*found, strict=True))
-    assert found[0].books[HEAT] != 0
+    assert found[0].energy_ledger[HEAT] != 0
 
 
 def test_a_ramp_goes_from_its_begin_to_its_end():
     system = build(small_scene({"argon": 3000}, 150.0))
-    row = BAOAB.with_bath(Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, THERMOSTAT)))
+    row = BAOAB.with_thermostat(Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, THERMOSTAT)))
     state, engine = system.state.copy(), Engine(system.model, {})
     for part in (0.5, 1.0):
         move(engine, state, row, 0.02, 50)
@@ -181,7 +181,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
     simulation = Simulation(scene)
     system = simulation.system
     assert [system.freedom_in(k).total for k in range(3)] == [120, 117, 117]
-    assert integrator_of_stage(system, 1).bath.degrees_of_freedom == 117
+    assert integrator_of_stage(system, 1).thermostat.degrees_of_freedom == 117
     results = simulation.run()
     own = results["stage"] == 0
     mass = system.model.mass[system.model.species].sum()

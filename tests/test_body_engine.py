@@ -9,11 +9,11 @@ from support import (
     DRIFT,
     KICK,
     SCHEMES,
-    WITH_BATH,
+    WITH_THERMOSTAT,
     Body,
     Engine,
     Flow,
-    Pinned,
+    NoTranslation,
     Scheme,
     SteadyForce,
     build_body,
@@ -27,13 +27,13 @@ from support import (
     split_rotor,
     state_of,
 )
-from support import course_integral as integral
-from support import course_is_steady as is_steady
-from support import course_steady as steady
-from support import course_table as table
-from support import course_total as total
-from support import course_value_at as value_at
-from support import course_window as window
+from support import integrate_function as integral
+from support import is_constant_function as is_steady
+from support import constant_function as steady
+from support import interpolated_function as table
+from support import sum_functions as total
+from support import values_at as value_at
+from support import pulse_function as window
 
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
@@ -123,7 +123,7 @@ def test_a_row_that_is_inconsistent_or_not_reversible_is_refused_when_it_is_made
 def test_rows_in_print_have_rounded_coefficients_and_shipped_ones_are_made_anew():
     rounded = split("mine", (0.1931833275, 0.613633345, 0.1931833275), (0.5, 0.5), 2, "in print")
     assert rounded.force_evaluations == 2
-    for scheme in (SCHEMES | WITH_BATH).values():
+    for scheme in (SCHEMES | WITH_THERMOSTAT).values():
         assert Scheme(*scheme) == scheme  # the checks of a new row
 
 
@@ -341,8 +341,8 @@ def test_euler_angles_are_singular_only_near_their_poles():
 
 
 @njit
-def pushed(*arguments):
-    return resistance.pushed(*arguments)
+def resisted_motion(*arguments):
+    return resistance.resisted_motion(*arguments)
 
 
 @pytest.mark.parametrize("dry", [0.0, 0.3])
@@ -351,8 +351,8 @@ def pushed(*arguments):
 @pytest.mark.parametrize("h", [1e-9, 0.1, 1.0, 1e6])
 def test_a_push_against_resistance_is_solved_exactly(dry, linear, push, h):
     for speed in (2.0, 0.05, 0.0, 1e-300):
-        after, way = pushed(speed, push, dry, linear, h)
-        mirrored = pushed(-speed, -push, dry, linear, h)
+        after, way = resisted_motion(speed, push, dry, linear, h)
+        mirrored = resisted_motion(-speed, -push, dry, linear, h)
         assert (after, way) == (-mirrored[0], -mirrored[1])
         if dry == 0 == push and speed > 0:
             assert (after > 0) == (linear * h < 600)  # only dry friction brings anything to rest
@@ -665,7 +665,7 @@ def test_the_ranking_of_schemes_at_equal_cost():
     errors = []
     for _ in range(40):
         a, b, c = rng.uniform(0.1, 1.0, 3)
-        body = Body(Pinned(1.0), split_rotor(np.array([[a + b, b + c, c + a]])))
+        body = Body(NoTranslation(1.0), split_rotor(np.array([[a + b, b + c, c + a]])))
         engine = Engine(body, {"weight": SteadyForce(np.array([0.0, 0.0, -3.0]), 0.5 * rng.standard_normal(3))})
         state = state_of(rotation=random_rotations(rng, 1), angular_momentum_body=1.5 * rng.standard_normal((1, 3)))
 
@@ -685,7 +685,7 @@ def test_the_ranking_of_schemes_at_equal_cost():
 def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
     # Small swings all take the same time: after whole periods the change of variables has undone itself.
     tilt, swings = 1e-4, 5
-    body = Body(Pinned(1.0), split_rotor(np.array([[1.0, 1.0, 1.0]])))
+    body = Body(NoTranslation(1.0), split_rotor(np.array([[1.0, 1.0, 1.0]])))
     engine = Engine(body, {"weight": SteadyForce(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0]))})
     start = from_vector(np.array([[tilt, 0.0, 0.0]]))
     for name, order in (("takahashi_imada", 4), ("position_verlet", 2)):

@@ -14,7 +14,7 @@ TOP = {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 0.5], "pinned": True, "centre
 def faults(**tables):
     with pytest.raises(SceneError) as caught:
         build_body(Scene.from_dict({"body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 2.0, 2.5]}, "run": RUN} | tables))
-    return "\n".join(caught.value.faults)
+    return "\n".join(caught.value.errors)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import json
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from support import BODIES, ROOT, Keeper, build_body, write_scene
+from support import BODIES, ROOT, CheckpointSchedule, build_body, write_scene
 
 import rigidmd
 from rigidmd.commands.cli import main
@@ -187,7 +187,7 @@ def test_a_run_says_what_is_wrong_with_it():
     said = simulation.introduction() + simulation.conclusion(simulation.run())
     assert "timestep_s is too long for this motion" in said
     assert "is not a whole number of steps of" in said
-    assert "turns by more than 180° between samples" in said
+    assert "rotates by more than 180° between samples" in said
 
 
 def test_what_a_trajectory_cannot_hold_is_told(tmp_path):
@@ -292,7 +292,7 @@ def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to
 def test_a_stiff_motion_ends_in_its_time_with_advice(tmp_path, monkeypatch):
     scene = stiff(tmp_path, 1e7)
     looks = iter(range(400))
-    monkeypatch.setattr(Keeper, "time_is_up", property(lambda self: next(looks, None) is None))
+    monkeypatch.setattr(CheckpointSchedule, "time_is_up", property(lambda self: next(looks, None) is None))
     results = Simulation(scene, tmp_path / "out", warn=str).run()
     assert results.interrupted
     assert results.out_of_time

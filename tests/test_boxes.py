@@ -19,17 +19,17 @@ from support import (
     VelocityRescaling,
     VolumeMoves,
     barostat_of,
-    box_room,
+    barostat_workspace,
     boxes,
     build,
     built,
+    constant_ramp,
     integrator_of_stage,
     key_of,
     move,
     observe,
     remove_overlaps,
     small_scene,
-    steady,
 )
 
 from rigidmd.errors import SceneError, SimulationError
@@ -45,7 +45,7 @@ QUIET = {"trajectory": False, "figures": False}
 
 @numba.njit
 def driving(box, model, state, room, k, volume, thermal):
-    return boxes.driving(box, model, state, room, k, volume, thermal)
+    return boxes.strain_force(box, model, state, room, k, volume, thermal)
 
 
 @numba.njit
@@ -88,7 +88,7 @@ def tallied(system, engine, state, room):
 
 def strained(system, engine, box, start, strain):
     """The state after a strain (6,), and a room that remembers how it was before."""
-    state, room = start.copy(), box_room(start)
+    state, room = start.copy(), barostat_workspace(start)
     tallied(system, engine, start, room)
     room.tally[1] = room.tally[0]
     room.strain[0] = strain
@@ -108,7 +108,7 @@ def enthalpy(system, engine, state, pressure):
 def test_what_drives_a_strain_is_minus_the_slope_of_the_enthalpy(liquid, k):
     system, engine, state = liquid
     box = barostat_of(system, 0)._replace(at_rest=(0.0, 0.0, 0.0))
-    room = box_room(state)
+    room = barostat_workspace(state)
     tallied(system, engine, state, room)
     found = driving(box, system.model, state, room, k, state.volume, THERMAL)
     pressure, step = np.array(box.pressure.first), 1e-4
@@ -154,7 +154,7 @@ def drift(box, model, state, room, h, mean, variance):
 
 def prepared(system, engine, box, before, after, room, h):
     """Log of the chance of a move whose drift is that of the state before."""
-    own = box_room(before)
+    own = barostat_workspace(before)
     engine.forget()
     tallied(system, engine, before, own)
     drift(box, system.model, before, own, h, room.strain[1], room.strain[2])
@@ -175,10 +175,10 @@ def gas(count, thermostat, box_for):
     system = build(scene)
     pressure = (count + 1) * THERMAL / system.state.volume
     asked = Pressure((pressure,) * 3 + (0.0,) * 3, (pressure,) * 3 + (0.0,) * 3, 1.0)
-    bath = VelocityRescaling(steady(THERMAL), 0.05, system.freedom.total, key_of(1, THERMOSTAT))
+    bath = VelocityRescaling(constant_ramp(THERMAL), 0.05, system.freedom.total, key_of(1, THERMOSTAT))
     if thermostat == "langevin":
-        bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
-    row = VERLET.with_bath(bath).with_box(box_for(asked, pressure), 2)
+        bath = Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
+    row = VERLET.with_thermostat(bath).with_barostat(box_for(asked, pressure), 2)
     engine = system.engine()
     state = engine.begin(system.state, row)
     found = []
@@ -198,9 +198,9 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
 
     def box_for(asked, pressure):
         if barostat == "monte_carlo":
-            return VolumeMoves(steady(THERMAL), asked, 600.0, float(n), (0.0, 0.0), key)
+            return VolumeMoves(constant_ramp(THERMAL), asked, 600.0, float(n), (0.0, 0.0), key)
         at_rest = (1.0,) * 3 if thermostat == "velocity_rescaling" else (0.0,) * 3
-        return CellRescaling(steady(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key)
+        return CellRescaling(constant_ramp(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key)
 
     volumes, moves = gas(n, thermostat, box_for)
     assert 0.2 < moves[1] / moves[0] < 0.99  # what is rejected matters
@@ -218,12 +218,12 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
 def test_a_rejected_move_leaves_no_trace(liquid):
     system, _, state = liquid
     dear = CellRescaling(
-        steady(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * barostat_of(system, 0).rate,
+        constant_ramp(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * barostat_of(system, 0).rate,
         COUPLINGS["flexible"], (1.0, 1.0, 1.0), (0.0, 0.0), key_of(1, BAROSTAT),
     )  # fmt: skip
     fresh = system.engine()
     still, moved = state.copy(), state.copy()
-    move(fresh, moved, VERLET.with_box(dear, 1), 0.0, 5)
+    move(fresh, moved, VERLET.with_barostat(dear, 1), 0.0, 5)
     assert fresh.moves == (5, 0)
     for name, a, b in zip(state._fields, still, moved, strict=True):
         assert name in ("step", "time") or a.tobytes() == b.tobytes(), name
@@ -236,11 +236,11 @@ def compressed():
     forces = {"cutoff_A": 4.5, "truncation": "smooth_switch", "tail_correction": True}
     system, engine, state = built({"nitrogen": 32}, 11.5, 2, spread=0.1, forces=forces, stages=[stage])
     remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.3, THERMAL, 0.002)
-    bath = Langevin(steady(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
-    move(engine, state, WITH_THERMOSTAT["baoab"].with_bath(bath), 0.002, 300)
+    bath = Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
+    move(engine, state, WITH_THERMOSTAT["baoab"].with_thermostat(bath), 0.002, 300)
     state.velocity[:] -= state.velocity.mean(axis=0)
-    state.begin_stretch()
-    return system, state._replace(books=np.zeros(3))
+    state.begin_segment()
+    return system, state._replace(energy_ledger=np.zeros(3))
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("velocity_verlet", 2), ("suzuki_4", 4)])
@@ -253,9 +253,9 @@ def test_a_piston_conserves_the_enthalpy_to_its_order(compressed, integrator, or
         state, found = engine.begin(start, row), []
         for _ in range(30):
             move(engine, state, row, dt, round(0.008 / dt))
-            found.append(observe(system, engine, state).energy - state.books.sum())
+            found.append(observe(system, engine, state).energy - state.energy_ledger.sum())
         spreads.append(np.std(found))
-        assert abs(state.volume / start.volume - 1) > 1e-3 and state.books[WORK] != 0
+        assert abs(state.volume / start.volume - 1) > 1e-3 and state.energy_ledger[WORK] != 0
     assert np.log2(spreads[0] / spreads[1]) == pytest.approx(order, abs=0.35)
 
 
@@ -265,7 +265,7 @@ def test_a_piston_can_be_run_backwards(compressed):
     state = engine.begin(start, row)
     move(engine, state, row, 0.002, 40)
     assert abs(state.volume / start.volume - 1) > 1e-3
-    for array in (state.velocity, state.angular_momentum_body, state.bath):
+    for array in (state.velocity, state.angular_momentum_body, state.extra_variables):
         array *= -1
     engine.forget()
     move(engine, state, row, 0.002, 40)
@@ -353,6 +353,6 @@ def test_a_compressibility_in_another_unit_is_said():
 def test_pressures_become_components():
     stage = NPT | {"pressure_coupling": "flexible", "pressure_bar": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
     system = build(small_scene({"argon": 20}, 30.0, stages=[stage]))
-    box = integrator_of_stage(system, 0).box
+    box = integrator_of_stage(system, 0).barostat
     assert box.pressure.first == pytest.approx(np.arange(1, 7) * BAR)
     assert integrator_of_stage(system, 0).flows[-1].every == 25

@@ -21,9 +21,20 @@ from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher, cpu_target
 from support import ROOT
 
-from rigidmd.compile import Bound, Code, Laid, call, call_blocks, kernel, numba_private, opened, packed, task
+from rigidmd.compile import (
+    BoundTask,
+    Code,
+    NumbaStruct,
+    call,
+    call_blocks,
+    kernel,
+    load_arguments,
+    numba_private,
+    pack_arguments,
+    task,
+)
 from rigidmd.compile.cache import cache_folder
-from rigidmd.compile.numba_private import Index, Inner, Kernel, LinkedCode, callback
+from rigidmd.compile.numba_private import CacheIndex, InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 
 # --- what Numba does not promise -------------------------------------------------------------------------------------
 
@@ -70,8 +81,8 @@ def test_a_cache_takes_its_folder_from_the_configuration_when_it_is_made():
 
 def test_the_index_of_a_cache_may_be_of_our_class():
     assert doubled(2.0) == 4.0
-    assert issubclass(Index, IndexDataCacheFile)
-    assert type(doubled._cache._cache_file) is Index
+    assert issubclass(CacheIndex, IndexDataCacheFile)
+    assert type(doubled._cache._cache_file) is CacheIndex
     names = os.listdir(doubled._cache.cache_path)
     assert any(re.fullmatch(r"test_compile\.doubled-\d+\.py\d+\.\d+\.nbc\.[0-9a-f]{16}", name) for name in names)
 
@@ -81,7 +92,7 @@ def test_a_dispatcher_opens_its_cache_only_to_compile():
     def unused(x):
         return x
 
-    assert isinstance(unused, CPUDispatcher) and type(unused) is Kernel
+    assert isinstance(unused, CPUDispatcher) and type(unused) is KernelDispatcher
     assert "_opened" not in vars(unused)
 
 
@@ -106,7 +117,7 @@ def test_an_inner_kernel_has_no_wrapper_and_says_so():
     def outer(x):
         return x + x
 
-    assert type(inner) is Inner
+    assert type(inner) is InnerKernel
     with pytest.raises(TypeError, match=r"inner is for compiled code only; for Python, use kernel\(outer=True\)"):
         inner(2.0)
     inner.compile((types.float64,))
@@ -141,7 +152,7 @@ def test_an_inner_kernel_has_no_machine_code_and_is_optimised_in_its_caller():
     assert outer(2.0) == 5.0
     (linked,) = inner.overloads.values()
     (whole,) = outer.overloads.values()
-    assert type(linked.library) is LinkedCode and type(whole.library) is JITCodeLibrary
+    assert type(linked.library) is LinkedLibrary and type(whole.library) is JITCodeLibrary
     assert linked.library.get_pointer_to_function(linked.fndesc.llvm_func_name) == 0
     assert whole.library.get_pointer_to_function(whole.fndesc.llvm_cpython_wrapper_name) != 0
     assert "alloca" not in linked.library.get_llvm_str()  # made smaller before it is linked
@@ -162,8 +173,8 @@ def test_an_inner_kernel_is_kept_and_linked_into_other_kernels_later(tmp_path):
 
 
 def test_a_callback_is_compiled_for_given_types_and_cached():
-    code = callback(lambda x, k: None, (types.float64, types.intp), {})
-    assert code.address and type(code._cache._cache_file) is Index
+    code = compile_callback(lambda x, k: None, (types.float64, types.intp), {})
+    assert code.address and type(code._cache._cache_file) is CacheIndex
 
 
 # --- values in memory ------------------------------------------------------------------------------------------------
@@ -187,7 +198,7 @@ class Mixed(NamedTuple):
 
 @task()
 def _tell(parcel, block):
-    mixed, found = opened(parcel)
+    mixed, found = load_arguments(parcel)
     found[0], found[1], found[2] = mixed.small, mixed.flags[0], mixed.flags[1]
     found[3], found[4], found[5] = mixed.plane[1, 2], mixed.single, mixed.flag
     found[6], found[7] = mixed.inner[0], mixed.inner[1][0][1]
@@ -201,16 +212,16 @@ def test_values_are_laid_down_as_compiled_code_has_them():
     inner = (np.uint16(65000), (np.array([7, 8, 9], np.int32),))
     turned, code = np.arange(6, dtype=np.float32).reshape(2, 3).T, Code(add=(_add, (np.zeros(3), 0.0)))
     mixed = Mixed(np.int8(-3), (True, False), plane, None, np.float32(0.5), True, inner, 2.5, -(2**40), turned, code)
-    Bound(_tell, (mixed, found))()
+    BoundTask(_tell, (mixed, found))()
     assert found.tolist() == [-3, 1, 0, 5, 0.5, 1, 65000, 8, 2.5, -(2**40), 5, 5]
     assert plane[0, 0] == -1.0
-    context, laid = cpu_target.target_context, Laid(mixed)
+    context, laid = cpu_target.target_context, NumbaStruct(mixed)
     assert ctypes.sizeof(laid._memory) == context.get_abi_sizeof(context.get_value_type(laid.kind))
 
 
 def test_what_cannot_be_laid_down_or_has_another_type_is_named():
     with pytest.raises(TypeError, match="unicode_type cannot be laid down"):
-        Laid((1.0, "text"))
+        NumbaStruct((1.0, "text"))
     code = Code(add=(_add, (np.zeros(3), 0.0)))
     assert code.lay_down((np.zeros(2), 1.0)).kind == numba.typeof((np.zeros(3), 0.0))
     with pytest.raises(TypingError, match=r"add was compiled for .*float64, 1d.*, not for .*float32, 1d"):
@@ -229,19 +240,19 @@ class Content(NamedTuple):
 
 @task(counted=False)
 def _add(parcel, block):
-    values, x = opened(parcel)
+    values, x = load_arguments(parcel)
     values[block] += x
 
 
 @kernel(outer=True)
 def add_once_and_in_blocks(content, blocks):
-    call(content.code, "add", packed((content.values, 1.0)))
-    call_blocks(content.code, "add", packed((content.values, 2.0)), blocks)
+    call(content.code, "add", pack_arguments((content.values, 1.0)))
+    call_blocks(content.code, "add", pack_arguments((content.values, 2.0)), blocks)
 
 
 @kernel(outer=True)
 def call_what_is_not_there(content):
-    call(content.code, "subtract", packed((content.values, 1.0)))
+    call(content.code, "subtract", pack_arguments((content.values, 1.0)))
 
 
 def content_of(values):
@@ -392,8 +403,8 @@ def test_a_folder_in_which_nothing_is_kept_is_named(tmp_path, monkeypatch):
         monkeypatch.setenv("RIGIDMD_CACHE", str(tmp_path / named))
         cache.cache_folder.cache_clear()
         cache.shared_folder.cache_clear()
-        assert expected in cache.kept_in_words()
-    assert f"not kept, as {tmp_path / 'file/x'} cannot be written" in cache.kept_in_words()
+        assert expected in cache.describe_cache()
+    assert f"not kept, as {tmp_path / 'file/x'} cannot be written" in cache.describe_cache()
     monkeypatch.undo()
     cache.cache_folder.cache_clear()
     cache.shared_folder.cache_clear()

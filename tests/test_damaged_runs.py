@@ -253,4 +253,4 @@ def test_a_pipe_hangs_no_command(command, name, argon, tmp_path, capsys):
     code = cli.main([command, str(folder), *([str(argon)] if command == "compare" else [])])
     said = capsys.readouterr()
     assert code == (1 if command == "compare" else 2)
-    assert f"{folder / name} cannot be read: it is no file but a pipe" in said.out + said.err
+    assert f"{folder / name} cannot be read: it is a pipe" in said.out + said.err

@@ -3,7 +3,7 @@
 A comment before a block tells this file how to treat it:
 
     <!-- test: file NAME -->       the block is the file NAME, which later commands use
-    <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `precision` and `sweep` of the block, and those
+    <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `accuracy` and `sweep` of the block, and those
                                    of --set to each `Scene.read` of a Python block: shorter runs
     <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
 
@@ -109,7 +109,7 @@ class Reader:
     def command(self, words: list[str], options: list[str], runs: bool) -> None:
         match words:
             case ["rigidmd", *arguments]:
-                if arguments[0] in ("run", "precision", "sweep"):
+                if arguments[0] in ("run", "accuracy", "sweep"):
                     arguments += options
                 to = Path(arguments[arguments.index(">") + 1]) if ">" in arguments else None
                 parse(arguments := arguments[: arguments.index(">")] if to else arguments)

@@ -10,8 +10,8 @@ from support import (
     brief_rows,
     correlation_time,
     error_of_mean,
+    format_signed,
     inefficiency,
-    signed,
     slope,
     small_scene,
 )
@@ -110,8 +110,8 @@ def test_few_independent_values_have_the_error_of_student():
 
 
 def test_values_without_an_error_are_printed_as_such():
-    assert signed(1.5, None) == "+1.5 (too short for an error)" == signed(1.5, float("nan"))
-    assert signed(1.5, 0.25) == "+1.50 ± 0.25"
+    assert format_signed(1.5, None) == "+1.5 (too short for an error)" == format_signed(1.5, float("nan"))
+    assert format_signed(1.5, 0.25) == "+1.50 ± 0.25"
     quantities = [Quantity("U", "kJ/mol", 2.5), Quantity("T_trans", "K", 300.0, 300.0)]
     run = AverageRun("baoab", "langevin", 2.0, 500.0, averages={"T_trans": (300.5, 1.0)}, short=["U", "density"])
     found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, quantities, [run])

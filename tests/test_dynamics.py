@@ -4,20 +4,21 @@ import numba
 import numpy as np
 import pytest
 from support import (
-    BATH,
     HEAT,
     MOST_THREADS,
     SCHEMES,
+    THERMOSTAT,
     Engine,
     State,
     VelocityRescaling,
     blocks_of,
     build,
     built,
+    constant_ramp,
     draw_momenta,
-    extent_of,
     groups,
     key_of,
+    largest_values,
     move,
     no_load,
     observe,
@@ -26,8 +27,7 @@ from support import (
     slope,
     small_scene,
     state_of,
-    steady,
-    sums_over,
+    sums_of_state,
 )
 
 from rigidmd.errors import SceneError
@@ -155,7 +155,7 @@ def test_sums_are_those_of_numpy(molecules):
     rng = np.random.default_rng(1)
     for array in load:
         array[:] = rng.normal(size=array.shape)
-    found, mass = sums_over(model, state, load), model.mass[model.species][:, None]
+    found, mass = sums_of_state(model, state, load), model.mass[model.species][:, None]
     inverse = model.inverse_inertia[model.species][: len(state.rotation)]
     assert found.momentum == pytest.approx((mass * state.velocity).sum(axis=0), rel=1e-12, abs=1e-9)
     assert found.flow == pytest.approx((mass * state.velocity).T @ state.velocity, rel=1e-12, abs=1e-9)
@@ -165,11 +165,11 @@ def test_sums_are_those_of_numpy(molecules):
     assert found.torque == pytest.approx((inverse * load.torque_body**2).sum(), rel=1e-12)
     if len(state.rotation):
         state.rotation[1] += 1e-6
-    assert sums_over(model, state).orthogonality_error == pytest.approx(orthogonality_error(state.rotation), abs=1e-15)
-    assert sums_over(model, state)[2:4] == (0, 0)
+    assert sums_of_state(model, state).orthogonality_error == pytest.approx(orthogonality_error(state.rotation), abs=1e-15)
+    assert sums_of_state(model, state)[2:4] == (0, 0)
     if len(state.rotation):
         state.rotation[0, 1, 1] = np.nan
-        assert np.isnan(sums_over(model, state).orthogonality_error)
+        assert np.isnan(sums_of_state(model, state).orthogonality_error)
 
 
 @pytest.mark.parametrize("molecules", [{"spce": 5, "argon": 4}, {"argon": 6}])
@@ -178,13 +178,13 @@ def test_an_extent_has_the_largest_of_every_array(molecules):
     load = no_load(state)
     load.force[:] = np.random.default_rng(2).normal(size=load.force.shape)
     arrays = [*state[:4], *load]
-    assert extent_of(state, load) == tuple(np.abs(array).max(initial=0.0) for array in arrays)
+    assert largest_values(state, load) == tuple(np.abs(array).max(initial=0.0) for array in arrays)
     for k, array in enumerate(arrays):
         if len(array):
             for worst in (-1e300, np.inf, -np.inf, np.nan, -np.nan):  # each is larger than the one before
                 array.flat[7] = worst
-                np.testing.assert_equal(extent_of(state, load)[k], abs(worst))
-    assert extent_of(state)[4:] == (0.0, 0.0)
+                np.testing.assert_equal(largest_values(state, load)[k], abs(worst))
+    assert largest_values(state)[4:] == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("molecules", [{"spce": 40}, {"argon": 40}])
@@ -194,9 +194,9 @@ def test_what_is_measured_at_the_end_of_a_move_is_that_of_the_state(molecules):
     state = engine.begin(state, verlet)
 
     def same(known=True):
-        assert engine.extent(state) == (extent_of(state, engine.load) if known else None)
-        load, _ = engine.look(state)
-        for found, expected in zip(engine.sums(state, load), sums_over(system.model, state, load), strict=True):
+        assert engine.extent(state) == (largest_values(state, engine.load) if known else None)
+        load, _ = engine.evaluate_current(state)
+        for found, expected in zip(engine.sums(state, load), sums_of_state(system.model, state, load), strict=True):
             np.testing.assert_array_equal(found, expected)
 
     assert engine.extent(state) is None
@@ -336,14 +336,14 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
     # free flight, so the kinetic energy has nothing but the thermostat: mean and variance of a Gamma distribution
     system = build(small_scene({"nitrogen": 6}, 40.0))  # linear: its free rotation is exact
     freedom, thermal = system.freedom.total, 300 * BOLTZMANN
-    row = VERLET.with_bath(VelocityRescaling(steady(thermal), 0.01, freedom, key_of(1, BATH)))
+    row = VERLET.with_thermostat(VelocityRescaling(constant_ramp(thermal), 0.01, freedom, key_of(1, THERMOSTAT)))
     state = system.state.copy()
     engine = Engine(system.model, {})
     samples, heat = [], []
     for _ in range(6000):
         move(engine, state, row, 0.01, 4)
         samples.append(sum(kinetic_energies(system.model, state, 0, 6)))
-        heat.append(samples[-1] - state.books[HEAT])
+        heat.append(samples[-1] - state.energy_ledger[HEAT])
     samples = np.array(samples) / thermal
     assert samples.mean() == pytest.approx(freedom / 2, rel=0.01)
     assert samples.var() == pytest.approx(freedom / 2, rel=0.08)
@@ -353,15 +353,15 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
 def test_a_thermostat_that_rests_changes_no_bit():
     """A stage at constant energy after one with a thermostat: the same machine code, and yet constant energy."""
     system = build(small_scene({"spce": 8}, 20.0))
-    resting = VelocityRescaling(steady(0.0), np.inf, system.freedom.total, key_of(1, BATH))
+    resting = VelocityRescaling(constant_ramp(0.0), np.inf, system.freedom.total, key_of(1, THERMOSTAT))
     found = []
-    for row in (VERLET, VERLET.with_bath(resting)):
+    for row in (VERLET, VERLET.with_thermostat(resting)):
         state = system.state.copy()
         move(system.engine(), state, row, 1e-3, 20)
         found.append(state)
     for free, rested in zip(*found, strict=True):
         assert np.array_equal(free, rested)
-    assert found[1].books[HEAT] == 0
+    assert found[1].energy_ledger[HEAT] == 0
 
 
 @pytest.mark.parametrize("count", [513, 70_001])  # in 16 blocks, and in more

@@ -10,7 +10,7 @@ from math import pi
 
 import numpy as np
 import pytest
-from support import build, lammps_files, force_field_of, small_scene, write_gromacs, write_openmm
+from support import build, force_field_of, lammps_files, small_scene, write_gromacs, write_openmm
 
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
@@ -114,7 +114,7 @@ ATM = 1 / 1.01325
 
 def commands(stage, **sections):
     """Fixes of a stage: name -> words behind its style."""
-    lines = lammps_files.movers(drawn(stage, **sections), 0)
+    lines = lammps_files.fixes(drawn(stage, **sections), 0)
     return {line.split()[1]: line.split()[3:] for line in lines}
 
 
@@ -154,7 +154,7 @@ def test_lammps_has_pressures_in_atm_less_that_of_the_tail(counts, ensemble, tai
     stage = NPT | CHAINS if ensemble == "npt" else {"ensemble": "nph", "duration_ps": 0.4}
     stage = stage | {"pressure_bar": [100.0, 300.0], "barostat_time_ps": 1.7}
     own = drawn(stage, counts=counts, tail=tail)
-    (line,) = lammps_files.movers(own, 0)
+    (line,) = lammps_files.fixes(own, 0)
     words = line.split()[3:]
     beyond = own.system.tail.pressure(13.0**3) / 6.02214076e-3 if tail else 0.0  # bar
     assert (beyond < -1) == tail

@@ -18,27 +18,27 @@ from support import (
     Engine,
     TabledScreening,
     Triclinic,
-    accuracy,
+    coulomb_errors,
     build,
     built,
     cell_of,
     describe,
     estimated_error,
+    ewald_error_notes,
+    ewald_sum_in_numpy,
     force_table,
     from_vector,
+    k_vectors_up_to,
     kernel,
     lanes,
     observe,
-    outgrown_sums,
     screened,
     screening,
     screening_of_lanes,
     shaken,
     slope,
     small_scene,
-    sum_of,
     summary_text,
-    waves,
 )
 
 from rigidmd.commands.cli import main
@@ -296,7 +296,7 @@ def test_nist_spce_in_a_triclinic_cell(reference, tmp_path):
     system = build(
         nist_scene(file, cell, tmp_path, ewald_alpha_per_A=0.285, ewald_k_max=7, ewald_k_radius_per_A=radius)
     )
-    assert system.terms["coulomb_reciprocal"].waves.total == 2 * 755
+    assert system.terms["coulomb_reciprocal"].k_vectors.total == 2 * 755
     seen = observe(system, system.engine(), system.state)
     found = in_kelvin(seen.components)
     for name, printed in NIST_NAMES.items():
@@ -613,7 +613,7 @@ def test_waves_without_compiled_code():
     system, engine, state = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
     engine.evaluate(state)
     term, own = system.terms["coulomb_reciprocal"], engine.workspaces["coulomb_reciprocal"].sums
-    energy, force, virial = sum_of(term.charge, own.position, cell_of(system.space), term.alpha, term.waves)
+    energy, force, virial = ewald_sum_in_numpy(term.charge, own.position, cell_of(system.space), term.alpha, term.k_vectors)
     assert energy == pytest.approx(own.tallies[:, 0].sum(), rel=1e-11)
     assert force == pytest.approx(own.force, abs=1e-11 * np.abs(force).max())
     assert virial.ravel() == pytest.approx(own.tallies[:, 1:].sum(axis=0), rel=1e-9, abs=1e-9 * abs(energy))
@@ -632,7 +632,7 @@ def test_waves_of_a_slanted_cell():
         own = engine.workspaces["waves"]
         position = (own.sums if method is TIGHT_EWALD else own.mesh).position
         found[method["electrostatics"]] = (tallies["waves"].energy, own.site_force.copy(), tallies["waves"].virial)
-        energy, force, _ = sum_of(term.charge, position, cell_of(slanted), 0.9, waves((20, 20, 20)))
+        energy, force, _ = ewald_sum_in_numpy(term.charge, position, cell_of(slanted), 0.9, k_vectors_up_to((20, 20, 20)))
         error = 1e-11 if method is TIGHT_EWALD else 3e-6
         assert tallies["waves"].energy == pytest.approx(energy, rel=error)
         assert own.site_force == pytest.approx(force, abs=10 * error * np.abs(force).max())
@@ -744,12 +744,12 @@ def test_forces_are_as_accurate_as_asked_for(method, asked):
     """Measured against a tight Ewald sum: within a factor 2 of the request, either way; and as estimated."""
     forces = {"cutoff_A": 7.7, "electrostatics": method, "ewald_accuracy": asked}
     system, _, state = built({"spce": 125}, 15.52, 7, forces=forces)
-    found = accuracy(system, state)
+    found = coulomb_errors(system, state)
     assert 0.5 * asked < found.measured / COULOMB < 2 * asked
     assert 0.7 * asked < system.force_error / COULOMB < 1.03 * asked  # of both parts of the sum together
     assert found.estimated == pytest.approx(found.measured, rel=0.6)
     grown = state._replace(cell=1.1 * state.cell, position=1.1 * state.position)
-    assert estimated_error(system, grown.cell) == pytest.approx(accuracy(system, grown).measured, rel=0.6)
+    assert estimated_error(system, grown.cell) == pytest.approx(coulomb_errors(system, grown).measured, rel=0.6)
 
 
 @pytest.mark.parametrize("method", ["ewald", "pme"])
@@ -759,7 +759,7 @@ def test_a_box_that_has_outgrown_its_waves_is_noted(method):
     system = build(small_scene({"spce": 125}, 15.52, forces=forces, stages=stages))
     assert estimated_error(system, system.state.cell) == pytest.approx(system.force_error, rel=1e-12)
     for factor, told in ((1.0, 0), (1.01, 0), (1.2, 1)):
-        assert len(outgrown_sums(system, system.state._replace(cell=factor * system.state.cell))) == told
+        assert len(ewald_error_notes(system, system.state._replace(cell=factor * system.state.cell))) == told
 
 
 @pytest.mark.parametrize("order", [7, *(pytest.param(order, marks=pytest.mark.soak) for order in (3, 4, 5, 6, 8))])
@@ -772,7 +772,7 @@ def test_every_order_of_splines_keeps_to_its_estimate(order):
         "pme_grid": [20, 18, 21],
     }
     system, _, state = built({"spce": 125}, 15.52, 7, forces=forces)
-    found = accuracy(system, state)
+    found = coulomb_errors(system, state)
     assert found.estimated == pytest.approx(found.measured, rel=0.5)
 
 
@@ -782,7 +782,7 @@ def test_single_precision_is_good_enough_for_1e_5():
     errors = []
     for precision in ("double", "mixed"):
         system, _, state = built({"spce": 125}, 15.52, 7, forces=forces, precision=precision)
-        errors.append(accuracy(system, state).measured)
+        errors.append(coulomb_errors(system, state).measured)
     assert errors[1] == pytest.approx(errors[0], rel=0.1)
 
 
@@ -820,7 +820,7 @@ def test_what_energy_says_of_its_figures():
         simulation = Simulation(scene)
         found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")
         said, system = found["meaning"], simulation.system
-        law = system.terms["coulomb_real"].law
+        law = system.terms["coulomb_real"].potential
         assert ("(sum of q)² of each molecule" in said["coulomb_self"]) == (net > 0)
         own = -law.alpha / np.sqrt(np.pi) * (system.of_sites(lambda m: m.charges) ** 2).sum()
         own -= 0.5 * erfc(law.alpha * 6.0) / 6.0 * net

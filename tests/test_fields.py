@@ -216,7 +216,7 @@ def conserved_along(kind, scheme, dt):
     found, kinetic = [], []
     for _ in range(round(span / dt) + 1):
         seen = observe(system, engine, state)
-        found.append(seen.energy - state.books.sum())
+        found.append(seen.energy - state.energy_ledger.sum())
         kinetic.append(seen.kinetic)
         move(engine, state, scheme, dt, 1)
     return np.array(found), np.ptp(kinetic)
@@ -241,7 +241,7 @@ def test_a_field_that_oscillates_does_work_that_is_booked():
     before = observe(system, engine, state).energy
     move(engine, state, VERLET, dt, round(span / dt))
     change = observe(system, engine, state).energy - before
-    assert abs(change) > 100 * abs(change - state.books.sum())
+    assert abs(change) > 100 * abs(change - state.energy_ledger.sum())
     f, field = 2.0, 0.7  # 1/ps, V/nm
     fields = {"electric_V_per_nm": [field, 0.0, 0.0], "electric_frequency_per_ps": f}
     system, engine, state = alone({"bead": 1}, fields)
@@ -323,11 +323,11 @@ def test_conserved_components_of_momentum_are_known_and_not_counted(counts, fiel
     momentum = mass @ state.velocity
     taken = remove_momentum(system.model, other.velocity)
     engine.forget()
-    move(engine, state, VERLET.with_rest(1), 0.0, 1)
+    move(engine, state, VERLET.with_momentum_removal(1), 0.0, 1)
     for velocity in (state.velocity, other.velocity):
         assert mass @ velocity == pytest.approx(np.where(keeps, 0.0, momentum), abs=1e-12 * size)
     assert taken == pytest.approx((momentum[keeps] ** 2).sum() / (2 * mass.sum()), abs=1e-12 * size)
-    assert state.books[REMOVED] == pytest.approx(-taken, rel=1e-10)
+    assert state.energy_ledger[REMOVED] == pytest.approx(-taken, rel=1e-10)
 
 
 def test_the_errors_of_precision_are_those_of_what_is_conserved():
@@ -397,8 +397,8 @@ def test_restraints_hold_the_molecules_that_are_named():
     system = build(small_scene({}, 30.0, molecules=molecules, fields={"restraints": restraints}))
     found = [system.terms[f"restraints_{k}"] for k in range(3)]
     assert [term.molecule.tolist() for term in found] == [[5, 6, 7], [1, 3], [0, 1, 2, 3]]
-    assert (found[0].place == [1.0, 2.0, 3.0]).all()
-    assert (found[1].place == system.state.position[[1, 3]]).all()
+    assert (found[0].reference == [1.0, 2.0, 3.0]).all()
+    assert (found[1].reference == system.state.position[[1, 3]]).all()
     assert found[1].stiffness.tolist() == [0, 0, 300]
 
 
@@ -463,9 +463,9 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
          "kind = 'lj93' needs sigma_A and epsilon_kJ_mol"),
         ({"walls": [LJ | {"axis": "c"}]}, {}, "fields.walls.0.axis: is 'c', must be 'x', 'y' or 'z'"),
         ({"walls": [LJ | {"positions_A": [5.0, 5.0]}]}, {}, "positions_A = [5, 5]: the first must be below the second"),
-        ({"walls": [LJ | {"positions_A": [-inf, inf]}]}, NO_BOX, "positions_A = [-inf, inf] is no wall at all"),
-        ({"walls": [LJ | {"positions_A": [0.0, inf]}]}, {}, "in a periodic box both walls are needed"),
-        ({"walls": [LJ, SOFT | {"positions_A": [21.0, 30.0]}]}, NO_BOX, "those across z leave no place between them"),
+        ({"walls": [LJ | {"positions_A": [-inf, inf]}]}, NO_BOX, "positions_A = [-inf, inf] defines no wall"),
+        ({"walls": [LJ | {"positions_A": [0.0, inf]}]}, {}, "a periodic box needs both walls"),
+        ({"walls": [LJ, SOFT | {"positions_A": [21.0, 30.0]}]}, NO_BOX, "the walls across z leave no space between them"),
         ({"walls": [LJ | {"positions_A": [0.0, 22.0]}]}, {},
          "along z the box is 30 Å, and must be 33 Å at least: 22 Å between the walls, 2 Å by which sites may stand out, "
          "and the cut-off of 9 Å"),

@@ -17,12 +17,12 @@ from support import (
     ROOT,
     SCHEMES,
     Curve,
+    IntegratorAccuracy,
     Picture,
-    Precision,
     Sample,
     Samples,
     Trial,
-    body_subject,
+    body_trial_system,
     build,
     columns_figure,
     draw_molecule,
@@ -30,7 +30,7 @@ from support import (
     energy_figure,
     load_model,
     panels,
-    precision_report,
+    accuracy_report,
     record_of,
     save_figure,
     shown_range,
@@ -191,14 +191,14 @@ def test_what_range_is_shown(values, stage, wanted):
 
 
 def test_as_many_integrators_as_there_are_are_told_apart():
-    subject, _ = body_subject(Scene.read(ROOT / "systems" / "heavy_top_3.toml"), 0.1)
+    trial_system, _ = body_trial_system(Scene.read(ROOT / "systems" / "heavy_top_3.toml"), 0.1)
     names = [*SCHEMES, *COMPARATORS]
     trials = [
         Trial(name, 1e-3 * k, 10, 10, [1e-3 / k], *[k**4 * 10.0**-n] * 3)
         for n, name in enumerate(names)
         for k in (1, 2, 3)
     ]
-    figure = precision_report.figure_of(Precision(subject, trials, 10, 1e-30))
+    figure = accuracy_report.figure_of(IntegratorAccuracy(trial_system, trials, 10, 1e-30))
     for axis in figure.axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names
@@ -206,7 +206,7 @@ def test_as_many_integrators_as_there_are_are_told_apart():
         assert len(styles) == len(names)
     left, right = figure.axes
     for axis, error in ((left, "trajectory_error"), (right, "energy_rms")):
-        front = [f"{trial.timestep:.2g}" for trial in Precision(subject, trials, 10, 1e-30).front(error)]
+        front = [f"{trial.timestep:.2g}" for trial in IntegratorAccuracy(trial_system, trials, 10, 1e-30).front(error)]
         steps = [text.get_text() for text in axis.texts if text.get_text() != "error of the reference"]
         assert 0 < len(steps) <= len(front)  # of the best alone, and not one on another
         assert set(steps) <= set(front)

@@ -5,24 +5,24 @@ import pytest
 from numba.core.errors import TypingError
 from reference import Oracle
 from support import (
-    AHEAD,
     BUILDS,
     BUILT,
     ENTRIES,
-    MET,
-    MET_BY_ONE,
-    MOST_MET,
-    NAMES,
-    POLYNOMIALS,
+    LEAD_TIME,
+    MAX_NEIGHBORS,
+    NEIGHBORS,
+    NEIGHBORS_OF_ONE,
     SCHEMES,
+    SWITCH_FUNCTIONS,
+    TRUNCATIONS,
     USABLE,
     WINDOW,
-    Addend,
-    Correction,
     Engine,
-    Loading,
     NotFiniteError,
-    Plain,
+    SwitchCorrection,
+    SwitchTerm,
+    TermDispatcher,
+    Unmodified,
     build,
     built,
     cell_of,
@@ -34,7 +34,7 @@ from support import (
     move,
     no_load,
     observe,
-    place_ahead,
+    predict_site,
     radial,
     reaction_field,
     small_scene,
@@ -231,7 +231,7 @@ def test_virials_are_sums_over_pairs(box, precision, digits):
     move(engine, state, SCHEMES["velocity_verlet"], 0.0002, 20)
     virial = engine.evaluate(state)[1]["lennard_jones"].virial
     pairs = engine.workspaces["lennard_jones"].pairs
-    assert pairs.counters[BUILDS] == 1 and pairs.clusters.farthest.max() > 0.02
+    assert pairs.counters[BUILDS] == 1 and pairs.clusters.largest_displacement.max() > 0.02
     site, owner = system.site_positions(state), system.sites.molecule
     centre = state.position[owner]
     well, size = system.species[0].epsilon[0], system.species[0].sigma[0]
@@ -239,14 +239,14 @@ def test_virials_are_sums_over_pairs(box, precision, digits):
     images = np.array(list(np.ndindex(3, 3, 3))) - 1 if periodic else np.zeros((1, 3))
     expected = np.zeros((3, 3))
     for i in range(len(site)):
-        apart = site[i] - site[owner != owner[i]]
+        origin_vector = site[i] - site[owner != owner[i]]
         centres = centre[i] - centre[owner != owner[i]]
         if periodic:
-            edges = np.round(apart @ np.linalg.inv(state.cell))
-            apart, centres = apart - edges @ state.cell, centres - edges @ state.cell
+            edges = np.round(origin_vector @ np.linalg.inv(state.cell))
+            origin_vector, centres = origin_vector - edges @ state.cell, centres - edges @ state.cell
         for image in images:
             shift = image @ state.cell if periodic else 0.0
-            d, between = apart + shift, centres + shift
+            d, between = origin_vector + shift, centres + shift
             r = np.sqrt((d**2).sum(axis=1))
             near = r < 6.0
             force = _force(well, size, r[near]) - _force(well, size, 6.0)
@@ -279,10 +279,10 @@ def test_a_list_with_little_room_grows_and_misses_nothing(precision):
             entries=np.empty((blocks, 3), np.uint16),
             masked=np.empty((blocks, 1, 2), np.int32),
             met=np.empty((blocks, 2), np.int32),
-            apart=np.empty((blocks, 6 if precision == "mixed" else 0), own.pairs.apart.dtype),
+            origin_vector=np.empty((blocks, 6 if precision == "mixed" else 0), own.pairs.origin_vector.dtype),
         )
         pairs.counters[USABLE] = 0
-        cramped.append(own._replace(pairs=pairs, sums=own.sums._replace(others=own.sums.others[:, :8].copy())))
+        cramped.append(own._replace(pairs=pairs, sums=own.sums._replace(forces_behind=own.sums.forces_behind[:, :8].copy())))
     engine._workspaces = tuple(cramped)
     assert energies(engine, state) == expected
 
@@ -291,21 +291,21 @@ def test_sums_that_only_a_passing_moment_needs_are_in_common():
     _, engine, state = built({"spce": 200}, 18.5, 4, forces={"cutoff_A": 8.0})  # so many that there are blocks
     engine.evaluate(state)
     one, two = engine.workspaces.values()
-    assert one.sums.others.size != two.sums.others.size
-    assert np.shares_memory(one.sums.others, two.sums.others)
-    assert not np.shares_memory(one.sums.own, two.sums.own)
+    assert one.sums.forces_behind.size != two.sums.forces_behind.size
+    assert np.shares_memory(one.sums.forces_behind, two.sums.forces_behind)
+    assert not np.shares_memory(one.sums.forces, two.sums.forces)
 
 
 @pytest.mark.parametrize("edge", [31.1, None])
 def test_lists_begin_with_about_the_room_they_need(edge):
     _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)
-    begun = [own.pairs for own in engine.room(state)]
-    others = [own.sums.others.shape[1] for own in engine.room(state)]
+    begun = [own.pairs for own in engine.new_workspaces(state)]
+    others = [own.sums.forces_behind.shape[1] for own in engine.new_workspaces(state)]
     engine.evaluate(state)
     for pairs, other, own in zip(begun, others, engine.workspaces.values(), strict=True):
         lanes = 4 * len(own.pairs.clusters.order) // len(own.pairs.clusters.origin)
         needed = own.pairs.needed.max(axis=0)
-        for kind, array in ((ENTRIES, pairs.entries), (MET, pairs.met)):
+        for kind, array in ((ENTRIES, pairs.entries), (NEIGHBORS, pairs.met)):
             assert needed[kind] <= 1.1 * array.shape[1] and array.shape[1] < 1.6 * needed[kind] + 16
         if edge:
             window = 3 * lanes * needed[WINDOW]
@@ -317,9 +317,9 @@ def test_a_cutoff_within_which_are_too_many_sites_is_refused():
     _, engine, state = built({"argon": 10}, 18.0, 4, forces={"cutoff_A": 8.0})
     engine.evaluate(state)
     (own,) = engine.workspaces.values()
-    own.pairs.needed[0, MET_BY_ONE] = MOST_MET + 1
+    own.pairs.needed[0, NEIGHBORS_OF_ONE] = MAX_NEIGHBORS + 1
     with pytest.raises(SimulationError, match="sites are within the cut-off of 8 Å: take a shorter one"):
-        own.with_room(state.cell)
+        own.with_capacity(state.cell)
 
 
 @kernel(outer=True)
@@ -439,9 +439,9 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
     engine.evaluate(state)
     own = engine.workspaces["lennard_jones"]
     sites = own.sites._replace(first=own.sites.first.astype(np.int64))
-    loading = Loading((own,), False, np.ones(1, np.int64))
+    loading = TermDispatcher((own,), False, np.ones(1, np.int64))
     with pytest.raises(TypingError, match="find was compiled for parcel"):
-        Loading((own._replace(sites=sites),), False, np.ones(1, np.int64))
+        TermDispatcher((own._replace(sites=sites),), False, np.ones(1, np.int64))
     with pytest.raises(TypingError, match="tallied was compiled for parcel"):
         loading.bind((own._replace(sites=sites),), state, no_load(state))
 
@@ -503,8 +503,8 @@ def test_a_list_lasts_until_sites_have_moved_by_half_its_skin():
         {"argon": 8}, 40.0, forces={"cutoff_A": cutoff, "skin_A": skin, "truncation": "plain"}
     )
     group = 4.0 * np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1.0]])
-    apart = np.array([cutoff + skin + 0.01, 0.0, 0.0])
-    state.position[:] = 10.0 + np.vstack([group, group + apart])
+    origin_vector = np.array([cutoff + skin + 0.01, 0.0, 0.0])
+    state.position[:] = 10.0 + np.vstack([group, group + origin_vector])
     alone = sum(energies(engine, state).values())
     state.position[:4, 0] += 0.7 * skin
     state.position[4:, 0] -= 0.7 * skin
@@ -528,8 +528,8 @@ def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
             load, expected = engine.evaluate(state)[0], system.engine().evaluate(state)[0]
             assert load.force == pytest.approx(expected.force, abs=1e-10 * np.abs(expected.force).max())
     for own in engine.workspaces.values():
-        assert own.pairs.times[AHEAD] < 0  # built on the way back
-    assert all(own.pairs.times[AHEAD] == 0.0 for own in other.workspaces.values())
+        assert own.pairs.times[LEAD_TIME] < 0  # built on the way back
+    assert all(own.pairs.times[LEAD_TIME] == 0.0 for own in other.workspaces.values())
     builds = [sum(own.pairs.counters[BUILDS] for own in of.workspaces.values()) for of in (engine, other)]
     assert builds[0] < 0.95 * builds[1]
 
@@ -537,7 +537,7 @@ def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
 @kernel(outer=True)
 def places_ahead(sites, state, lead, places):
     for i in range(len(places)):
-        for k, x in enumerate(place_ahead(sites, state, sites.molecule[i], i, lead)):
+        for k, x in enumerate(predict_site(sites, state, sites.molecule[i], i, lead)):
             places[i, k] = x
 
 
@@ -578,10 +578,10 @@ def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
         state.velocity[17, 1] = state.angular_momentum_body[20, 2] = 1e5 if change == "fast" else np.nan
     load = engine.evaluate(state)[0]
     assert load.force == pytest.approx(expected.force, abs=1e-10 * np.abs(expected.force).max())
-    assert all((own.pairs.times[AHEAD] != 0.0) == (change == "lately") for own in engine.workspaces.values())
+    assert all((own.pairs.times[LEAD_TIME] != 0.0) == (change == "lately") for own in engine.workspaces.values())
     if change == "lately":
         rate = np.abs(state.angular_momentum_body * system.model.inverse_inertia[system.model.species]).max()
-        assert 0.3 < rate * own.pairs.times[AHEAD] < 1.0
+        assert 0.3 < rate * own.pairs.times[LEAD_TIME] < 1.0
 
 
 @pytest.mark.parametrize("precision", ["double", "mixed"])
@@ -632,9 +632,9 @@ def switched_laws(name, start):
 
 def forces_of_products(argon, charges, r):
     """force/r of energies that a switch multiplies, in NumPy."""
-    s, slope = np.array([POLYNOMIALS[type(argon.shape)](argon.shape, x) for x in r]).T
+    s, slope = np.array([SWITCH_FUNCTIONS[type(argon.shape)](argon.shape, x) for x in r]).T
     of_argon = 2e9 * r**-12 - 3e6 * r**-6, 24e9 * r**-14 - 18e6 * r**-8
-    of_charges = 1 / r + charges.field * r**2 + charges.end[0], r**-3 - 2 * charges.field
+    of_charges = 1 / r + charges.field * r**2 + charges.terms[0], r**-3 - 2 * charges.field
     return np.stack([s * w - slope * u / r for u, w in (of_argon, of_charges)], axis=1)
 
 
@@ -647,7 +647,7 @@ def test_a_switched_force_is_that_of_the_product(name, start):
     expected = forces_of_products(one, charges, r)
     for law in (one, two):
         found = np.empty((len(r), 2))
-        pair_forces_at(law.room(1, np.float64), charges.room(1, np.float64), r**2, found)
+        pair_forces_at(law.for_slots(1, np.float64), charges.for_slots(1, np.float64), r**2, found)
         limit = 1e-13 if name == "switch" else 2e-12  # terms of the smooth one are up to 1e4 times their sum
         assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < limit
 
@@ -657,11 +657,11 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
     """The polynomial in r² that mixed precision adds to the force: here in double precision, and how far its terms
     cancel, which single precision would show."""
     one, _, charges = switched_laws("switch", start)
-    laws = one.room(1, np.float32), charges.room(1, np.float32)
+    laws = one.for_slots(1, np.float32), charges.for_slots(1, np.float32)
     corrections = laws[0].correction, laws[1].switched
-    assert all(isinstance(correction, Correction) for correction in corrections)
-    shape = Plain(9.0)
-    plain = (one._replace(shape=shape).room(1, np.float32), charges._replace(shape=shape).room(1, np.float32))
+    assert all(isinstance(correction, SwitchCorrection) for correction in corrections)
+    shape = Unmodified(9.0)
+    plain = (one._replace(truncation=shape).for_slots(1, np.float32), charges._replace(truncation=shape).for_slots(1, np.float32))
     r = np.linspace(start - 1, 9.0, 2001)
     found, without = np.empty((2, len(r), 2))
     pair_forces_at(*laws, r**2, found)
@@ -675,13 +675,13 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
         assert found[before, k] == pytest.approx(expected[before, k], rel=1e-14)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TRUNCATIONS)
 def test_what_a_law_does_for_its_ending_is_decided_by_the_ending(name):
     """A wide switch has an addend in mixed precision too; a smooth one multiplies the energy there; what is no switch
     has nothing to add."""
     for start, dtype in ((0.0, np.float32), (8.0, np.float64)):
         one, two, charges = switched_laws(name, start)
-        one, two, charges = one.room(1, dtype), two.room(1, dtype), charges.room(1, dtype)
-        kind = Addend if name == "switch" or (name == "smooth_switch" and dtype == np.float64) else tuple
+        one, two, charges = one.for_slots(1, dtype), two.for_slots(1, dtype), charges.for_slots(1, dtype)
+        kind = SwitchTerm if name == "switch" or (name == "smooth_switch" and dtype == np.float64) else tuple
         assert one.correction == ()
         assert {type(x) for x in (one.addend12, one.addend6, two.addend12, two.addend6, charges.switched)} == {kind}

@@ -24,7 +24,7 @@ from scenes import FROM_FILE, SATELLITE, STRUCTURES
 from support import Checkpoint, Saved, read_checkpoint, state_of, write_checkpoint, write_state
 
 from rigidmd.commands.cli import main
-from rigidmd.errors import UNSEEN, CheckpointError
+from rigidmd.errors import UNPRINTABLE, CheckpointError
 
 SECONDS, BYTES = 5.0, 2e9  # of computing, that an input may take
 FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the soak tier
@@ -311,7 +311,7 @@ class Trial:
         self.note(time.process_time() - begin, code == 2, arguments)
         said = out.getvalue() + err.getvalue()
         assert code in (0, 2), said
-        assert not UNSEEN.search(said), said
+        assert not UNPRINTABLE.search(said), said
         if code == 2:
             assert err.getvalue().startswith("rigidmd: "), said
             assert len(err.getvalue().splitlines()[0].split(": ")) >= 3 or "errors" in said, said

@@ -15,12 +15,13 @@ from support import (
     HEAT,
     NOW,
     ROOT,
-    Bodies,
     LammpsEngine,
+    RigidBodies,
     available_models,
     build,
     built,
     compare_at,
+    describe_comparison,
     energy_figure,
     lammps,
     lammps_files,
@@ -28,7 +29,6 @@ from support import (
     small_scene,
     verify,
 )
-from support import comparison_in_words as in_words
 from support import mean_and_error as mean
 
 from rigidmd.commands import cli
@@ -51,9 +51,9 @@ def both(counts, sections, seed=1, edge=15.0, **more):
 @pytest.mark.parametrize("name", SCENES)
 def test_both_engines_compute_the_same(name):
     _, _, engine, lines = both(*SCENES[name])
-    assert all(line.agrees for line in lines), in_words(lines, "LAMMPS")
+    assert all(line.agrees for line in lines), describe_comparison(lines, "LAMMPS")
     plain = [line for line in lines if line.name == "lennard jones"]
-    assert all(line.apart <= 1e-8 * abs(line.here) for line in plain)
+    assert all(line.difference <= 1e-8 * abs(line.here) for line in plain)
     engine.close()
 
 
@@ -63,7 +63,7 @@ def test_every_ending_is_the_same(truncation):
     forces = {"cutoff_A": 6.0, "truncation": truncation}
     _, _, engine, lines = both({"nitrogen": 20, "argon": 4}, {"forces": forces}, edge=13.0)
     for line in lines:
-        assert line.apart <= 2e-7 * abs(line.here), in_words(lines, "LAMMPS")
+        assert line.difference <= 2e-7 * abs(line.here), describe_comparison(lines, "LAMMPS")
     engine.close()
 
 
@@ -71,7 +71,7 @@ def test_charges_within_a_cutoff_and_without_a_box():
     forces = {"cutoff_A": 6.0, "electrostatics": "damped_shifted_force"}
     for edge, own in ((13.0, forces), (None, {})):
         _, _, engine, lines = both({"spce": 6}, {"forces": own}, edge=edge)
-        assert all(line.agrees for line in lines), in_words(lines, "LAMMPS")
+        assert all(line.agrees for line in lines), describe_comparison(lines, "LAMMPS")
         engine.close()
 
 
@@ -87,7 +87,7 @@ def test_an_error_of_the_forces_is_found(monkeypatch):
 def test_all_models_in_one_box():
     counts = dict.fromkeys(available_models(), 1)
     _, _, engine, lines = both(counts, {"forces": PME | {"cutoff_A": 9.0}}, edge=32.0)
-    assert all(line.agrees for line in lines), in_words(lines, "LAMMPS")
+    assert all(line.agrees for line in lines), describe_comparison(lines, "LAMMPS")
     engine.close()
 
 
@@ -102,7 +102,7 @@ def test_a_short_run_is_the_same(ranks):
                         engine={"name": "lammps", "ranks": ranks})  # fmt: skip
     found = verify(scene)
     assert found.agrees, found.in_words()
-    assert found.run[0].apart < 1e-6 and found.run[0].here > 0.1
+    assert found.run[0].difference < 1e-6 and found.run[0].here > 0.1
     assert "they agree" in found.in_words()
     assert json.loads(json.dumps(found.told()))["agrees"] is True
 
@@ -115,7 +115,7 @@ def test_states_come_back_as_they_went():
     there = state.copy()
     turning = system.model.inertia[system.model.species] > 0
     there.angular_momentum_body[:] = np.random.default_rng(1).standard_normal(turning.shape) * turning
-    bodies = Bodies(system)
+    bodies = RigidBodies(system)
     back = bodies.state(state, system.site_positions(there), system.site_velocities(there), there.cell)
     np.testing.assert_allclose(back.position, there.position, atol=1e-13)
     np.testing.assert_allclose(back.velocity, there.velocity, atol=1e-13)
@@ -135,7 +135,7 @@ def test_chunks_are_the_whole_and_a_state_given_again_goes_on():
         if until == 12:
             engine.forget()  # it is given the state anew: rounding
     np.testing.assert_allclose(parts.position, whole.position, atol=1e-10)
-    assert parts.step[NOW] == 20 and parts.time[NOW] == pytest.approx(0.02) and parts.books[HEAT] == 0
+    assert parts.step[NOW] == 20 and parts.time[NOW] == pytest.approx(0.02) and parts.energy_ledger[HEAT] == 0
     assert engine.snapshot().position.tobytes() == parts.position.tobytes()
     engine.close()
 
@@ -270,7 +270,7 @@ def test_a_body_has_no_other_engine(capsys, tmp_path):
 def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, capsys):
     system, _, state = built({"spce": 12}, 13.0, 1, 0.1, **THERE, forces={"cutoff_A": 6.0})
     engine = LammpsEngine(system)
-    engine._movers = ["fix bodies bodies rigid/none molecule"]
+    engine._fixes = ["fix bodies bodies rigid/none molecule"]
     with pytest.raises(EngineError, match=r"LAMMPS stopped: ERROR.*rigid/none"):
         engine.evaluate(state)
     engine = LammpsEngine(system)

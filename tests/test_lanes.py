@@ -13,7 +13,7 @@ from numba import types
 from support import BUILDS, ROOT, SCHEMES, build, built, move, small_scene
 from support import pair_loop as pairs
 
-from rigidmd.compile import SIMD_BITS, Parcel, kernel, simd
+from rigidmd.compile import SIMD_BITS, TaskArguments, kernel, simd
 from rigidmd.compile.simd_records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.units import KJ_PER_MOL
 
@@ -23,25 +23,25 @@ W1 = {"truncation": "shift", "reaction_field_permittivity": 78.5}
 
 @kernel(inline=True)
 def cube(x):
-    _, one, two = simd.root_and_cube(x)
+    _, one, two = simd.inverse_root_and_cube(x)
     return one * two
 
 
 @kernel(outer=True)
 def every_operation(a, b, out, sums):
-    width = simd.width_of(a)
+    width = simd.lanes_of(a)
     x, y = simd.load(a, 0), simd.load(b, 0)
     results = (
-        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, simd.larger(x, y), simd.smaller(x, 1.5), simd.inverse_root(x),
-        simd.select(x < y, x, 0.0), simd.select(simd.mask_of(5, x), y, x), cube(x),
+        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, simd.maximum(x, y), simd.minimum(x, 1.5), simd.inverse_square_root(x),
+        simd.select(x < y, x, 0.0), simd.select(simd.mask_from_bits(5, x), y, x), cube(x),
     )  # fmt: skip
     for k in range(12):
         simd.store(out, k * width, results[k])
-    sums[0] = simd.total(x)
-    sums[1] = simd.largest(x)
-    sums[2] = simd.bits((x > 1.0) & (y <= 2.0))
+    sums[0] = simd.sum_lanes(x)
+    sums[1] = simd.largest_lane(x)
+    sums[2] = simd.mask_bits((x > 1.0) & (y <= 2.0))
     sums[3] = simd.lowest_bit(40)
-    sums[4] = simd.lane(simd.narrowed(simd.load_four(sums, 0), a), 1)
+    sums[4] = simd.extract_lane(simd.convert_to(simd.load_four(sums, 0), a), 1)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
@@ -66,10 +66,10 @@ def test_vectors_compute_as_arrays_do(dtype):
 
 @kernel(outer=True)
 def sums_of_six(x, out):
-    width = simd.width_of(x)
+    width = simd.lanes_of(x)
     one = simd.load(x, 0), simd.load(x, width), simd.load(x, 2 * width)
     two = simd.load(x, 3 * width), simd.load(x, 4 * width), simd.load(x, 5 * width)
-    simd.add_totals(out, 1, 3, one, two)
+    simd.add_lane_sums(out, 1, 3, one, two)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
@@ -85,7 +85,7 @@ def test_six_sums_over_lanes_are_added_in_pairs(dtype):
 
 @kernel(outer=True)
 def records_in_lanes(vectors, matrices, out):
-    width = simd.width_of(out)
+    width = simd.lanes_of(out)
     x, y, z = load_vectors(vectors, 1)
     nine = load_matrices(matrices, 1)
     simd.store(out, 0, x)
@@ -113,17 +113,17 @@ def test_records_are_loaded_into_lanes_and_stored(dtype):
 
 @kernel(inline=True)
 def root(x):
-    found, _, _ = simd.root_and_cube(x)
+    found, _, _ = simd.inverse_root_and_cube(x)
     return found
 
 
 @kernel(outer=True)
 def inverses(x, out):
-    width = simd.width_of(x)
+    width = simd.lanes_of(x)
     for i in range(0, len(x), width):
         at = simd.load(x, i)
         simd.store(out[0], i, simd.inverse(at))
-        simd.store(out[1], i, simd.inverse_root(at))
+        simd.store(out[1], i, simd.inverse_square_root(at))
         simd.store(out[2], i, cube(at))
         simd.store(out[3], i, root(at))
 
@@ -153,15 +153,15 @@ def test_the_stack_is_aligned_to_vectors():
 
 @kernel(outer=True)
 def part(x, out):
-    width = simd.width_of(x)
-    whole, rest = simd.parted(simd.load(x, 0))
+    width = simd.lanes_of(x)
+    whole, rest = simd.split_integer_part(simd.load(x, 0))
     simd.store(out, 0, rest)
     simd.store(out, width, simd.select(whole < fives(x), simd.load(x, 0), 0.0))
 
 
 @kernel(inline=True)
 def fives(x):
-    five, _ = simd.parted(simd.fill(5.0, x))
+    five, _ = simd.split_integer_part(simd.broadcast(5.0, x))
     return five
 
 
@@ -177,8 +177,8 @@ def test_numbers_are_parted_into_whole_and_rest():
 
 @kernel(outer=True)
 def pick(table, x, out):
-    k, _ = simd.parted(simd.load(x, 0))
-    simd.store(out, 0, simd.picked(simd.load(table, 0), simd.load(table, 16), k))
+    k, _ = simd.split_integer_part(simd.load(x, 0))
+    simd.store(out, 0, simd.permute_two(simd.load(table, 0), simd.load(table, 16), k))
 
 
 @pytest.mark.skipif(not simd.HAS_AVX512, reason="an instruction of AVX-512")
@@ -198,7 +198,7 @@ def test_the_pair_loops_of_water_are_vectorised(precision):
     engine.evaluate(state)
     kind = {"double": "double", "mixed": "float"}[precision]
     for own in engine.workspaces.values():
-        parcel = Parcel(numba.typeof((own.arranged, own.pairs, own.sums)))
+        parcel = TaskArguments(numba.typeof((own.slot_potential, own.pairs, own.sums)))
         fresh = numba.cfunc(types.void(parcel, types.intp), **pairs._forces.options)(pairs._forces.function)
         vector = f"<{SIMD_BITS // (64 if kind == 'double' else 32)} x {kind}>"
         code = fresh.inspect_llvm()

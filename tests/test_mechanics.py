@@ -6,8 +6,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support import (
-    NONE,
-    TOGETHER,
+    LANES,
+    NO_SYMMETRY,
     ExactRotor,
     Load,
     align,
@@ -19,18 +19,18 @@ from support import (
     orthogonality_error,
     principal_frame,
     random_rotations,
+    rotate_group,
     spin,
     split_rotor,
     state_of,
     turn,
-    turn_group,
 )
 
 
 @kernel(outer=True)
 def turn_all(rotor, species, rotation, angular_momentum, h, together):
     if together:
-        turn_group(rotor, species, rotation, angular_momentum, 0, len(rotation), h)
+        rotate_group(rotor, species, rotation, angular_momentum, 0, len(rotation), h)
     else:
         for m in range(len(rotation)):
             turn(rotor, species[m], rotation, angular_momentum, m, h)
@@ -48,7 +48,7 @@ def test_many_bodies_turn_together_as_one_by_one(moments, longest):
         "round": [[2, 2, 2], [0, 1, 1]],
     }[moments]  # fmt: skip
     rotor = split_rotor(np.array(inertia, float))
-    n = 20 * TOGETHER + 1
+    n = 20 * LANES + 1
     species = rng.integers(0, len(inertia), n)
     rotation = random_rotations(rng, n)
     momentum = rng.standard_normal((n, 3)) * (rotor.inverse_inertia[species] > 0)
@@ -81,7 +81,7 @@ def kick_all(species, inverse_mass, inverse_inertia, state, load, h):
 @pytest.mark.parametrize("turning", [True, False])
 def test_many_bodies_are_kicked_together(turning):
     """Species in any order, one of them linear; as many bodies as do not fill the last group. Points have no momenta."""
-    rng, n = np.random.default_rng(6), 5 * TOGETHER + 1
+    rng, n = np.random.default_rng(6), 5 * LANES + 1
     species, inverse_mass = rng.integers(0, 3, n).astype(np.int32), np.array([1.0, 0.25, 0.0])
     inverse_inertia = np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     turns = n if turning else 0
@@ -260,7 +260,7 @@ def test_the_exact_rotor_keeps_energy_and_momentum_for_a_million_steps():
     inertia = np.array([[0.6, 1.1, 1.7]])
     q, l = np.eye(3)[None].copy(), np.array([[3.0, -2.0, 5.0]])  # noqa: E741
     rotor = ExactRotor(*split_rotor(inertia))
-    assert rotor.symmetry[0] == NONE
+    assert rotor.symmetry[0] == NO_SYMMETRY
     lab, size, energy = q[0] @ l[0], np.linalg.norm(l), (l**2 / inertia).sum()
     spin(rotor, q, l, 0.01, 1_000_000)
     assert abs(np.linalg.norm(l) / size - 1) < 2e-13

@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from support import (
     NOW,
+    CheckpointSchedule,
     Enthalpy,
-    Keeper,
     State,
     build,
     describe,
@@ -21,7 +21,7 @@ from support import (
     mobile,
     molecular_run,
     panels,
-    precision,
+    measure_accuracy,
     read_frames,
     read_record,
     shaken,
@@ -427,9 +427,9 @@ def test_bad_input(stages, more, expected):
         small_scene({"spce": 4}, 20.0, stages=stages, **more)
 
 
-def test_precision_needs_a_stage_in_which_time_passes():
+def test_accuracy_needs_a_stage_in_which_time_passes():
     with pytest.raises(SceneError, match="the last stage is a minimisation"):
-        precision(small_scene({"spce": 4}, 20.0, stages=[stage_of()]))
+        measure_accuracy(small_scene({"spce": 4}, 20.0, stages=[stage_of()]))
 
 
 def test_momenta_are_those_of_the_first_stage_that_moves():
@@ -579,7 +579,7 @@ def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces
 
 def test_a_minimisation_and_its_overlap_removal_end_in_their_time(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(Keeper, "time_is_up", property(lambda self: asked.append(1) or len(asked) > 1))
+    monkeypatch.setattr(CheckpointSchedule, "time_is_up", property(lambda self: asked.append(1) or len(asked) > 1))
     (tmp_path / "two.xyz").write_text("3\n\nAr 0 0 0\nAr 0.9 0 0\nAr 0 1.1 0\n")
     sections = {"structure": {"file": "two.xyz"}, "molecules": [{"model": "argon"}], "box": {"periodic": False}}
     scene = small_scene({}, None, tmp_path, **sections, stages=[stage_of(), SHORT], start={})

@@ -328,7 +328,7 @@ def test_isotopes_in_a_scene(tmp_path, capsys):
     data["molecules"] = [data["molecules"][0] | {"masses_u": {"MW": 1.0, "D": 2.0}}]
     with pytest.raises(SceneError, match="massless") as caught:
         build(Scene.from_dict(data))
-    assert "masses_u.D is no site or element of it; there are O, H, X, OW" in str(caught.value)
+    assert "masses_u.D is not a site or element of it; there are O, H, X, OW" in str(caught.value)
     data["molecules"] = [data["molecules"][0] | {"masses_u": {"H": 0.0}}]
     with pytest.raises(SceneError, match="greater than 0"):
         Scene.from_dict(data)
@@ -470,7 +470,7 @@ def test_copied_files_do_not_rename_a_species(named, own):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (('parameters = "aromatic.toml"', 'parameters = "../aromatic.toml"'), "lies outside the scene's folder"),
+        (('parameters = "aromatic.toml"', 'parameters = "../aromatic.toml"'), "is outside the scene's folder"),
         (
             ('parameters = "aromatic.toml"', 'parameters = "none.toml"'),
             "line 6: molecules.0.parameters: there is no such file",

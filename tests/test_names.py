@@ -8,7 +8,7 @@ import subprocess
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from support import Manifest, Point, build, gromacs_files, lammps_files, force_field_of, write_script
+from support import Manifest, Point, build, force_field_of, gromacs_files, lammps_files, write_script
 
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
@@ -171,4 +171,4 @@ def test_names_with_control_characters_are_refused(key, hidden, tmp_path):
     with pytest.raises(SceneError, match=r"control character|must be one|plain file name|should match") as refused:
         Scene.from_dict(data(PLAIN), overrides={key: f"a{hidden}b"})
     assert key in str(refused.value)
-    assert not any(hidden in fault for fault in refused.value.faults)
+    assert not any(hidden in fault for fault in refused.value.errors)

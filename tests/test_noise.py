@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 from support import (
     BATCH,
-    BATH,
     LATTICE,
     MOMENTA,
+    THERMOSTAT,
     Key,
     chi_square,
     fill_normals,
@@ -54,7 +54,7 @@ def fill(key, freedom, uniform, normal, square):
 def test_distributions(freedom):
     n = 20_000
     uniform, normal, square = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
-    fill(key_of(5, BATH), freedom, uniform, normal, square)
+    fill(key_of(5, THERMOSTAT), freedom, uniform, normal, square)
     assert stats.kstest(uniform.ravel(), "uniform").pvalue > 1e-3
     assert stats.kstest(normal.ravel(), "norm").pvalue > 1e-3
     assert stats.kstest(square, "chi2", args=(freedom,)).pvalue > 1e-3
@@ -77,7 +77,7 @@ def six_of_each(batches, key, step):
 
 
 def test_numbers_in_batches_are_normal():
-    rows = six_of_each(4000, key_of(5, BATH), 3)
+    rows = six_of_each(4000, key_of(5, THERMOSTAT), 3)
     assert stats.kstest(rows.ravel(), "norm").pvalue > 1e-3
     for x in (2.0, 3.0, 4.0):
         expected = rows.size * stats.norm.sf(x)
@@ -89,7 +89,7 @@ def test_numbers_in_batches_are_normal():
 
 def test_numbers_in_batches_are_those_of_their_words():
     """Radii of 53 bits and angles of 32, in Python."""
-    key, step = key_of(5, BATH), 11
+    key, step = key_of(5, THERMOSTAT), 11
     found = six_of_each(3, key, step)
     for m in (0, 1, BATCH - 1, BATCH, 2 * BATCH + 2, 3 * BATCH - 1):
         (a, b, c, d), (e, f, more, rest) = ([int(word) for word in philox(key, draw, m, step)] for draw in (7, 8))
@@ -101,13 +101,13 @@ def test_numbers_in_batches_are_those_of_their_words():
 
 
 def test_no_freedom_has_no_energy():
-    assert chi_square(key_of(5, BATH), 0, 0, 0, 0) == 0
+    assert chi_square(key_of(5, THERMOSTAT), 0, 0, 0, 0) == 0
 
 
 def test_streams_are_apart():
     keys = {
-        key_of(seed, purpose, stage) for seed in range(4) for purpose in (LATTICE, MOMENTA, BATH) for stage in (0, 1)
+        key_of(seed, purpose, stage) for seed in range(4) for purpose in (LATTICE, MOMENTA, THERMOSTAT) for stage in (0, 1)
     }
     assert len(keys) == 4 * 3 * 2
-    numbers = {uniforms(key_of(1, BATH), draw, m, step) for draw in (0, 1) for m in (0, 1) for step in (0, 1, 2**40)}
+    numbers = {uniforms(key_of(1, THERMOSTAT), draw, m, step) for draw in (0, 1) for m in (0, 1) for step in (0, 1, 2**40)}
     assert len(numbers) == 2 * 2 * 3

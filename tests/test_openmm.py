@@ -11,18 +11,18 @@ from reference import Oracle
 from scipy.special import erfc
 from support import (
     HEAT,
-    Bodies,
     NotFiniteError,
     OpenmmEngine,
+    RigidBodies,
     available_models,
     build,
     built,
+    external_engine,
+    force_field_of,
     inertia_tensor,
     kinetic_energies,
     load_model,
     mass_points,
-    other_engine,
-    force_field_of,
     random_rotations,
     read_record,
     shaken,
@@ -113,11 +113,11 @@ def test_energies_and_forces_on_bodies_of_a_cluster(counts):
     system, ours, state = built(counts | {"argon": 2}, None, seed=3, spread=0.2)
     theirs = OpenmmEngine(system, platform="Reference")
     agree(ours, theirs, state, 1e-10)
-    particles, (at, _) = theirs._held.particles, theirs._held.positions(state)
-    theirs._put(theirs._seer, state)
-    theirs._seer.computeVirtualSites()
-    placed = theirs._seer.getState(getPositions=True).getPositions(asNumpy=True)._value * 10
-    assert np.abs(placed - at)[particles.site].max() < 1e-10
+    particles, (at, _) = theirs._model.particles, theirs._model.positions(state)
+    theirs._put(theirs._evaluating_context, state)
+    theirs._evaluating_context.computeVirtualSites()
+    virtual_sites = theirs._evaluating_context.getState(getPositions=True).getPositions(asNumpy=True)._value * 10
+    assert np.abs(virtual_sites - at)[particles.site].max() < 1e-10
 
 
 def test_molecules_whose_base_has_two_masses_keep_their_shape():
@@ -158,7 +158,7 @@ def test_both_engines_go_the_same_way(platform):
 def test_linear_bodies_stay_rotations_however_often_they_are_read():
     """Their spin about the axis is nobody's: what was read last decides, and its rounding must not grow."""
     system, _, state = built({"co2_trappe": 5, "argon": 2}, None, seed=3)
-    bodies, rng = Bodies(system), np.random.default_rng(1)
+    bodies, rng = RigidBodies(system), np.random.default_rng(1)
     found = state
     for _ in range(300):
         turned = state._replace(rotation=random_rotations(rng, len(state.rotation)))
@@ -268,7 +268,7 @@ def staged(kind, duration=1.0, counts=None):
 def conserved(system, engine, state):
     """Energy less the heat of baths, u Å²/ps²."""
     potential = sum(t.energy for t in engine.evaluate(state)[1].values())
-    return potential + sum(kinetic_energies(system, state)) - state.books[HEAT]
+    return potential + sum(kinetic_energies(system, state)) - state.energy_ledger[HEAT]
 
 
 @pytest.mark.parametrize("kind", THERMOSTATS)
@@ -390,7 +390,7 @@ def test_what_openmm_cannot_do_is_told_at_once():
         {"spce": 4}, 13.0, fields={"electric_V_per_nm": [0.0, 0.0, 0.1]}, engine={"name": "openmm"}, **BOX
     )
     with pytest.raises(SceneError, match=r"engine.name = .openmm.: electric field: a field is left to rigidmd"):
-        other_engine(build(falling))
+        external_engine(build(falling))
 
 
 def test_a_platform_that_is_not_there():

@@ -16,26 +16,26 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from support import (
-    NAMES,
     ROOT,
+    TRUNCATIONS,
+    CacheIndex,
+    CustomOneKind,
     FormulaError,
-    Index,
-    OwnOfOneKind,
-    Plain,
+    Unmodified,
     build,
     built,
     check_forces,
     describe,
-    ending,
+    formula_of_function,
+    formula_of_table,
+    formula_of_text,
     formulas,
     kernel,
     lanes,
-    of_function,
-    of_table,
-    of_text,
     own_code,
     small_scene,
-    tail_of,
+    tail_of_pair,
+    truncation_terms,
 )
 from support import lennard_jones as built_in
 from support import lennard_jones_energy_and_force as of_built_in
@@ -128,11 +128,11 @@ def in_numbers(law, r2):
 @pytest.mark.parametrize("energy", FORMULAS)
 def test_the_code_of_a_formula_has_the_energy_and_its_derivative(energy):
     given = FORMULAS[energy]
-    formula = of_text(energy)
+    formula = formula_of_text(energy)
     assert formula.parameters == tuple(sorted(given))
     own = formula.kind(*formula.numbers(given))
     end = (0.0, 0.0, 0.0, 0.0)
-    law, radial = OwnOfOneKind(20.0, Plain(20.0), own, (), end), formula.radial(given)
+    law, radial = CustomOneKind(20.0, Unmodified(20.0), own, (), end), formula.radial(given)
     names = {"exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
     for r in (2.1, 3.7, 8.5):
         u, w = at_distance(law, own, end, r * r)
@@ -145,10 +145,10 @@ def test_the_code_of_a_formula_has_the_energy_and_its_derivative(energy):
 
 
 def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
-    formula = of_text("c*eps*((sig/r)**n - (sig/r)**m)", {"n": 14.0, "m": 6.0, "c": 2.0})
+    formula = formula_of_text("c*eps*((sig/r)**n - (sig/r)**m)", {"n": 14.0, "m": 6.0, "c": 2.0})
     assert formula.parameters == ("eps", "sig")
     assert not formula.kind.uses_root  # even powers of r: no square root
-    assert of_text("A/r**7").kind.uses_root
+    assert formula_of_text("A/r**7").kind.uses_root
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
 )
 def test_a_text_that_is_no_formula_is_told(energy, word):
     with pytest.raises(FormulaError, match=re.escape(word)):
-        of_text(energy)
+        formula_of_text(energy)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_a_text_that_is_no_formula_is_told(energy, word):
 )
 def test_an_energy_that_is_not_real_is_refused_where_it_is_asked_for(energy, given, r):
     with pytest.raises(FormulaError, match=f"no finite real value at r = {r:g}"):
-        of_text(energy).radial(given)(r)
+        formula_of_text(energy).radial(given)(r)
 
 
 NUMBERS = ("0", "1", "2", "0.5", "1/3", "9", "200", "199", "1e8", "1e-8", "1e200", "999999999", "1" * 20, "1e-300", "pi",
@@ -236,14 +236,14 @@ def test_any_text_is_read_or_refused_soon(monkeypatch):
         if calls > MOST_CALLS:
             raise TimeoutError
 
-    of_text(LJ)  # imports SymPy
+    formula_of_text(LJ)  # imports SymPy
     monkeypatch.setattr(formulas, "module_of", module)
     for seed in range(300):
         chosen = random.Random(seed)
         text, calls = a_text(chosen, chosen.choice((3, 6, 10, 14, 19))), 0
         sys.setprofile(count)
         try:
-            formula = of_text(text)
+            formula = formula_of_text(text)
             for r in (0.3, 3.0, 30.0):
                 values = [*formula.radial(dict.fromkeys(formula.parameters, 1.5))(r)]
                 values += formula.numbers(dict.fromkeys(formula.parameters, -1.5))
@@ -259,8 +259,8 @@ def test_any_text_is_read_or_refused_soon(monkeypatch):
 def test_a_table_is_as_good_as_it_says():
     r = np.linspace(2.5, 10, 200)
     given = {"eps": 1.0, "sig": 3.4}
-    exact = of_text(LJ).radial(given)
-    table = of_table(r, [exact(x)[0] / KJ_PER_MOL for x in r], 9.0)
+    exact = formula_of_text(LJ).radial(given)
+    table = formula_of_table(r, [exact(x)[0] / KJ_PER_MOL for x in r], 9.0)
     radial, well = table.radial({"scale": 1.0}), KJ_PER_MOL
     off = max(abs(radial(x)[0] - exact(x)[0]) / well for x in np.linspace(2.9, 9, 3001))
     assert off < 3 * table.error < 1e-3
@@ -269,9 +269,9 @@ def test_a_table_is_as_good_as_it_says():
         assert radial(x)[1] == pytest.approx((radial(x - step)[0] - radial(x + step)[0]) / (2 * step), rel=1e-6)
     for bad, word in ((([1, 2], [1, 2]), "8 distances"), ((r, r**2), "does not repel"), ((r[::-1], r), "ascending")):
         with pytest.raises(FormulaError, match=word):
-            of_table(*bad, 9.0)
+            formula_of_table(*bad, 9.0)
     with pytest.raises(FormulaError, match=r"ends at 10 Å, before the cut-off"):
-        of_table(r, 1 / r, 12.0)
+        formula_of_table(r, 1 / r, 12.0)
 
 
 class Pair(NamedTuple):
@@ -294,39 +294,39 @@ def test_a_function_needs_to_say_what_its_parameters_are():
     def alone(p: Pair, r):
         return r
 
-    assert of_function(lennard_jones).radial({"eps": 1.0, "sig": 3.0})(4.0)[0] == pytest.approx(
-        of_text(LJ).radial({"eps": 1.0, "sig": 3.0})(4.0)[0]
+    assert formula_of_function(lennard_jones).radial({"eps": 1.0, "sig": 3.0})(4.0)[0] == pytest.approx(
+        formula_of_text(LJ).radial({"eps": 1.0, "sig": 3.0})(4.0)[0]
     )
     with pytest.raises(FormulaError, match="annotate p with a NamedTuple"):
-        of_function(bare)
+        formula_of_function(bare)
     with pytest.raises(FormulaError, match="not a function of Python"):
-        of_function(functools.partial(lennard_jones))
+        formula_of_function(functools.partial(lennard_jones))
     with pytest.raises(FormulaError, match="radius"):
-        of_function(strange)
+        formula_of_function(strange)
     with pytest.raises(FormulaError, match="two numbers"):
-        of_function(alone).radial({"eps": 1.0, "sig": 3.0})(4.0)
+        formula_of_function(alone).radial({"eps": 1.0, "sig": 3.0})(4.0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TRUNCATIONS)
 def test_a_law_ends_as_the_built_in_one(name):
     theirs = built_in(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
-    formula, given = of_text(LJ), {"eps": 1.0, "sig": 3.4}
-    end = ending(name, theirs.shape, formula.radial(given))
-    own = OwnOfOneKind(9.0, theirs.shape, formula.kind(*formula.numbers(given)), (), end)
-    one = theirs.room(8, np.float64)
+    formula, given = formula_of_text(LJ), {"eps": 1.0, "sig": 3.4}
+    end = truncation_terms(name, theirs.shape, formula.radial(given))
+    own = CustomOneKind(9.0, theirs.shape, formula.kind(*formula.numbers(given)), (), end)
+    one = theirs.for_slots(8, np.float64)
     for r in (2.9, 7.4, 8.2, 8.99):
         expected = in_numbers(one, r * r)
         assert at_distance(own, own.formula, end, r * r) == pytest.approx(expected, rel=1e-11, abs=1e-11)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TRUNCATIONS)
 def test_the_tail_of_a_law_is_that_of_the_built_in_one(name):
     theirs = built_in(np.zeros(10, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
-    radial = of_text(LJ).radial({"eps": 1.0, "sig": 3.4})
-    found = tail_of(radial, np.array(ending(name, theirs.shape, radial)), theirs.shape)
+    radial = formula_of_text(LJ).radial({"eps": 1.0, "sig": 3.4})
+    found = tail_of_pair(radial, np.array(truncation_terms(name, theirs.shape, radial)), theirs.shape)
     assert 100 * np.array(found) == pytest.approx(np.array(tail(theirs)), rel=1e-8)
     with pytest.raises(ArithmeticError, match="too slowly"):
-        tail_of(of_text("1/r**3").radial({}), np.zeros(4), theirs.shape)
+        tail_of_pair(formula_of_text("1/r**3").radial({}), np.zeros(4), theirs.shape)
 
 
 # --- pair laws in a system -------------------------------------------------------------------------------------------
@@ -357,7 +357,7 @@ def from_text(given, **more):
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("truncation", NAMES)
+@pytest.mark.parametrize("truncation", TRUNCATIONS)
 def test_a_law_is_the_built_in_one_in_a_box(truncation):
     same_as_built_in({"argon": 60}, 1e-12, law=from_text, truncation=truncation)
     same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_text, truncation=truncation)
@@ -379,25 +379,25 @@ def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
 
 def test_who_interacts_with_which_parameters():
     def numbers(law, counts={"argon": 3, "krypton": 3}, **forces):  # noqa: B006
-        law = build(small_scene(counts, 25.0, forces=forces).with_user_code([law])).terms["pair_law"].law
-        return law.parameters, law.acts
+        law = build(small_scene(counts, 25.0, forces=forces).with_user_code([law])).terms["pair_law"].potential
+        return law.parameters, law.interacts
 
     both = {"Ar": {"k": 1.0}, "Kr": {"k": 4.0}}
-    parameters, acts = numbers(rigidmd.pair_law("k/r**9", both))
+    parameters, interacts = numbers(rigidmd.pair_law("k/r**9", both))
     assert parameters[0] == pytest.approx(100 * np.array([[1.0, 2.0], [2.0, 4.0]]))
-    assert acts.all()
+    assert interacts.all()
     parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, mixing={"k": "arithmetic"}, pairs={}))
     assert parameters[0, 0, 1] == pytest.approx(250)
     parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, pairs={("Kr", "Ar"): {"k": 7.0}}))
     assert parameters[0, 0, 1] == parameters[0, 1, 0] == pytest.approx(700)
-    parameters, acts = numbers(rigidmd.pair_law("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}}))
-    assert np.array_equal(acts, [[0, 1], [1, 0]])
+    parameters, interacts = numbers(rigidmd.pair_law("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}}))
+    assert np.array_equal(interacts, [[0, 1], [1, 0]])
     # as in [[forces.pairs]]: a name means sites of that name, and elements only if no site has it
-    parameters, acts = numbers(rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}}))
+    parameters, interacts = numbers(rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}}))
     assert parameters[0] == pytest.approx(200)
-    assert acts.shape == (1, 1)
+    assert interacts.shape == (1, 1)
     one = build(small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms["pair_law"]
-    assert one.law.acts.shape == (1, 1)
+    assert one.potential.interacts.shape == (1, 1)
     with pytest.raises(SceneError, match=r"have no geometric mean"):
         numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
     with pytest.raises(SceneError, match=r"no site is 'Xe'; there are AR, argon.AR"):
@@ -426,7 +426,7 @@ def test_parameters_may_come_from_the_model():
         molecules=[{"name": "dot", "count": 10, "sites": sites}],
         forces={"custom": [{"name": "wall", "energy": "k/r**9"}]},
     )
-    assert build(scene).terms["wall"].law.parameters[0, 0, 0] == pytest.approx(300)
+    assert build(scene).terms["wall"].potential.parameters[0, 0, 0] == pytest.approx(300)
     assert "wall: k/r**9, 10 sites, cut-off 9 Å, switch" in describe(scene)
 
 
@@ -721,7 +721,7 @@ def test_entries_of_custom_forces_are_checked(entry, word):
 
 
 def test_code_for_classes_of_users_has_an_index_of_its_own():
-    index = Index("/nowhere", "f", 0)
+    index = CacheIndex("/nowhere", "f", 0)
     source = b"from typing import NamedTuple\nclass Term(NamedTuple):\n    x: float\n"
     kept = own_code.module_of(source, "<test>").Term
     assert own_code.module_of(source, "<test>").Term is kept  # one class for one text
@@ -754,7 +754,7 @@ def test_a_law_of_a_function_sees_what_the_function_uses_when_the_law_is_made(mo
     for strength in (1.0, 5.0):
         monkeypatch.setitem(globals(), "STRENGTH", strength)
         own = rigidmd.pair_law(of_strength, {"D": One(2.0)}).formula(9.0).kind(2.0)
-        made.append(at_distance(OwnOfOneKind(20.0, Plain(20.0), own, (), end), own, end, 4.0)[0])
+        made.append(at_distance(CustomOneKind(20.0, Unmodified(20.0), own, (), end), own, end, 4.0)[0])
     assert made == [pytest.approx(100.0), pytest.approx(500.0)]
 
 
@@ -776,7 +776,7 @@ def halve(bath, model, state, h, draw):
         for k in range(3):
             before += 0.5 * model.mass[model.species[m]] * state.velocity[m, k] ** 2
             state.velocity[m, k] *= math.sqrt(factor)
-    state.books[0] += (factor - 1) * before
+    state.energy_ledger[0] += (factor - 1) * before
 
 
 def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():

@@ -24,6 +24,7 @@ from support import (
     SCHEMES,
     Engine,
     Figures,
+    RunTimes,
     Sample,
     Samples,
     State,
@@ -349,14 +350,14 @@ def test_energy_that_goes_with_the_total_momentum_is_booked():
     state = system.state.copy()
     state.velocity[:, 0] += 0.1
     energy = observe(system, system.engine(), state).energy
-    row, engine = SCHEMES["velocity_verlet"].with_rest(4), system.engine()
+    row, engine = SCHEMES["velocity_verlet"].with_momentum_removal(4), system.engine()
     for steps, left in ((3, 0.1), (1, 0.0), (3, 0.0)):
         engine.advance(state, row, 1e-3, int(state.step[NOW]) + steps)
         momentum = system.model.mass[system.model.species] @ state.velocity
         assert momentum == pytest.approx([left * mass, 0, 0], abs=1e-9 * mass)
-    assert state.books[REMOVED] == pytest.approx(-0.5 * mass * 0.1**2, rel=1e-9)
+    assert state.energy_ledger[REMOVED] == pytest.approx(-0.5 * mass * 0.1**2, rel=1e-9)
     seen = observe(system, engine, state)
-    assert seen.energy - state.books.sum() == pytest.approx(energy, rel=1e-5)
+    assert seen.energy - state.energy_ledger.sum() == pytest.approx(energy, rel=1e-5)
 
 
 def test_a_drift_of_all_molecules_is_noted():
@@ -405,7 +406,7 @@ def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
     box, forces = {"density_g_cm3": density}, {"cutoff_A": 4.6, "truncation": "plain"}
     system = build(small_scene({"argon": 32}, None, box=box, forces=forces, start={"temperature_K": 1.0}))
     term = system.terms["lennard_jones"]
-    other = term._replace(law=term.law._replace(c12=term.law.c12 * (1 + gap), c6=term.law.c6 * (1 - gap)))
+    other = term._replace(potential=term.potential._replace(c12=term.potential.c12 * (1 + gap), c6=term.potential.c6 * (1 - gap)))
     here, there = (system.engine_of({"lennard_jones": each}, "double") for each in (term, other))
     state = shaken(system, 1, 0.05)[2]
     lines = compare_at(system, state, here, there)
@@ -431,7 +432,7 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **
         own = {name: float(values[k]) for name, values in made.items()}
         row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
         rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality_error": 0.0} | own))
-    return summarise(system, rows, state, 0, 0.0, 1.0, [1.0], False, {}, {}, {}, {}, [])
+    return summarise(system, rows, state, 0, RunTimes(0.0, 1.0, [1.0]), False, {}, {}, {}, {}, [])
 
 
 def noted(*given, **made):
@@ -461,10 +462,10 @@ def test_a_thermal_momentum_is_noted_where_it_is_conserved(thermostat, momentum)
         (-5.5, 0.0, 1.0, 400, ["5.5 K too cold"]),
         (1.4, 0.0, 1.0, 400, []),  # 0.5 %
         (5.5, 0.0, 1.0, 30, []),  # too few samples in its half
-        (0.0, 6.0, 3.0, 400, ["K apart, which sampling does not explain"]),
+        (0.0, 6.0, 3.0, 400, ["K that sampling does not explain"]),
         (0.0, 6.0, 100.0, 400, []),  # within the scatter
         (0.0, 1.5, 0.1, 400, []),  # certain, and small
-        (8.0, 8.0, 1.0, 400, ["too hot", "K apart"]),
+        (8.0, 8.0, 1.0, 400, ["too hot", "K that sampling does not explain"]),
     ],
 )
 def test_temperatures_are_judged_without_the_error_of_the_step(bias, apart, spread, n, words):
@@ -642,7 +643,7 @@ def test_faults_of_all_tables_are_said_at_once():
     scene = small_scene({}, 17.0, molecules=molecules, forces={"electrostatics": "pme", "ewald_alpha_per_A": 2.0})
     with pytest.raises(SceneError) as error:
         build(scene)
-    assert [fault.partition(":")[0].partition(" =")[0] for fault in error.value.faults] == [
+    assert [fault.partition(":")[0].partition(" =")[0] for fault in error.value.errors] == [
         "molecules.0.frozen", "forces.cutoff_A", "forces.ewald_alpha_per_A"
     ]  # fmt: skip
     assert "(the default)" in str(error.value)
@@ -1168,7 +1169,7 @@ def test_a_look_asks_a_force_in_python_once():
     system = build(small_scene({"argon": 10}, 25.0).with_user_code([spring := Spring()]))
     engine, row = system.engine(), SCHEMES["velocity_verlet"]
     state = engine.begin(system.state, row)
-    engine.advance(state, row, 1e-3, 5, looked=True)
+    engine.advance(state, row, 1e-3, 5, observed=True)
     asked = spring.asked
     found = engine.evaluate_current(state)[1]["spring"].energy
     assert spring.asked == asked
@@ -1180,9 +1181,9 @@ def test_a_look_at_another_state_is_an_evaluation():
     system, engine, start = built({"argon": 20}, 20.0, 3)
     row = SCHEMES["velocity_verlet"]
     moved, other = engine.begin(start, row), engine.begin(start, row)
-    engine.advance(moved, row, 1e-3, 5, looked=True)
+    engine.advance(moved, row, 1e-3, 5, observed=True)
     other.position[:] += 0.1 * np.arange(20)[:, None]
-    engine.advance(other, row, 1e-3, 0, looked=True)  # no step
+    engine.advance(other, row, 1e-3, 0, observed=True)  # no step
     expected = system.engine().evaluate(other)[1]
     assert engine.evaluate_current(other)[1]["lennard_jones"].energy == pytest.approx(expected["lennard_jones"].energy, rel=1e-12)
 
@@ -1201,7 +1202,7 @@ def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
 def test_a_look_at_a_state_that_was_changed_from_outside_is_anew():
     _, engine, state = built({"argon": 20}, 25.0)
     row = SCHEMES["velocity_verlet"]
-    engine.advance(state, row, 1e-3, 5, looked=True)
+    engine.advance(state, row, 1e-3, 5, observed=True)
     known = engine.evaluate_current(state)[1]["lennard_jones"].energy
     assert engine.evaluate_current(state.copy())[1]["lennard_jones"].energy == known
     state.position[0, 0] += 0.5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import elliprd
-from support import SOLID_NUMBERS as NUMBERS
+from support import COMPONENTS_PER_DIMENSION as NUMBERS
 from support import SOLIDS, added_mass_of_ellipsoid, inertia_tensor, solid
 
 MASS = 2.5

@@ -3,22 +3,22 @@
 import numpy as np
 import pytest
 from support import (
-    BATH,
     HEAT,
     NOW,
     ORIGIN,
     ROOT,
     SCHEMES,
+    THERMOSTAT,
     Solver,
     VelocityRescaling,
     build_body,
     built,
+    constant_ramp,
     key_of,
     move,
     read_state,
     small_scene,
     state_of,
-    steady,
     write_state,
 )
 
@@ -36,9 +36,9 @@ def same_bits(a, b):
 
 def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
     system, engine, state = built({"spce": 5, "argon": 2}, 20.0, 1)
-    row = VERLET.with_bath(VelocityRescaling(steady(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, BATH)))
+    row = VERLET.with_thermostat(VelocityRescaling(constant_ramp(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, THERMOSTAT)))
     move(engine, state, row, 0.001, 7)
-    assert state.books[HEAT] != 0
+    assert state.energy_ledger[HEAT] != 0
     write_state(tmp_path / "s.npz", system.saved(state))
     saved = read_state(tmp_path / "s.npz")
     assert same_bits(saved.state, state)
@@ -50,7 +50,7 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
 def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
     """Time, heat and random numbers go on from the state alone; points, whose sums have one order, to the bit."""
     system, _, start = built({"argon": 2}, 30.0, 2)
-    row = VERLET.with_bath(VelocityRescaling(steady(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, BATH)))
+    row = VERLET.with_thermostat(VelocityRescaling(constant_ramp(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, THERMOSTAT)))
     whole = start.copy()
     move(system.engine(), whole, row, 0.003, 20)
     state = start

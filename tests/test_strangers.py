@@ -60,7 +60,7 @@ def own_molecule(position="[0.0, 0.0, 1.0]", more=""):
         ('model = "spce"', 'file = "a\\u0000.toml"', "line 5: molecules.0.file: is 'a\\x00.toml': control characters"),
         ('model = "spce"', f'file = "{"a" * 300}.toml"', "line 5: molecules.0.file: cannot be read: File name too long"),
         ('model = "spce"', 'file = "loop.toml"', "cannot be read: Too many levels of symbolic links: "),
-        ('model = "spce"', 'file = "pipe.toml"', "line 5: molecules.0.file: is no file but a pipe"),
+        ('model = "spce"', 'file = "pipe.toml"', "line 5: molecules.0.file: is a pipe, a socket or a device"),
         ('model = "spce"', 'model = "spce"\nname = "\\u001b[31mred"', "line 6: molecules.0.name: is '\\x1b[31mred'"),
         ("[start]", '"\\u001b[31mx" = 1\n[start]', "\\x1b[31mx: has a control character in its name"),
         ("count = 20", 'count = 20\n"int" = 1', "line 7: molecules.0.int: unknown key"),
@@ -137,7 +137,7 @@ def test_a_file_may_begin_with_the_mark_of_its_encoding(capsys, tmp_path):
 
 def test_a_scene_that_is_a_pipe_or_too_large(tmp_path):
     os.mkfifo(tmp_path / "pipe.toml")
-    with pytest.raises(SceneError, match="is no file but a pipe"):
+    with pytest.raises(SceneError, match="is a pipe, a socket or a device"):
         Scene.read(tmp_path / "pipe.toml")
     (tmp_path / "large.toml").write_bytes(b"#" * 5_000_000)
     with pytest.raises(SceneError, match=r"has 5 MB; files of up to 4 MB are read"):
@@ -383,7 +383,7 @@ def test_what_is_free_is_no_more_than_the_limits():
     assert 1e8 < memory.free_memory() < 1e14
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
-        "from rigidmd.core.memory import free_memory; print(free_memory())"
+        "from rigidmd.core.process import free_memory; print(free_memory())"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 1e9 < float(found.stdout) < 3e9
@@ -391,7 +391,7 @@ def test_what_is_free_is_no_more_than_the_limits():
 
 @pytest.mark.parametrize(("most", "square"), [((5, 6, 7), None), ((3, 0, 4), 20), ((0, 0, 3), None), ((0, 0, 0), None)])
 def test_waves_in_columns_are_all_waves(most, square):
-    found = vectors.waves(most, square)
+    found = vectors.k_vectors_up_to(most, square)
     axes = [np.arange(-m, m + 1) for m in most]
     n = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     n = n[(n**2).sum(axis=1) <= (np.inf if square is None else square)]

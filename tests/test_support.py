@@ -26,7 +26,7 @@ PAST = {
     "test_lanes.py": (["rigidmd.compile"], OPEN),
     "test_threads.py": (["rigidmd.compile"], OPEN),
     "test_watch.py": (["rigidmd.compile"], "a script of a user who compiles a function"),
-    "test_strangers.py": (["rigidmd.core.memory"], "a script in so little memory that it loads nothing else"),
+    "test_strangers.py": (["rigidmd.core.process"], "a script in so little memory that it loads nothing else"),
 }
 FILES = sorted(TESTS.rglob("*.py"))
 

@@ -22,8 +22,8 @@ def test_chains_go_on_to_the_same_bits_in_double_precision(tmp_path):
 def test_a_checkpoint_gives_back_all_of_a_state():
     system = build(small_scene({"spce": 3}, 12.0, forces={"cutoff_A": 5.0}))
     rng = np.random.default_rng(1)
-    state = system.state._replace(bath=rng.standard_normal(12))
-    for array in (state.position, state.velocity, state.angular_momentum_body, state.books):
+    state = system.state._replace(extra_variables=rng.standard_normal(12))
+    for array in (state.position, state.velocity, state.angular_momentum_body, state.energy_ledger):
         array[:] = rng.standard_normal(array.shape)
     found = state_from({name: array.copy() for name, array in state._asdict().items()}, state)
     for name, a, b in zip(state._fields, found, state, strict=True):

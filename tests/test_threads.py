@@ -14,7 +14,7 @@ import pytest
 from support import ROOT, SCHEMES, small_scene
 
 from rigidmd import Every, Simulation, run_together
-from rigidmd.compile import Code, call_blocks, kernel, opened, packed, set_threads, task
+from rigidmd.compile import Code, call_blocks, kernel, load_arguments, pack_arguments, set_threads, task
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.compile.thread_pool import CLAIMED, FIRST_HELPER, SLEEPS, _crew, _pause, _read, _take, _write  # noqa: F401
 from rigidmd.errors import SimulationError
@@ -22,7 +22,7 @@ from rigidmd.errors import SimulationError
 
 @task()
 def _count(parcel, block):
-    seen, work = opened(parcel)
+    seen, work = load_arguments(parcel)
     total = 0.0
     for n in range(work):
         total += np.sqrt(n + block)
@@ -32,19 +32,19 @@ def _count(parcel, block):
 
 @task()
 def _count_within(parcel, block):
-    code, seen = opened(parcel)
-    call_blocks(code, "count", packed((seen[block], 10)), seen.shape[1])
+    code, seen = load_arguments(parcel)
+    call_blocks(code, "count", pack_arguments((seen[block], 10)), seen.shape[1])
 
 
 @kernel(outer=True)
 def _run(code, seen, work, times):
     for _ in range(times):
-        call_blocks(code, "count", packed((seen, work)), len(seen))
+        call_blocks(code, "count", pack_arguments((seen, work)), len(seen))
 
 
 @kernel(outer=True)
 def _run_within(code, inner, seen):
-    call_blocks(code, "within", packed((inner, seen)), len(seen))
+    call_blocks(code, "within", pack_arguments((inner, seen)), len(seen))
 
 
 def counted(blocks: int, work: int = 10, times: int = 1) -> np.ndarray:
@@ -71,7 +71,7 @@ def test_every_block_is_done_once(threads, blocks, work):
 
 @task()
 def _note(parcel, block):
-    order = opened(parcel)
+    order = load_arguments(parcel)
     order[0] += 1
     order[order[0]] = block
 
@@ -247,7 +247,7 @@ def test_what_cannot_run_together_is_refused(twice, jobs, word):
 @task()
 def _meet(parcel, block):
     """Wait until the other of two blocks has begun, or for so many looks; note whether it has."""
-    at, most = opened(parcel)
+    at, most = load_arguments(parcel)
     _write(at, block, 1)
     looks = 0
     while _read(at, 1 - block) == 0 and looks < most:
@@ -258,7 +258,7 @@ def _meet(parcel, block):
 
 @kernel(outer=True)
 def _run_meeting(code, at, most):
-    call_blocks(code, "meet", packed((at, most)), 2)
+    call_blocks(code, "meet", pack_arguments((at, most)), 2)
 
 
 def met(most: int) -> list[int]:

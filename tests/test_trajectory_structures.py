@@ -193,8 +193,8 @@ def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
         (".gsd", "frame", "structure.frame is 3: it holds 2"),
         (".gsd", "noise", "Not a GSD file"),
         (".xtc", "crash", "its reader crashed. Is it damaged?"),
-        (".xtc", "outside", "lies outside the scene's folder"),
-        (".gsd", "topology", "topology is of trajectories without names"),
+        (".xtc", "outside", "is outside the scene's folder"),
+        (".gsd", "topology", "topology is for trajectories without names"),
         (".xtc", "not a structure", "name a structure file with names"),
     ],
 )

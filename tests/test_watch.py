@@ -19,7 +19,7 @@ from support import (
     small_scene,
     stable_angle,
     stable_step,
-    stiffest,
+    stiffest_mode,
     watch,
 )
 
@@ -93,7 +93,7 @@ def test_a_molecule_that_moves_or_turns_too_far():
     assert "Try timestep_fs = 0.46 or less" in said
     assert "Last good" not in said  # there was none
     said = stopped(water(2.0), change=lambda state: state.angular_momentum_body.__setitem__(3, 3e3))
-    assert "molecule 4 (spce) turns by" in said
+    assert "molecule 4 (spce) rotates by" in said
     assert "watch.turn_rad = 2" in said
 
 
@@ -135,7 +135,7 @@ def test_bad_inertia():
 
 def test_q_that_is_no_rotation():
     said = stopped(water(2.0), change=lambda state: state.rotation.__imul__(1 + 1e-6))
-    assert "Q is no longer a rotation: |QᵀQ - 1| is 2e-06 (watch.orthogonality = 1e-09)" in said
+    assert "Q is not a rotation: |QᵀQ - 1| is 2e-06 (watch.orthogonality = 1e-09)" in said
 
 
 @pytest.mark.parametrize("name", ["force", "torque_body"])
@@ -145,7 +145,7 @@ def test_a_load_that_is_no_number(name):
     getattr(load, name)[5, 1] = np.nan
     check = watch.StepCheck(system, system.scene.watch)
     check.thermal = 250.0
-    found = check.next_step(system.state, load, SCHEMES["velocity_verlet"], 0.002)
+    found = check.check_step(system.state, load, SCHEMES["velocity_verlet"], 0.002)
     assert str(found) == f"the {name.removesuffix('_body')} on molecule 6 (spce) is not finite"
 
 
@@ -162,14 +162,14 @@ def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
     def findings(m):
         for size in np.geomspace(1.0, 1e9, 180):
             number[m, 1] = size
-            found = check.next_step(system.state, load, verlet, 0.002)
+            found = check.check_step(system.state, load, verlet, 0.002)
             yield found and str(found)
         number[m, 1] = 0.0
 
     for m in (3, 23):
         quick = list(findings(m))
         with monkeypatch.context() as patched:
-            patched.setattr(check, "_is_mild", lambda *_: False)
+            patched.setattr(check, "_is_within_limits", lambda *_: False)
             assert quick == list(findings(m))
         assert quick[0] is None and quick[-1] is not None
 
@@ -182,9 +182,9 @@ def test_a_thermostat_is_held_to_its_own_time_only():
     rows = simulation.run().samples.rows
     drifted = rows[-1]._replace(drift=rows[-3].drift + 0.4 * rows[-3].kinetic)
     limits = system.scene.watch
-    assert watch.sample_finding(system, limits, rows[-3], drifted) is None
-    assert watch.sample_finding(system, limits, rows[-3], drifted._replace(drift=rows[-3].drift - rows[-3].kinetic))
-    assert watch.sample_finding(system, limits, rows[0], rows[-1]._replace(drift=3 * rows[-1].kinetic)) is None
+    assert watch.check_sample(system, limits, rows[-3], drifted) is None
+    assert watch.check_sample(system, limits, rows[-3], drifted._replace(drift=rows[-3].drift - rows[-3].kinetic))
+    assert watch.check_sample(system, limits, rows[0], rows[-1]._replace(drift=3 * rows[-1].kinetic)) is None
 
 
 def test_limits_can_be_set_and_lifted(capsys, tmp_path):
@@ -259,7 +259,7 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluate, advance = Engine.evaluate, Engine.advance
     monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state))
 
-    def counted(self, state, scheme, dt, until, looked=False):
+    def counted(self, state, scheme, dt, until, observed=False):
         loads.append(until - state.step[NOW])
         return advance(self, state, scheme, dt, until, looked)
 
@@ -267,7 +267,7 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     ends, costs = [], []
     quiet = dict.fromkeys(("move", "turn_rad", "kick", "energy", "orthogonality", "stable_step"), False)
     for limits, often in ((quiet, 100_000), ({}, 100_000), ({}, 7)):
-        monkeypatch.setattr(watch, "patience", lambda system, often=often: often)
+        monkeypatch.setattr(watch, "check_interval", lambda system, often=often: often)
         ends.append(Simulation(water(2.0, stages=[{"duration_ps": 0.2}], watch=limits)).run().state)
         costs.append((len(evaluated), sum(loads)))
         evaluated.clear(), loads.clear()
@@ -280,7 +280,7 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
 
 
 def test_a_run_that_nobody_looks_at_is_looked_at(monkeypatch):
-    monkeypatch.setattr(watch, "patience", lambda system: 20)
+    monkeypatch.setattr(watch, "check_interval", lambda system: 20)
     scene = water(16.0, stages=[{"duration_ps": 160.0, "timestep_fs": 16.0}])
     silent = Scene.from_dict(scene.model_dump(exclude_none=True) | {
         "output": {"log_interval_ps": 1e6, "trajectory": False}})  # fmt: skip
@@ -320,9 +320,9 @@ def test_the_stiffest_motion_of_a_dimer():
     argon = system.species[0]
     system.state.position[:] = [[0.0, 0.0, 0.0], [0.0, 2 ** (1 / 6) * argon.sigma[0], 0.0]]
     expected = np.sqrt(36 * 2 ** (2 / 3) * argon.epsilon[0] / argon.sigma[0] ** 2 / (argon.mass / 2))
-    assert stiffest(system, system.state).rate == pytest.approx(expected, rel=1e-3)
+    assert stiffest_mode(system, system.state).rate == pytest.approx(expected, rel=1e-3)
     system.state.position[1] += 1e4
-    assert stiffest(system, system.state) is None or stiffest(system, system.state).rate < 1e-6
+    assert stiffest_mode(system, system.state) is None or stiffest_mode(system, system.state).rate < 1e-6
 
 
 def test_the_stiffest_libration_of_water_is_found_in_few_directions():
@@ -330,11 +330,11 @@ def test_the_stiffest_libration_of_water_is_found_in_few_directions():
     system = build(water(2.0))
     simulation = Simulation(water(2.0, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]))
     state = simulation.run().state
-    few = stiffest(system, state).rate
+    few = stiffest_mode(system, state).rate
     before = stable_step.DIRECTIONS
     stable_step.DIRECTIONS = 100
     try:
-        assert few == pytest.approx(stiffest(system, state).rate, rel=0.03)
+        assert few == pytest.approx(stiffest_mode(system, state).rate, rel=0.03)
     finally:
         stable_step.DIRECTIONS = before
 
@@ -346,10 +346,10 @@ def test_in_a_large_system_a_slab_tells_the_stiffest_motion(monkeypatch):
     simulation = Simulation(scene)
     state = simulation.run().state
     state.position[7] += [41.6, 0.0, -20.8]  # in which box a molecule is does not matter
-    whole = stiffest(simulation.system, state)
+    whole = stiffest_mode(simulation.system, state)
     for most in (60, 120):
         monkeypatch.setattr(stable_step, "MOST_DISPLACED", most)
-        found = stiffest(simulation.system, state)
+        found = stiffest_mode(simulation.system, state)
         x = simulation.system.centres(state, wrapped=True)[:, 0]
         assert np.sum(x < x[found.molecule]) < most
         assert 0.8 * whole.rate < found.rate < 1.001 * whole.rate  # the stiffest of fewer
@@ -406,10 +406,10 @@ def test_a_body_that_is_lost_turns_too_far_or_loses_q():
     wild = dict(run__duration_s=30.0, run__integrator="rk4", output__interval_s=0.3)
     assert "step 4 (1.2 s): position or momentum of the body is not finite" in stopped(top(run__timestep_s=0.3, **wild))
     lost = stopped(top(run__timestep_s=0.02, **wild))
-    assert "Q is no longer a rotation" in lost
+    assert "Q is not a rotation" in lost
     assert "only accuracy keeps Q a rotation under rk4" in lost
     turned = stopped(top(run__timestep_s=0.05, watch__turn_rad=1.0))
-    assert "the body turns by 3 rad in a step (watch.turn_rad = 1)" in turned
+    assert "the body rotates by 3 rad in a step (watch.turn_rad = 1)" in turned
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
@@ -474,21 +474,21 @@ def test_what_went_wrong_is_found_between_looks(monkeypatch):
               {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "nose_hoover", "duration_ps": 2.0,
                "timestep_fs": 1.0}]  # fmt: skip
     scene = small_scene({}, 20.0, molecules=[{"model": "tip4p2005", "count": 20}, ion], stages=stages)
-    pair_in_core, seen = watch.pair_in_core, []
+    most_overlapping_pair, seen = watch.most_overlapping_pair, []
 
     def only_between(system, state, molecule):
         seen.append(int(state.step[NOW]))
-        return pair_in_core(system, state, molecule) if len(seen) > 2 else None
+        return most_overlapping_pair(system, state, molecule) if len(seen) > 2 else None
 
-    monkeypatch.setattr(watch, "pair_in_core", only_between)
+    monkeypatch.setattr(watch, "most_overlapping_pair", only_between)
     said = stopped(scene)
     assert any(f"at step {step}, " in said for step in seen[2:])
     assert "Likely cause: a charge on a site without repulsion" in said
 
 
 def test_a_long_way_back_is_not_computed_again(monkeypatch):
-    monkeypatch.setattr(watch, "patience", lambda system: 20)
-    monkeypatch.setattr(watch, "PATIENCE", 1)
+    monkeypatch.setattr(watch, "check_interval", lambda system: 20)
+    monkeypatch.setattr(watch, "MOVES_PER_CHECK", 1)
     advanced, advance = [], Engine.advance
     monkeypatch.setattr(
         Engine, "advance", lambda self, state, *rest: advanced.append(state) or advance(self, state, *rest)

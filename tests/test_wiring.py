@@ -195,7 +195,7 @@ def test_a_ramp_is_even_over_the_steps_of_its_stage():
     """At step k of n, counted from the begin of the stage, the pressure is p0 + (p1 - p0) k/n."""
     system = system_of(NPT)
     box, state = barostat_of(system, 0), system.state.copy()
-    asked, present = boxes.asked.py_func, ramps.present.py_func
+    asked, present = boxes.target_pressure.py_func, ramps.ramp_value.py_func
     state.step[ORIGIN] = 1000
     for taken in (0, 99, 249):  # the step that is being taken is the next one
         state.step[NOW] = 1000 + taken
@@ -208,14 +208,14 @@ def test_a_ramp_is_even_over_the_steps_of_its_stage():
 
 @numba.njit
 def _driving(box, model, state, room, k, volume, thermal):
-    return boxes.driving(box, model, state, room, k, volume, thermal)
+    return boxes.strain_force(box, model, state, room, k, volume, thermal)
 
 
 def test_what_drives_the_cell_follows_a_ramp_of_the_pressure():
     """Between two steps of a ramp only the pressure differs: the drive falls by V dP."""
     system = system_of(NPT)
     box, state = barostat_of(system, 0), system.state.copy()
-    room, found = boxes.box_room(state), []
+    room, found = boxes.barostat_workspace(state), []
     for taken in (0, 124, 249):
         state.step[NOW] = taken
         found.append(_driving(box, system.model, state, room, 1, state.volume, 300 * KELVIN))
@@ -234,7 +234,7 @@ def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecu
     system = system_of(MONTE_CARLO)
     box, state = barostat_of(system, 0), system.state.copy()
     state.step[NOW] = 249  # 310 K, 500 bar
-    room = boxes.box_room(state)
+    room = boxes.barostat_workspace(state)
     room.tally[:, 0] = 250.0, 100.0
     state.cell[:] *= 1.02
     before, after = 14.0**3, (1.02 * 14.0) ** 3
@@ -248,10 +248,10 @@ def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecu
 
 @numba.njit
 def _rest(model, state):
-    advance.rest(model, state)
+    advance.remove_momentum_flow(model, state)
 
 
-def resisted_motion(system, seed=1):
+def pushed(system, seed=1):
     """Thermal momenta of a mixture, and a push along each axis."""
     rng, state = np.random.default_rng(seed), system.state.copy()
     mass = system.model.mass[system.model.species]
@@ -264,7 +264,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     """The common velocity is P/M; its energy P²/2M is accounted for. A field along x leaves what is along x."""
     field = {"fields": {"electric_V_per_nm": [0.1, 0.0, 0.0]}} if "na_spce" in counts else {}
     system = system_of(NVT, counts=counts, **field)
-    state, mass = resisted_motion(system)
+    state, mass = pushed(system)
     before = state.velocity.copy()
     momentum = mass @ before
     kept = np.array([not field, True, True])
@@ -272,7 +272,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     assert (mass @ state.velocity)[kept] == pytest.approx(np.zeros(kept.sum()), abs=1e-12)
     assert before - state.velocity == pytest.approx(np.tile(kept * momentum / mass.sum(), (len(mass), 1)))
     energies = [0.5 * mass @ (v**2).sum(axis=1) for v in (before, state.velocity)]
-    assert state.books[REMOVED] == pytest.approx(energies[1] - energies[0])
+    assert state.energy_ledger[REMOVED] == pytest.approx(energies[1] - energies[0])
 
 
 def test_a_mixture_starts_at_rest_and_at_its_temperature():
@@ -307,7 +307,7 @@ def test_a_start_has_a_thermal_energy_about_each_axis():
 def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     """`remove_momentum` keeps all relative velocities, and returns the energy that it takes."""
     system = system_of(NVT)
-    state, mass = resisted_motion(system)
+    state, mass = pushed(system)
     before = state.velocity.copy()
     taken = remove_momentum(system.model, state.velocity)
     assert np.ptp(before - state.velocity, axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
@@ -321,7 +321,7 @@ def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
 def test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces():
     """2K/(f k) of K + dt²/12 (sum F²/m), and of K + dt²/12 (sum n²/I), over the axes that have inertia."""
     system = system_of({"duration_ps": 0.1})
-    state, mass = resisted_motion(system)
+    state, mass = pushed(system)
     rng, dt = np.random.default_rng(3), 0.02
     inertia = system.model.inertia[system.model.species]
     state.angular_momentum_body[:] = rng.standard_normal(inertia.shape) * np.sqrt(inertia * 300 * KELVIN)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigidmd.assemble.body_faults import integrator_errors, body_errors, torque_errors
+from rigidmd.assemble.body_faults import body_errors, integrator_errors, torque_errors
 from rigidmd.assemble.body_parts import (
     carried_fluid,
     frame_of,
@@ -25,7 +25,7 @@ from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor
 from rigidmd.mechanics.time_functions import values_at
-from rigidmd.mechanics.translation import FreeTranslation, FluidTranslation, NoTranslation
+from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, NoTranslation
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
 

@@ -4,14 +4,22 @@ from itertools import permutations
 
 import numpy as np
 
-from rigidmd.forces.body.applied import TimeDependentForce, SteadyForce
+from rigidmd.forces.body.applied import SteadyForce, TimeDependentForce
 from rigidmd.forces.body.frame import InertialFrame, RotatingFrame
 from rigidmd.forces.body.resistance import NoResistance, Resistance
 from rigidmd.mechanics.free_rotor import DrivenRotor, split_rotor
 from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
 from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
-from rigidmd.mechanics.time_functions import TimeFunction, integrate_function, is_constant_function, constant_function, interpolated_function, sum_functions, pulse_function
+from rigidmd.mechanics.time_functions import (
+    TimeFunction,
+    constant_function,
+    integrate_function,
+    interpolated_function,
+    is_constant_function,
+    pulse_function,
+    sum_functions,
+)
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body_forces import Timed
 from rigidmd.scene.validation import not_none

@@ -7,20 +7,20 @@ import numpy as np
 
 from rigidmd.assemble.defaults import Composition, with_defaults, with_momentum_removal
 from rigidmd.assemble.engine_defaults import with_engine_defaults
-from rigidmd.assemble.fields import SystemParts, wrapped_between_walls, field_notes, field_terms, fields_left_out
+from rigidmd.assemble.fields import SystemParts, field_notes, field_terms, fields_left_out, wrapped_between_walls
 from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.overlaps import overlaps
-from rigidmd.assemble.species import split_frozen, species_of
+from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
-from rigidmd.assemble.start import starting_configuration, residue_numbers, set_momenta
+from rigidmd.assemble.start import residue_numbers, set_momenta, starting_configuration
 from rigidmd.assemble.terms import interactions, left_out
 from rigidmd.core.state import state_of
-from rigidmd.dynamics.momenta import freedom_of, kept_momentum, mobile
-from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.momenta import conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import space_of
-from rigidmd.forces.potentials.lennard_jones import sum_of
+from rigidmd.forces.potentials.lennard_jones import sum_of_tails
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
@@ -51,7 +51,7 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
     )
     acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
     acting.terms.update(field_terms(scene, SystemParts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
-    model = model._replace(keeps_momentum=kept_momentum(model, acting.terms))
+    model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
     system = System(
         scene=scene,
@@ -60,7 +60,7 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
         space=space,
         state=state,
         terms=acting.terms,
-        freedom=freedom_of(model),
+        freedom=count_degrees_of_freedom(model),
         constants=acting.constants,
         constant_pressure=acting.pressure,
         tail=acting.tail,
@@ -126,10 +126,10 @@ def with_user_code(system: System) -> System:
         # those that Python computes come first: until they are told, nothing else need be computed
         terms={name: added.terms[name] for name in added.python_forces} | system.terms | added.terms,
         model=model,
-        freedom=freedom_of(model),
+        freedom=count_degrees_of_freedom(model),
         python_forces=added.python_forces,
         thermostat=added.thermostat,
-        tail=sum_of([*([system.tail] if system.tail is not None else []), *added.tails]),
+        tail=sum_of_tails([*([system.tail] if system.tail is not None else []), *added.tails]),
         user_terms=added.words,
         notes=[*system.notes, *added.notes],
     )

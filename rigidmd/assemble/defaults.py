@@ -15,15 +15,15 @@ from rigidmd.assemble.engine_defaults import stage_with_defaults
 from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.engines.system import charges_in
 from rigidmd.forces.ewald.errors import (
-    FAREST,
-    MOST_POINTS,
+    MAX_ALPHA_CUTOFF,
+    MAX_GRID_POINTS,
     SPACINGS,
     Charges,
     alpha_for,
-    mesh_for,
-    wave_radius_for,
+    k_cutoff_for,
+    pme_grid_for,
 )
-from rigidmd.forces.ewald.k_vectors import AS_GIVEN
+from rigidmd.forces.ewald.k_vectors import SAME_BASIS
 from rigidmd.forces.neighbors.space import Space, Triclinic, cell_of
 from rigidmd.io.cells import basis_in_words, edges_in_words
 from rigidmd.scene import BodyScene, MolecularScene
@@ -70,7 +70,7 @@ class Composition(NamedTuple):
     @property
     def is_as_described(self) -> bool:
         """Whether the box has the edges of the cell that was described."""
-        return np.array_equal(self.basis, AS_GIVEN)
+        return np.array_equal(self.basis, SAME_BASIS)
 
 
 class SceneWithDefaults(NamedTuple):
@@ -175,10 +175,10 @@ def _electrostatic_faults(forces: Forces, space: Space, cutoff: float) -> list[s
     if method == "damped_shifted_force" and cutoff == inf:
         return ["forces.electrostatics = 'damped_shifted_force' ends at a cut-off; give forces.cutoff_A"]
     screening = {"damped_shifted_force": "damping_per_A", "ewald": "ewald_alpha_per_A", "pme": "ewald_alpha_per_A"}
-    if (key := screening.get(method)) and (getattr(forces, key) or 0.0) * cutoff > FAREST:
+    if (key := screening.get(method)) and (getattr(forces, key) or 0.0) * cutoff > MAX_ALPHA_CUTOFF:
         return [
             f"forces.{key} = {getattr(forces, key):g} with a cut-off of {cutoff:g} Å screens charges there by "
-            f"erfc({getattr(forces, key) * cutoff:.3g}), far below rounding; at most {FAREST / cutoff:.3g} is of use"
+            f"erfc({getattr(forces, key) * cutoff:.3g}), far below rounding; at most {MAX_ALPHA_CUTOFF / cutoff:.3g} is of use"
         ]
     return []
 
@@ -199,13 +199,13 @@ def _ewald(
     share = accuracy / sqrt(2)  # for either part
     asked = f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be had"
     alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, facts.space.volume, share))
-    if alpha * cutoff > FAREST:
+    if alpha * cutoff > MAX_ALPHA_CUTOFF:
         return numbers, [f"{asked} with a cut-off of {cutoff:g} Å; take a longer one"], None
     numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
     if forces.electrostatics == "ewald":
         radius = forces.ewald_k_radius_per_A
         if not forces.sets_k_vectors:
-            radius = float(wave_radius_for(charges, alpha, facts.reciprocal, share))
+            radius = float(k_cutoff_for(charges, alpha, facts.reciprocal, share))
         longest = np.linalg.norm(cell_of(facts.space), axis=1).max()
         if radius is not None and forces.ewald_k_max is None and radius * longest > 2 * pi * MOST_WAVES:
             fault = (
@@ -228,13 +228,13 @@ def _ewald(
             "that cell, or give three equal numbers, or leave pme_grid out"
         )
         return numbers, [fault], None
-    if grid is None and (longest := np.linalg.norm(cell, axis=1).max()) > MOST_POINTS * SPACINGS[0]:
+    if grid is None and (longest := np.linalg.norm(cell, axis=1).max()) > MAX_GRID_POINTS * SPACINGS[0]:
         fault = (
-            f"forces.electrostatics = 'pme': an edge of {longest:.4g} Å is too long for a grid of {MOST_POINTS} points"
+            f"forces.electrostatics = 'pme': an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
         )
         return numbers, [fault], None
     if grid is None or order is None:
-        found = mesh_for(charges, alpha, cell, share, order, grid)
+        found = pme_grid_for(charges, alpha, cell, share, order, grid)
         if found is None:
             given = " with the forces.pme_order or pme_grid that is given" if order or grid else ""
             fault = f"{asked}{given} at alpha = {alpha:.3g} 1/Å; ask for less, or take a longer cut-off"

@@ -10,7 +10,7 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.fields import describe_fields
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
-from rigidmd.compile.machine import threads_for
+from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.body_system import BodySystem
@@ -131,7 +131,7 @@ def _molecules(system: System) -> str:
         lines += [f"  {k}: {how}", f"     {law}"]
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
     if not scene.engine.is_external:
-        threads = threads_for(scene.threads)
+        threads = usable_threads(scene.threads)
         lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {PRECISIONS[scene.precision]}")
     return "\n".join(lines)
 

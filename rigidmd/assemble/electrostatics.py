@@ -10,7 +10,7 @@ from rigidmd.core.state import State
 from rigidmd.engines.system import charges_in
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum, k_vectors
-from rigidmd.forces.ewald.errors import Charges, mesh_error, radius_of, real_error, wave_error, wave_radius_for
+from rigidmd.forces.ewald.errors import Charges, k_cutoff_for, k_cutoff_of_count, k_space_error, pme_error, real_error
 from rigidmd.forces.neighbors.pair_loop import pair_forces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
@@ -101,8 +101,8 @@ class _Ewald(NamedTuple):
     """Truncation errors and waves of an Ewald sum."""
 
     real_error: float  # e²/Å², see ewald_errors
-    wave_error: float
-    waves: k_vectors.Waves | None  # with PME only for the interactions of frozen molecules
+    k_space_error: float
+    waves: k_vectors.KVectors | None  # with PME only for the interactions of frozen molecules
 
 
 def _waves(scene: MolecularScene, charged: ChargedSites, space: Space, basis: np.ndarray, grid: Grid | None) -> _Ewald:
@@ -112,21 +112,21 @@ def _waves(scene: MolecularScene, charged: ChargedSites, space: Space, basis: np
     beyond = real_error(charges, alpha, cutoff, volume)
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     if grid is not None:
-        left = mesh_error(charges, alpha, cell, grid, not_none(forces.pme_order))
+        left = pme_error(charges, alpha, cell, grid, not_none(forces.pme_order))
         over = None
         if charged.frozen.any():
-            over = k_vectors.waves_within(reciprocal, wave_radius_for(charges, alpha, reciprocal, 1e-3 * left))
+            over = k_vectors.k_vectors_within(reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * left))
         return _Ewald(beyond, left, over)
     most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
     if isinstance(most, int):
         most = (most, most, most)
     if radius is None:
-        over = k_vectors.waves(not_none(most), forces.ewald_k2_max, basis)
+        over = k_vectors.k_vectors_up_to(not_none(most), forces.ewald_k2_max, basis)
     else:
-        over = k_vectors.waves_within(reciprocal, radius, most, basis)
+        over = k_vectors.k_vectors_within(reciprocal, radius, most, basis)
     if over.total == 0:
         raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no wave at all"])
-    return _Ewald(beyond, wave_error(charges, alpha, radius_of(over.total, volume), volume), over)
+    return _Ewald(beyond, k_space_error(charges, alpha, k_cutoff_of_count(over.total, volume), volume), over)
 
 
 def _ewald(
@@ -147,7 +147,7 @@ def _ewald(
         waves = not_none(found.waves)
         over = direct_sum.EwaldSum(alpha, charge, charged.sites, waves)
         how = f"{waves.total} waves, |n| up to {' '.join(map(str, waves.most))}"
-        if forces.ewald_k_max is not None and not np.array_equal(basis, k_vectors.AS_GIVEN):
+        if forces.ewald_k_max is not None and not np.array_equal(basis, k_vectors.SAME_BASIS):
             how += "; these are the waves that ewald_k_max means in the cell that was described"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
@@ -164,12 +164,12 @@ def _ewald(
         ),
         "coulomb_intramolecular": charged.each(lambda q, x: corrections.intramolecular_energy(q, x, alpha)),
     }
-    error = float(np.hypot(found.real_error, found.wave_error))
+    error = float(np.hypot(found.real_error, found.k_space_error))
     notes = [
         f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cut-off {cutoff:g} Å, {how}"
         + ("" if law.shift == 0 else "; energies of real space shifted to 0 at the cut-off"),
         f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
-        f"kJ/(mol Å); {found.real_error:.2g} beyond the cut-off, {found.wave_error:.2g} in the reciprocal part",
+        f"kJ/(mol Å); {found.real_error:.2g} beyond the cut-off, {found.k_space_error:.2g} in the reciprocal part",
     ]
     still = charged.frozen[charged.sites.molecule]
     net, net_still = charge.sum(), charge[still].sum()
@@ -198,7 +198,7 @@ def _frozen_correction(
     charge: np.ndarray,
     space: Space,
     alpha: float,
-    waves: k_vectors.Waves,
+    waves: k_vectors.KVectors,
     permittivity: float,
     state: State,
 ) -> tuple[float, float]:
@@ -211,7 +211,7 @@ def _frozen_correction(
     if len(state.rotation):
         arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
     position = state.position[sites.molecule] + arms
-    energy, force, virial = direct_sum.sum_of(charge, position, cell_of(space), alpha, waves)
+    energy, force, virial = direct_sum.ewald_sum_in_numpy(charge, position, cell_of(space), alpha, waves)
     dipole = charge @ position
     surface = 2 * pi / ((2 * permittivity + 1) * volume)
     force -= 2 * surface * charge[:, None] * dipole

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.dynamics.momenta import kept_momentum
-from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.momenta import conserved_momentum
 from rigidmd.errors import SceneError
 from rigidmd.forces.fields.electric import ElectricField, OscillatingField
-from rigidmd.forces.fields.gravity import Weight
+from rigidmd.forces.fields.gravity import Gravity
 from rigidmd.forces.fields.restraints import Restraints
 from rigidmd.forces.fields.walls import HarmonicWalls, LennardJonesWalls
 from rigidmd.forces.neighbors.sites import sites_of
@@ -46,7 +46,7 @@ def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTup
         terms["electric_field"] = _electric_field(scene, parts, moves, faults)
     if any(fields.gravity_m_s2 or ()):
         mass = np.where(moves, model.mass, 0.0)
-        terms["gravity"] = Weight(model.species, mass, np.array(fields.gravity_m_s2) * METRE_PER_S2)
+        terms["gravity"] = Gravity(model.species, mass, np.array(fields.gravity_m_s2) * METRE_PER_S2)
     for k, walls in enumerate(fields.walls):
         term = terms[f"walls_{k}"] = _walls(walls, k, parts, moves, faults)
         if isinstance(term, LennardJonesWalls) and (behind := term.behind(parts.state)) is not None:
@@ -56,7 +56,7 @@ def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTup
     for k in range(len(fields.restraints)):
         if (term := _restraints(scene, k, parts, faults)) is not None:
             terms[f"restraints_{k}"] = term
-    if not faults and scene.run.remove_momentum_interval_ps and not kept_momentum(model, terms).any():
+    if not faults and scene.run.remove_momentum_interval_ps and not conserved_momentum(model, terms).any():
         faults.append(
             "run.remove_momentum_interval_ps: fields or frozen molecules change all components of the total momentum; "
             "leave it out"

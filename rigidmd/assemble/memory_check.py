@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.memory import free_memory, format_gigabytes, memory_shortage
+from rigidmd.core.process import format_gigabytes, free_memory, memory_shortage
 from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene

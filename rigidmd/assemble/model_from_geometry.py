@@ -12,7 +12,7 @@ from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import MoleculeError, StructureError
 from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
-from rigidmd.scene.models import Molecule, MoleculeFile, Site, find_site, molecule, read_table
+from rigidmd.scene.models import Molecule, MoleculeFile, Site, find_site, molecule, read_parameters
 from rigidmd.scene.validation import ValidationError, validation_messages
 
 #: Factor on the sum of covalent radii up to which two atoms are bonded.
@@ -44,7 +44,7 @@ def model_from_geometry(geometry: Path, parameters: Path | None, name: str | Non
         sites = sites_of_geometry(geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), "")
         notes.append("it has no interactions yet: give its sites charge_e, sigma_A and epsilon_kJ_mol, or --parameters")
     else:
-        table = read_table(parameters)
+        table = read_parameters(parameters)
         sites = sites_of_geometry(geometry, (), table.sites, "the table")
         told.append(f"parameters of {parameters.name}" + (f": {table.source}" if table.source else ""))
         names, elements, *_ = read_geometry(geometry)

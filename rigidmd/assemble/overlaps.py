@@ -72,7 +72,7 @@ def _close_among(
     system: "System", state: State, molecules: np.ndarray, radius: float, chosen: list[np.ndarray]
 ) -> Iterator[tuple[int, int, float]]:
     """The pairs of `close_pairs` among some molecules, of the sites chosen[k] (indices) of species k."""
-    kinds, counts = system.model.species[molecules], system.own_sites
+    kinds, counts = system.model.species[molecules], system.sites_per_molecule
     owner = np.repeat(molecules, np.array([len(own) for own in chosen])[kinds])
     site = (np.cumsum(counts) - counts)[owner] + gather_per_molecule(chosen, kinds)
     offset = gather_per_molecule([m.positions_body[own] for m, own in zip(system.species, chosen, strict=True)], kinds)

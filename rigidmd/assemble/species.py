@@ -29,7 +29,7 @@ def species_of(scene: MolecularScene) -> list[Molecule]:
         try:
             found.append(_one_species(scene, entry))
         except InputError as error:
-            faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.faults]
+            faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.errors]
     names = [m.name for m in found]
     faults += [
         f"molecules: {name} appears twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1
@@ -45,7 +45,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     elif entry.file is not None and entry.file.endswith(".toml"):
         found = read_molecule(scene.path(entry.file))
     else:
-        table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters))
+        table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters)).sites
         if entry.file is None:
             sites = with_parameters(not_none(entry.sites), table)
         else:

@@ -8,9 +8,8 @@ import numpy as np
 from rigidmd.core.integrators import Scheme
 from rigidmd.dynamics.barostats import COUPLINGS, CellRescaling, Pressure, VolumeMoves, piston
 from rigidmd.dynamics.momenta import mobile
-from rigidmd.dynamics.noise import THERMOSTAT, BAROSTAT, key_of
-from rigidmd.dynamics.ramps import Ramp, steady
-from rigidmd.dynamics.thermostats import Andersen, Langevin, NoseHoover, VelocityRescaling
+from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
+from rigidmd.dynamics.thermostats import Andersen, Langevin, NoseHoover, Ramp, VelocityRescaling, constant_ramp
 from rigidmd.engines.system import System
 from rigidmd.scene.stage import Six, Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
@@ -25,19 +24,19 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     found = stage.scheme
     if (own := system.thermostat) is not None:
         bath = own.for_stage(system, k) if hasattr(own, "for_stage") else own
-        found = found.with_bath(bath, halved=getattr(bath, "halved", True))
+        found = found.with_thermostat(bath, halved=getattr(bath, "halved", True))
     elif stage.has_thermostat:
-        found = found.with_bath(thermostat_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
+        found = found.with_thermostat(thermostat_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
     elif not stage.has_barostat and any(other.thermostat_kind == "velocity_rescaling" for other in scene.stages):
         # a stage without a thermostat among others with one has one that rests: all then run the same machine code
-        idle = VelocityRescaling(steady(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
-        found = found.with_bath(idle)
+        idle = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
+        found = found.with_thermostat(idle)
     if stage.ensemble == "npt":
-        found = found.with_box(barostat_of(system, k), stage.moves_every)
+        found = found.with_barostat(barostat_of(system, k), stage.moves_every)
     elif stage.ensemble == "nph":
         found = found.with_piston(barostat_of(system, k))
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
-        found = found.with_rest(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
+        found = found.with_momentum_removal(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
     return found
 
 

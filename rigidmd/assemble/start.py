@@ -6,11 +6,11 @@ import numpy as np
 
 from rigidmd.assemble.fields import start_lattice
 from rigidmd.assemble.memory_check import check_memory_of_molecules
-from rigidmd.assemble.structure import Configuration, with_reduced_cell, read_structure
+from rigidmd.assemble.structure import Configuration, read_structure, with_reduced_cell
 from rigidmd.core.state import State
+from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
-from rigidmd.dynamics.step_loop import Model
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.io.cells import cell_fault
 from rigidmd.mechanics.rotation import random_rotations
@@ -41,7 +41,7 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
                 held,
             )
         except StructureError as error:
-            raise StructureError(scene.structure_source, error.faults) from None
+            raise StructureError(scene.structure_source, error.errors) from None
         faults = []
         for k, entry in enumerate(scene.molecules):
             present = int((found.species == k).sum())

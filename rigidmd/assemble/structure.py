@@ -10,7 +10,7 @@ from rigidmd.assemble.matching import NO_MASS, MatchedMolecules, massive_sites, 
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
-from rigidmd.forces.ewald.k_vectors import AS_GIVEN
+from rigidmd.forces.ewald.k_vectors import SAME_BASIS
 from rigidmd.io.atoms import SAME_MASS, Atoms
 from rigidmd.io.cells import (
     angles_deg,
@@ -18,9 +18,9 @@ from rigidmd.io.cells import (
     basis_of,
     cell_fault,
     edges_in_words,
+    least_skewed_cell,
     reduced,
     right_angled,
-    least_skewed_cell,
     same_lattice,
     standard_rotation,
 )
@@ -51,7 +51,7 @@ class Configuration(NamedTuple):
     residual_max: float  # Å
     number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
     notes: tuple[str, ...] = ()  # how the file was interpreted
-    basis: np.ndarray = AS_GIVEN  # (3, 3) integers: edges of the cell in terms of the described cell
+    basis: np.ndarray = SAME_BASIS  # (3, 3) integers: edges of the cell in terms of the described cell
 
 
 def read_structure(

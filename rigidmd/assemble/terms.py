@@ -6,16 +6,16 @@ import numpy as np
 
 from rigidmd.assemble.electrostatics import ChargedSites, Interactions, electrostatics
 from rigidmd.core.state import State
-from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.model import Model
 from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.pair_loop import pair_forces
-from rigidmd.forces.neighbors.sites import groups, sites_of
+from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.potentials.lennard_jones import LennardJones, lennard_jones, tail
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import MINIMUM_TOLERANCE, short_cutoff_note
-from rigidmd.scene.models import Molecule, sites_named, gather_per_molecule
+from rigidmd.scene.models import Molecule, gather_per_molecule, sites_named
 from rigidmd.units import KJ_PER_MOL
 
 
@@ -65,7 +65,7 @@ def interactions(
     if scene.forces.lennard_jones and any(len(c) for c in chosen):
         law = _lennard_jones(scene, species, index, named, chosen)
         sites = _sites_of(species, model, chosen)
-        found.terms["lennard_jones"] = pair_forces(law, sites, groups(sites, frozen))
+        found.terms["lennard_jones"] = pair_forces(law, sites, exclusion_groups(sites, frozen))
         found = found._replace(
             tail=tail(law) if scene.forces.tail_correction else None, notes=_short_cutoff_notes(law, species, index, chosen)
         )
@@ -73,7 +73,7 @@ def interactions(
     if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
         return found
     sites = _sites_of(species, model, chosen)
-    charged = ChargedSites(species, index, frozen, chosen, sites, groups(sites, frozen))
+    charged = ChargedSites(species, index, frozen, chosen, sites, exclusion_groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(
         found.terms | added.terms,

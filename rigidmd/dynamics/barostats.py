@@ -4,8 +4,8 @@ A move multiplies the cell (rows a, b, c) and the centres of mass from the right
 keeps a along x and b in the xy plane. Rotations and angular momenta stay as they are: what answers is the molecular
 virial sum F (x) R, with W_ij = sum F_i R_j in `tally[1:]`.
 
-`move_box(box, ...)` acts where the row of a step has BOX, `stretch(box, ...)` where it has STRETCH. What a box does to
-the energy of the molecules is in `state.books[WORK]`.
+`apply_barostat(barostat, ...)` acts where the row of a step has BOX, `scale_box(barostat, ...)` where it has STRETCH. What a box does to
+the energy of the molecules is in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log, sqrt
@@ -14,14 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.core.integrators import BOX
+from rigidmd.core.integrators import BAROSTAT
 from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
 from rigidmd.dynamics.force_gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
-from rigidmd.dynamics.ramps import Ramp, present
-from rigidmd.dynamics.thermostats import scale_array, translational_energy
+from rigidmd.dynamics.thermostats import Ramp, ramp_value, scale_array, translational_energy
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import PRESSED, TALLIED, load_now
+from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, compute_load
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -44,7 +43,7 @@ class Pressure(NamedTuple):
     steps: float
 
 
-class NoBox(NamedTuple):
+class NoBarostat(NamedTuple):
     """Constant volume."""
 
     rate: float = 0.0
@@ -68,7 +67,7 @@ class CellRescaling(NamedTuple):
     rate: float  # compressibility over time constant, Å ps²/u/ps
     coordinate: tuple[int, int, int, int, int, int]  # of COUPLINGS
     at_rest: tuple[float, float, float]  # 1 of each axis along which the total momentum is kept at zero
-    beyond: tuple[float, float]  # dispersion beyond the cut-off: its energy times V, its pressure times V²
+    tail: tuple[float, float]  # dispersion beyond the cut-off: its energy times V, its pressure times V²
     key: Key
 
 
@@ -80,7 +79,7 @@ class VolumeMoves(NamedTuple):
     pressure: Pressure
     width: float  # largest change of the volume, Å³
     molecules: float  # that move
-    beyond: tuple[float, float]
+    tail: tuple[float, float]
     key: Key
 
 
@@ -88,29 +87,29 @@ class Piston(NamedTuple):
     """Isotropic volume with inertia and no noise (Andersen 1980, J. Chem. Phys. 72, 2384): constant enthalpy.
 
     H = K + U + P0 V + Pi²/(2 M) in centres and momenta scaled by the edge is followed by kicks of Pi (BOX) and changes
-    of V (STRETCH), each exact, beside those of the molecules. Pi is the last number of `state.bath`; what P0 V and the
-    piston gain is what `books[WORK]` loses.
+    of V (STRETCH), each exact, beside those of the molecules. Pi is the last number of `state.extra_variables`; what P0 V and the
+    piston gain is what `energy_ledger[WORK]` loses.
     """
 
     pressure: Pressure
     inverse_mass: float  # 1/M, Å⁴/u, see `piston`
-    beyond: tuple[float, float]
+    tail: tuple[float, float]
 
 
-def piston(pressure: Pressure, period: float, compressibility: float, volume: float, beyond: tuple) -> Piston:
+def piston(pressure: Pressure, period: float, compressibility: float, volume: float, tail: tuple) -> Piston:
     """A piston with which a volume of this compressibility (Å ps²/u) swings with a period (ps).
 
     It hangs on the spring dP/dV = -1/(compressibility V), so that M = (period/2 pi)²/(compressibility V).
     """
-    return Piston(pressure, compressibility * volume * (2 * np.pi / period) ** 2, beyond)
+    return Piston(pressure, compressibility * volume * (2 * np.pi / period) ** 2, tail)
 
 
-class BoxRoom(NamedTuple):
+class BarostatWorkspace(NamedTuple):
     """Where a move is made and, if it is rejected, taken back."""
 
     tally: np.ndarray  # (2, 10) energies and virials: now, before the move; of a piston virials only
     strain: np.ndarray  # (3, 6) of the move; its drift; its variance
-    turned: np.ndarray  # (2, 3, 3) T, its inverse
+    matrices: np.ndarray  # (2, 3, 3) T, its inverse
     position: np.ndarray  # as in State
     velocity: np.ndarray
     cell: np.ndarray
@@ -119,9 +118,9 @@ class BoxRoom(NamedTuple):
     counts: np.ndarray  # (2,) moves tried, accepted
 
 
-def box_room(state: State) -> BoxRoom:
+def barostat_workspace(state: State) -> BarostatWorkspace:
     """Room for the molecules of a state."""
-    return BoxRoom(
+    return BarostatWorkspace(
         np.zeros((2, TALLY_SIZE)),
         np.zeros((3, 6)),
         np.zeros((2, 3, 3)),
@@ -134,7 +133,7 @@ def box_room(state: State) -> BoxRoom:
     )
 
 
-def load_for(box, terms, state, load, room, row, which):
+def compute_load_for_barostat(barostat, terms, state, load, workspace, flows, which):
     """Forces and torques at the present positions; a status code.
 
     which : PLAIN, or TALLIED for energies and virials too. A step in which the box moves always computes virials, and
@@ -143,218 +142,220 @@ def load_for(box, terms, state, load, room, row, which):
     raise TypeError("compiled code only")
 
 
-def move_box(box, model, terms, state, load, room, cursor, h, draw):
+def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
     """The flow of a box over a time h, in place; a status code. cursor : see `advance`."""
     raise TypeError("compiled code only")
 
 
-def stretch(box, state, h):
+def scale_box(barostat, state, h):
     """The flow of the volume by its own inertia, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(load_for, inline=True)
-def _load_for(box, terms, state, load, room, row, which):
-    if is_a(box, NoBox):
-        return lambda box, terms, state, load, room, row, which: load_now(terms, state, load, which)
+@implements(compute_load_for_barostat, inline=True)
+def _compute_load_for_barostat(barostat, terms, state, load, workspace, flows, which):
+    if is_a(barostat, NoBarostat):
+        return lambda barostat, terms, state, load, workspace, flows, which: compute_load(terms, state, load, which)
 
-    needed = PRESSED if is_a(box, Piston) else TALLIED
+    needed = WITH_VIRIALS if is_a(barostat, Piston) else WITH_ENERGIES
 
-    def with_virials(box, terms, state, load, room, row, which):
-        room.known[0] = 0
-        for k in range(len(row.kind)):
-            if row.kind[k] == BOX and (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] == 0:
-                return tally_bodies(terms, state, load, room, which if which == TALLIED else needed)
-        return load_now(terms, state, load, which)
+    def with_virials(barostat, terms, state, load, workspace, flows, which):
+        workspace.known[0] = 0
+        for k in range(len(flows.kind)):
+            if flows.kind[k] == BAROSTAT and (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0:
+                return compute_load_and_virial(
+                    terms, state, load, workspace, which if which == WITH_ENERGIES else needed
+                )
+        return compute_load(terms, state, load, which)
 
     return with_virials
 
 
 @kernel(inline=True)
-def tally_bodies(terms, state, load, room, which):
+def compute_load_and_virial(terms, state, load, workspace, which):
     """Forces and torques and virial at the present positions, with TALLIED also energies; a status code.
 
     which : TALLIED or PRESSED
     """
-    status = load_now(terms, state, load, which)
+    status = compute_load(terms, state, load, which)
     for k in range(TALLY_SIZE):
-        room.tally[0, k] = 0.0
+        workspace.tally[0, k] = 0.0
         for tally in terms.tallies:
-            room.tally[0, k] += tally[k]
-    room.known[0] = 1 if status == OK else 0
+            workspace.tally[0, k] += tally[k]
+    workspace.known[0] = 1 if status == OK else 0
     return status
 
 
-@implements(stretch)
-def _stretch(box, state, h):
-    if not is_a(box, Piston):
-        return lambda box, state, h: None
+@implements(scale_box)
+def _scale_box(barostat, state, h):
+    if not is_a(barostat, Piston):
+        return lambda barostat, state, h: None
 
-    def stretch(box, state, h):
+    def scale_box(barostat, state, h):
         volume = volume_of(state.cell)
-        after = volume + h * box.inverse_mass * state.bath[-1]
+        after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
         scale = (after / volume) ** (1 / 3)
         scale_array(state.position, scale)
         scale_array(state.velocity, 1 / scale)
         scale_array(state.cell, scale)
-        state.books[WORK] -= asked(box.pressure, state, 0) * (after - volume)
+        state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
 
-    return stretch
+    return scale_box
 
 
-@implements(move_box, Piston)
-def _kick_piston(box, model, terms, state, load, room, cursor, h, draw):
-    if cursor[1] != 1 or room.known[0] == 0:
-        status = tally_bodies(terms, state, load, room, PRESSED)
+@implements(apply_barostat, Piston)
+def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, draw):
+    if progress[1] != 1 or workspace.known[0] == 0:
+        status = compute_load_and_virial(terms, state, load, workspace, WITH_VIRIALS)
         if status != OK:
             return status
-        cursor[1] = 1
+        progress[1] = 1
     volume = volume_of(state.cell)
-    virial = room.tally[0, 1] + room.tally[0, 5] + room.tally[0, 9]
-    pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + box.beyond[1] / volume**2
-    before = state.bath[-1]
-    state.bath[-1] += h * (pressure - asked(box.pressure, state, 0))
-    state.books[WORK] -= 0.5 * box.inverse_mass * (state.bath[-1] ** 2 - before**2)
+    virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
+    pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + barostat.tail[1] / volume**2
+    before = state.extra_variables[-1]
+    state.extra_variables[-1] += h * (pressure - target_pressure(barostat.pressure, state, 0))
+    state.energy_ledger[WORK] -= 0.5 * barostat.inverse_mass * (state.extra_variables[-1] ** 2 - before**2)
     return OK
 
 
-@implements(move_box)
-def _move_box(box, model, terms, state, load, room, cursor, h, draw):
-    if is_a(box, NoBox):
-        return lambda box, model, terms, state, load, room, cursor, h, draw: OK
-    if is_a(box, Piston):
+@implements(apply_barostat)
+def _apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
+    if is_a(barostat, NoBarostat):
+        return lambda barostat, model, terms, state, load, workspace, progress, h, draw: OK
+    if is_a(barostat, Piston):
         return None
 
-    def try_move(box, model, terms, state, load, room, cursor, h, draw):
-        if cursor[2] == 0:
-            if cursor[1] != 1 or room.known[0] == 0:
-                cursor[1] = 0
-                status = tally_bodies(terms, state, load, room, TALLIED)
+    def try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
+        if progress[2] == 0:
+            if progress[1] != 1 or workspace.known[0] == 0:
+                progress[1] = 0
+                status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
                 if status != OK:
                     return status
-                cursor[1] = 1
-            propose(box, model, state, room, h, draw)
-            keep(state, load, room)
-            apply_strain(box, state, room)
-            cursor[2] = 1
-        status = tally_bodies(terms, state, load, room, TALLIED)
+                progress[1] = 1
+            propose_strain(barostat, model, state, workspace, h, draw)
+            save_before_move(state, load, workspace)
+            apply_strain(barostat, state, workspace)
+            progress[2] = 1
+        status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
         if status != OK:
             return status
-        cursor[2] = 0
-        chance = log_chance(box, model, state, room, h)
-        u, _ = uniforms(box.key, draw + 8, 0, state.step[NOW])
-        room.counts[0] += 1
+        progress[2] = 0
+        chance = log_chance(barostat, model, state, workspace, h)
+        u, _ = uniforms(barostat.key, draw + 8, 0, state.step[NOW])
+        workspace.counts[0] += 1
         if log(u) < chance:
-            room.counts[1] += 1
-            state.books[WORK] += energy_gained(box, model, state, room)
+            workspace.counts[1] += 1
+            state.energy_ledger[WORK] += energy_gained(barostat, model, state, workspace)
         else:
-            take_back(state, load, room)
-            terms.known[0] = 0
+            undo_move(state, load, workspace)
+            terms.tallies_valid[0] = 0
         return OK
 
     return try_move
 
 
 @kernel(inline=True)
-def asked(pressure, state, k):
+def target_pressure(pressure, state, k):
     """Component k of the pressure asked for in the step that is being taken."""
-    share = (state.step[NOW] - state.step[ORIGIN] + 1) / pressure.steps
-    return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * share
+    fraction = (state.step[NOW] - state.step[ORIGIN] + 1) / pressure.steps
+    return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction
 
 
 @kernel
-def keep(state, load, room):
+def save_before_move(state, load, workspace):
     """Remember what a move changes."""
-    copy(state.position, room.position)
-    copy(state.velocity, room.velocity)
-    copy(load.force, room.load.force)
-    copy(load.torque_body, room.load.torque_body)
-    copy(room.tally[:1], room.tally[1:])
-    copy(state.cell, room.cell)
+    copy(state.position, workspace.position)
+    copy(state.velocity, workspace.velocity)
+    copy(load.force, workspace.load.force)
+    copy(load.torque_body, workspace.load.torque_body)
+    copy(workspace.tally[:1], workspace.tally[1:])
+    copy(state.cell, workspace.cell)
 
 
 @kernel
-def take_back(state, load, room):
+def undo_move(state, load, workspace):
     """Undo a move."""
-    copy(room.position, state.position)
-    copy(room.velocity, state.velocity)
-    copy(room.load.force, load.force)
-    copy(room.load.torque_body, load.torque_body)
-    copy(room.tally[1:], room.tally[:1])
-    copy(room.cell, state.cell)
+    copy(workspace.position, state.position)
+    copy(workspace.velocity, state.velocity)
+    copy(workspace.load.force, load.force)
+    copy(workspace.load.torque_body, load.torque_body)
+    copy(workspace.tally[1:], workspace.tally[:1])
+    copy(workspace.cell, state.cell)
 
 
-def propose(box, model, state, room, h, draw):
-    """Draw the strain of a move, with its drift and variance, into room.strain, and T and its inverse."""
+def propose_strain(barostat, model, state, workspace, h, draw):
+    """Draw the strain of a move, with its drift and variance, into workspace.strain, and T and its inverse."""
     raise TypeError("compiled code only")
 
 
-def log_chance(box, model, state, room, h):
+def log_chance(barostat, model, state, workspace, h):
     """The logarithm of the chance of a move that has been made to be kept."""
     raise TypeError("compiled code only")
 
 
-@implements(propose)
-def _propose(box, model, state, room, h, draw):
-    if is_a(box, VolumeMoves):
+@implements(propose_strain)
+def _propose(barostat, model, state, workspace, h, draw):
+    if is_a(barostat, VolumeMoves):
 
-        def propose_volume(box, model, state, room, h, draw):
-            u, _ = uniforms(box.key, draw, 0, state.step[NOW])
+        def propose_volume(barostat, model, state, workspace, h, draw):
+            u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
             volume = volume_of(state.cell)
-            room.strain[0] = 0.0
+            workspace.strain[0] = 0.0
             for k in range(3):
-                room.strain[0, k] = log(max(1 + (2 * u - 1) * box.width / volume, 0.1)) / 3
-            set_matrices(room)
+                workspace.strain[0, k] = log(max(1 + (2 * u - 1) * barostat.width / volume, 0.1)) / 3
+            set_matrices(workspace)
 
         return propose_volume
 
-    def propose_strain(box, model, state, room, h, draw):
-        drift(box, model, state, room, h, room.strain[1], room.strain[2])
+    def propose_strain(barostat, model, state, workspace, h, draw):
+        drift(barostat, model, state, workspace, h, workspace.strain[1], workspace.strain[2])
         for c in range(6):
-            xi, _ = normals(box.key, draw + c, 0, state.step[NOW])
+            xi, _ = normals(barostat.key, draw + c, 0, state.step[NOW])
             for k in range(6):
-                if box.coordinate[k] == c:
-                    room.strain[0, k] = room.strain[1, k] + sqrt(room.strain[2, k]) * xi
-        set_matrices(room)
+                if barostat.coordinate[k] == c:
+                    workspace.strain[0, k] = workspace.strain[1, k] + sqrt(workspace.strain[2, k]) * xi
+        set_matrices(workspace)
 
     return propose_strain
 
 
 @kernel
-def drift(box, model, state, room, h, mean, variance):
+def drift(barostat, model, state, workspace, h, mean, variance):
     """Mean and variance of the strain of a move, by component (6,), into `mean` and `variance`; 0 of what stays."""
     volume = volume_of(state.cell)
-    thermal = present(box.thermal_energy, state)
+    thermal = ramp_value(barostat.thermal_energy, state)
     for k in range(6):
         mean[k] = variance[k] = 0.0
     for c in range(6):
         push, shared = 0.0, 0
         for k in range(6):
-            if box.coordinate[k] == c:
-                push += driving(box, model, state, room, k, volume, thermal)
+            if barostat.coordinate[k] == c:
+                push += strain_force(barostat, model, state, workspace, k, volume, thermal)
                 shared += 1
         for k in range(6):
-            if box.coordinate[k] == c:
-                variance[k] = 2 * thermal * box.rate * h / (3 * volume * shared)
+            if barostat.coordinate[k] == c:
+                variance[k] = 2 * thermal * barostat.rate * h / (3 * volume * shared)
                 mean[k] = max(-LONGEST_DRIFT, min(LONGEST_DRIFT, variance[k] / (2 * thermal) * push))
 
 
 @kernel
-def driving(box, model, state, room, k, volume, thermal):
+def strain_force(barostat, model, state, workspace, k, volume, thermal):
     """What drives component k of the strain: minus the derivative of H + P0 V, u Å²/ps²."""
     i, j = COMPONENTS[k]
-    total = room.tally[0, 1 + 3 * j + i] - volume * asked(box.pressure, state, k)
+    total = workspace.tally[0, 1 + 3 * j + i] - volume * target_pressure(barostat.pressure, state, k)
     for m in range(len(state.velocity)):
         total += model.mass[model.species[m]] * state.velocity[m, i] * state.velocity[m, j]
     if k < 3:
-        total += box.beyond[1] / volume + box.at_rest[k] * thermal
+        total += barostat.tail[1] / volume + barostat.at_rest[k] * thermal
     return total
 
 
 @kernel
-def set_matrices(room):
+def set_matrices(workspace):
     """T and its inverse of the strain: exp of the diagonal, the rest as it is."""
-    matrix, inverse, strain = room.turned[0], room.turned[1], room.strain[0]
+    matrix, inverse, strain = workspace.matrices[0], workspace.matrices[1], workspace.strain[0]
     matrix[:] = 0.0
     inverse[:] = 0.0
     for k in range(3):
@@ -367,12 +368,12 @@ def set_matrices(room):
 
 
 @kernel
-def apply_strain(box, state, room):
+def apply_strain(barostat, state, workspace):
     """Multiply centres and cell by T; momenta, where the box changes them, by its inverse."""
-    matrix = room.turned[0]
+    matrix = workspace.matrices[0]
     times(state.position, matrix)
     times(state.cell, matrix)
-    give_way(box, state, room)
+    rescale_velocities(barostat, state, workspace)
 
 
 @kernel(inline=True)
@@ -385,18 +386,18 @@ def times(rows, matrix):
         rows[m, 2] = z * matrix[2, 2]
 
 
-def give_way(box, state, room):
+def rescale_velocities(barostat, state, workspace):
     """Change the velocities with the strain, or not."""
     raise TypeError("compiled code only")
 
 
-@implements(give_way)
-def _give_way(box, state, room):
-    if is_a(box, VolumeMoves):
-        return lambda box, state, room: None
+@implements(rescale_velocities)
+def _rescale_velocities(barostat, state, workspace):
+    if is_a(barostat, VolumeMoves):
+        return lambda barostat, state, workspace: None
 
-    def contravariant(box, state, room):
-        inverse = room.turned[1]
+    def contravariant(barostat, state, workspace):
+        inverse = workspace.matrices[1]
         for m in range(len(state.velocity)):
             x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
             state.velocity[m, 0] = inverse[0, 0] * x
@@ -407,54 +408,60 @@ def _give_way(box, state, room):
 
 
 @kernel
-def energy_gained(box, model, state, room):
+def energy_gained(barostat, model, state, workspace):
     """Change of potential and kinetic energy by the move (u Å²/ps²), dispersion beyond the cut-off included."""
-    gained = room.tally[0, 0] - room.tally[1, 0]
-    gained += box.beyond[0] * (1 / volume_of(state.cell) - 1 / volume_of(room.cell))
+    gained = workspace.tally[0, 0] - workspace.tally[1, 0]
+    gained += barostat.tail[0] * (1 / volume_of(state.cell) - 1 / volume_of(workspace.cell))
     for m in range(len(state.velocity)):
         for k in range(3):
-            squares = state.velocity[m, k] ** 2 - room.velocity[m, k] ** 2
+            squares = state.velocity[m, k] ** 2 - workspace.velocity[m, k] ** 2
             gained += 0.5 * model.mass[model.species[m]] * squares
     return gained
 
 
 @implements(log_chance)
-def _log_chance(box, model, state, room, h):
-    if is_a(box, VolumeMoves):
+def _log_chance(barostat, model, state, workspace, h):
+    if is_a(barostat, VolumeMoves):
 
-        def of_volume(box, model, state, room, h):
-            before, after = volume_of(room.cell), volume_of(state.cell)
-            work = energy_gained(box, model, state, room) + asked(box.pressure, state, 0) * (after - before)
-            return box.molecules * log(after / before) - work / present(box.thermal_energy, state)
+        def of_volume(barostat, model, state, workspace, h):
+            before, after = volume_of(workspace.cell), volume_of(state.cell)
+            work = energy_gained(barostat, model, state, workspace) + target_pressure(barostat.pressure, state, 0) * (
+                after - before
+            )
+            return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
 
         return of_volume
 
-    def of_strain(box, model, state, room, h):
-        before, after = volume_of(room.cell), volume_of(state.cell)
-        matrix, inverse = room.turned[0], room.turned[1]
-        there, back = room.strain, np.zeros((2, 6))
-        drift(box, model, state, room, h, back[0], back[1])
-        mean = (asked(box.pressure, state, 0) + asked(box.pressure, state, 1) + asked(box.pressure, state, 2)) / 3
-        work = energy_gained(box, model, state, room) + mean * (after - before)
+    def of_strain(barostat, model, state, workspace, h):
+        before, after = volume_of(workspace.cell), volume_of(state.cell)
+        matrix, inverse = workspace.matrices[0], workspace.matrices[1]
+        there, back = workspace.strain, np.zeros((2, 6))
+        drift(barostat, model, state, workspace, h, back[0], back[1])
+        mean = (
+            target_pressure(barostat.pressure, state, 0)
+            + target_pressure(barostat.pressure, state, 1)
+            + target_pressure(barostat.pressure, state, 2)
+        ) / 3
+        work = energy_gained(barostat, model, state, workspace) + mean * (after - before)
         chance = log(after / before)
         used = -1
         for k in range(6):
-            if box.coordinate[k] < 0:
+            if barostat.coordinate[k] < 0:
                 continue
             i, j = COMPONENTS[k]
             turn = there[0, k]
             turn_back = -turn if k < 3 else inverse[i, j]
-            deviation = asked(box.pressure, state, k) - (mean if k < 3 else 0.0)
+            deviation = target_pressure(barostat.pressure, state, k) - (mean if k < 3 else 0.0)
             work += deviation * 0.5 * (before + after) * 0.5 * (turn - turn_back)
             if k < 3:
-                chance += box.at_rest[k] * turn
-            if box.coordinate[k] > used:  # coordinates are numbered in the order of their first component
-                used = box.coordinate[k]
+                chance += barostat.at_rest[k] * turn
+            if barostat.coordinate[k] > used:  # coordinates are numbered in the order of their first component
+                used = barostat.coordinate[k]
                 chance += 0.5 * (turn - there[1, k]) ** 2 / there[2, k] + 0.5 * log(there[2, k])
                 chance -= 0.5 * (turn_back - back[0, k]) ** 2 / back[1, k] + 0.5 * log(back[1, k])
-        if box.coordinate[3] >= 0:
+        if barostat.coordinate[3] >= 0:
             # densities of T and of its inverse in the left invariant measure of lower triangular matrices
             chance -= 2 * (log(matrix[1, 1]) + 2 * log(matrix[2, 2]))
-        return chance - work / present(box.thermal_energy, state)
+        return chance - work / ramp_value(barostat.thermal_energy, state)
 
     return of_strain

@@ -5,34 +5,41 @@ from typing import NamedTuple
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import NOW, WORK
 from rigidmd.dynamics.force_gradient import add_gyration, displace
-from rigidmd.dynamics.step_loop import drift, kick, pay
-from rigidmd.forces.body.frame import Inertial, Turning, follow, frame_rate
-from rigidmd.forces.body.resistance import NoResistance, Resistance, push
+from rigidmd.dynamics.step_loop import accumulate_work, drift, kick
+from rigidmd.forces.body.frame import InertialFrame, RotatingFrame, frame_rate, rotate_with_frame
+from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.forces.terms import total_power
-from rigidmd.mechanics.free_rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, turn_along
-from rigidmd.mechanics.translation import Free, Immersed, Pinned, along, carry, inertial_mass
+from rigidmd.mechanics.free_rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, rotate_by_vector
+from rigidmd.mechanics.translation import (
+    FluidTranslation,
+    FreeTranslation,
+    NoTranslation,
+    body_component,
+    inertial_mass,
+    translate,
+)
 
 
 class Body(NamedTuple):
     """What never changes during a run of a single body, in SI units; the counterpart of `Model` for molecules."""
 
-    flight: Free | Pinned | Immersed
+    flight: FreeTranslation | NoTranslation | FluidTranslation
     rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
-    frame: Inertial | Turning = Inertial()
+    frame: InertialFrame | RotatingFrame = InertialFrame()
     resistance: NoResistance | Resistance = NoResistance()
 
 
 @implements(kick, Body, inline=True)
-def _kick_body(model, code, state, load, waiting, h):
-    push(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
-    return waiting
+def _kick_body(model, code, state, load, pending, h):
+    kick_with_resistance(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
+    return pending
 
 
 @implements(drift, Body, inline=True)
-def _drift_body(model, code, state, load, waiting, h):
+def _drift_body(model, code, state, load, pending, h):
     time = state.time[NOW]
-    carry(model.flight, model.rotor, state, time, h)
-    follow(model.frame, state, time, h)
+    translate(model.flight, model.rotor, state, time, h)
+    rotate_with_frame(model.frame, state, time, h)
 
 
 @implements(displace, Body, inline=True)
@@ -42,7 +49,7 @@ def _displace_body(model, state, load, tau):
             state.position[k, i] += tau / model.flight.mass * load.force[k, i]
     for k in range(len(load.torque_body)):
         n, time = load.torque_body[k], state.time[NOW]
-        turn_along(
+        rotate_by_vector(
             state.rotation[k],
             tau * moments(model.rotor, time, 0)[0] * n[0],
             tau * moments(model.rotor, time, 1)[0] * n[1],
@@ -62,18 +69,18 @@ def _add_gyration_of_body(model, load, tau, gain):
         gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
 
 
-@implements(pay, inline=True)
-def _pay_body(model, terms, state, h):
+@implements(accumulate_work, inline=True)
+def _accumulate_work_of_body(model, terms, state, h):
     if not is_a(model, Body):
         return None
-    if not any(getattr(term.instance_class, "drives", False) for term in terms.types):
+    if not any(getattr(term.instance_class, "time_dependent", False) for term in terms.types):
         return lambda model, terms, state, h: None
 
-    def pay_body(model, terms, state, h):
+    def accumulate_work_of_body(model, terms, state, h):
         velocity, omega = relative_motion(model, state)
-        state.books[WORK] += h * total_power(terms, state, velocity, omega)
+        state.energy_ledger[WORK] += h * total_power(terms, state, velocity, omega)
 
-    return pay_body
+    return accumulate_work_of_body
 
 
 @kernel
@@ -87,9 +94,9 @@ def relative_motion(model, state):
         velocity = (V[0], V[1], V[2])
         if len(state.rotation):
             q = state.rotation[0]
-            a = along(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
-            b = along(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
-            c = along(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
+            a = body_component(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
+            b = body_component(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
+            c = body_component(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
             velocity = (
                 q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
                 q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,
@@ -108,8 +115,8 @@ def relative_motion(model, state):
         i1, h1 = moments(model.rotor, state.time[NOW], 1)
         i2, h2 = moments(model.rotor, state.time[NOW], 2)
         omega = (
-            (L[0] - h0) * i0 - along(q, W, 0),
-            (L[1] - h1) * i1 - along(q, W, 1),
-            (L[2] - h2) * i2 - along(q, W, 2),
+            (L[0] - h0) * i0 - body_component(q, W, 0),
+            (L[1] - h1) * i1 - body_component(q, W, 1),
+            (L[2] - h2) * i2 - body_component(q, W, 2),
         )
     return velocity, omega

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import OK, Load, State, no_load
-from rigidmd.forces.terms import OTHER, PLAIN, load_now
+from rigidmd.forces.terms import FORCES_ONLY, INTO_OTHER_LOAD, compute_load
 
 #: The difference is taken over this fraction of tau a. Over the whole of tau a (Wisdom, Holman & Touma 1996), the kick
 #: is not the gradient of a potential at order tau². With this fraction that defect is below the scheme's own error, and
@@ -23,7 +23,7 @@ from rigidmd.forces.terms import OTHER, PLAIN, load_now
 FRACTION = 1 / 256
 
 
-class Probe(NamedTuple):
+class GradientWorkspace(NamedTuple):
     """Arrays for forces at displaced positions."""
 
     position: np.ndarray  # to restore, as in State
@@ -31,9 +31,9 @@ class Probe(NamedTuple):
     load: Load
 
 
-def probe_for(state: State) -> Probe:
+def gradient_workspace(state: State) -> GradientWorkspace:
     """A probe for the bodies of a state."""
-    return Probe(np.empty_like(state.position), np.empty_like(state.rotation), no_load(state))
+    return GradientWorkspace(np.empty_like(state.position), np.empty_like(state.rotation), no_load(state))
 
 
 def displace(model, state, load, tau):
@@ -56,7 +56,7 @@ def evaluate(model, state, load, terms, probe, tau, known):
         copy(state.position, probe.position)
         copy(state.rotation, probe.rotation)
         displace(model, state, load, FRACTION * tau)
-    status = load_now(terms, state, probe.load if known else load, OTHER if known else PLAIN)
+    status = compute_load(terms, state, probe.load if known else load, INTO_OTHER_LOAD if known else FORCES_ONLY)
     if known:
         copy(probe.position, state.position)
         copy(probe.rotation, state.rotation)

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.model import Model
 from rigidmd.units import BOLTZMANN
 
 #: A total momentum below this fraction of the sum of |m v| is rounding.
 AT_REST = 1e-9
 
 
-class Freedom(NamedTuple):
+class DegreesOfFreedom(NamedTuple):
     """Degrees of freedom. Conserved components of the total momentum are zero and not counted."""
 
     translation: int
@@ -25,14 +25,14 @@ class Freedom(NamedTuple):
         return self.translation + self.rotation
 
 
-def freedom_of(model: Model) -> Freedom:
+def count_degrees_of_freedom(model: Model) -> DegreesOfFreedom:
     """Degrees of freedom of all molecules together."""
     turning = (model.inertia > 0).sum(axis=1)
     free = 3 * int(mobile(model).sum()) - int(model.keeps_momentum.sum())
-    return Freedom(free, int(turning[model.species].sum()))
+    return DegreesOfFreedom(free, int(turning[model.species].sum()))
 
 
-def kept_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
+def conserved_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
     """Which components (3,) of the total momentum are conserved: none among frozen molecules, which hold the others;
     else those that no term says to change (`changes_momentum`).
 
@@ -68,7 +68,7 @@ def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.
     `temperature` (K)."""
     thermal = BOLTZMANN * temperature
     mass = model.mass[model.species]
-    freedom = freedom_of(model)
+    freedom = count_degrees_of_freedom(model)
     spread = np.sqrt(thermal * model.inverse_mass[model.species])
     state.velocity[:] = rng.standard_normal(state.velocity.shape) * spread[:, None]
     remove_momentum(model, state.velocity)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.compile.simd import load, store, width_of
+from rigidmd.compile.simd import lanes_of, load, store
 
 #: Purposes. Each has its own stream, so that an additional draw for one changes nothing for the others.
-LATTICE, MOMENTA, BATH, BOX = 1, 2, 3, 4
+LATTICE, MOMENTA, THERMOSTAT, BAROSTAT = 1, 2, 3, 4
 
 MULTIPLIER_0, MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 WEYL_0, WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
@@ -114,7 +114,7 @@ def fill_normals(found, words, key, draw, first, step):
     fill_words(words[0], key, draw, first, step)
     fill_words(words[1], key, draw + 1, first, step)
     _fill_pairs(found, words.reshape(-1))
-    for m in range(0, 3 * BATCH, width_of(found)):
+    for m in range(0, 3 * BATCH, lanes_of(found)):
         radius, angle = sqrt(-2.0 * log(load(found, m))), load(found, 3 * BATCH + m)
         store(found, m, radius * cos(angle))
         store(found, 3 * BATCH + m, radius * sin(angle))

@@ -1,18 +1,16 @@
 """Sums over the molecules of a state and its largest numbers, for a look at a run: one pass over each array, where
 NumPy takes a dozen with arrays between."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import EXAMPLE, Load, State
-
-if TYPE_CHECKING:
-    from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.model import Model
 
 
-class Sums(NamedTuple):
+class StateSums(NamedTuple):
     """In u, Å, ps."""
 
     translation: float  # sum m V²
@@ -24,11 +22,11 @@ class Sums(NamedTuple):
     orthogonality_error: float  # largest entry of |Q^T Q - 1|; NaN if one is
 
 
-#: How many numbers there are in `Sums`.
-SUMS = 17
+#: How many numbers there are in `StateSums`.
+SUM_COUNT = 17
 
 
-class Extent(NamedTuple):
+class LargestValues(NamedTuple):
     """The largest size of a number in each array of a state and a load; NaN if one is, 0 of an empty array."""
 
     position: float
@@ -43,17 +41,17 @@ class Extent(NamedTuple):
 SIZE = np.int64(2**63 - 1)
 
 
-def extent_of(state: State, load: Load = EXAMPLE[1]) -> Extent:
+def largest_values(state: State, load: Load = EXAMPLE[1]) -> LargestValues:
     """The extent of a state and of the load on it."""
-    found = np.empty(len(Extent._fields))
+    found = np.empty(len(LargestValues._fields))
     arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
     find_largest(*(array.ravel() for array in arrays), found)
-    return Extent(*found.tolist())
+    return LargestValues(*found.tolist())
 
 
 @kernel(outer=True)
 def find_largest(position, velocity, rotation, angular, force, torque, found):
-    """Fill in the numbers (6,) of an `Extent` of arrays as rows of numbers."""
+    """Fill in the numbers (6,) of an `LargestValues` of arrays as rows of numbers."""
     bits = found.view(np.int64)
     bits[0], bits[1], bits[2] = _largest(position), _largest(velocity), _largest(rotation)
     bits[3], bits[4], bits[5] = _largest(angular), _largest(force), _largest(torque)
@@ -70,39 +68,39 @@ def _largest(values):
     return most
 
 
-def sums_over(model: "Model", state: State, load: Load = EXAMPLE[1]) -> Sums:
+def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateSums:
     """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
-    found = np.zeros(SUMS)
-    add_up(
+    found = np.zeros(SUM_COUNT)
+    fill_sums(
         model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
         state.angular_momentum_body, load.force, load.torque_body, found,
     )  # fmt: skip
-    return sums_of(found)
+    return unpack_sums(found)
 
 
-def sums_of(found: np.ndarray) -> Sums:
-    """The sums in the numbers that `add_up` has filled in."""
+def unpack_sums(found: np.ndarray) -> StateSums:
+    """The sums in the numbers that `fill_sums` has filled in."""
     translation, rotation, force, torque, orthogonality_error = found[:5].tolist()
     vectors = found[5:].copy()
-    return Sums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality_error)
+    return StateSums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality_error)
 
 
 @kernel(outer=True)
-def add_up(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found):
-    """Fill in the numbers (SUMS,) of `Sums`: orthogonality is the fifth, then come momentum and flow."""
+def fill_sums(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found):
+    """Fill in the numbers (SUMS,) of `StateSums`: orthogonality is the fifth, then come momentum and flow."""
     px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
     for m in range(len(velocity)):
-        own = mass[species[m]]
+        m_i = mass[species[m]]
         x, y, z = velocity[m, 0], velocity[m, 1], velocity[m, 2]
-        px += own * x
-        py += own * y
-        pz += own * z
-        xx += own * x * x
-        yy += own * y * y
-        zz += own * z * z
-        xy += own * x * y
-        xz += own * x * z
-        yz += own * y * z
+        px += m_i * x
+        py += m_i * y
+        pz += m_i * z
+        xx += m_i * x * x
+        yy += m_i * y * y
+        zz += m_i * z * z
+        xy += m_i * x * y
+        xz += m_i * x * z
+        yz += m_i * y * z
     for m in range(len(force)):
         pushed += inverse_mass[species[m]] * (force[m, 0] ** 2 + force[m, 1] ** 2 + force[m, 2] ** 2)
     for m in range(len(angular)):

@@ -1,51 +1,42 @@
-"""The compiled loop: n steps of any row of flows, any terms, any bath, any box."""
+"""The compiled loop: n steps of any row of flows, any terms, any thermostat, any barostat."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Bound, Code, call_blocks, implements, is_a, kernel, opened, packed, task
-from rigidmd.core.integrators import BATH, BOX, DRIFT, KICK, STRETCH, Scheme
-from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, TAKEN, WORK
-from rigidmd.dynamics.barostats import load_for, move_box, stretch
+from rigidmd.compile import BoundTask, Code, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task
+from rigidmd.core.integrators import BAROSTAT, DRIFT, KICK, SCALE_BOX, THERMOSTAT, Scheme
+from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK
+from rigidmd.dynamics.barostats import apply_barostat, compute_load_for_barostat, scale_box
 from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
-from rigidmd.dynamics.observables import SUMS, Extent, Sums, add_up, find_largest, sums_of
-from rigidmd.dynamics.thermostats import apply, bath_code
-from rigidmd.forces.neighbors.sites import blocks_of, share_of
-from rigidmd.forces.terms import PLAIN, TALLIED, is_driven, total_energy_rate
-from rigidmd.mechanics.batches import TOGETHER, kick_group, turn_group
-from rigidmd.mechanics.free_rotor import ExactRotor, NoRotor, SplitRotor, turn_along
+from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.observables import SUM_COUNT, LargestValues, StateSums, fill_sums, find_largest, unpack_sums
+from rigidmd.dynamics.thermostats import apply_thermostat, thermostat_code
+from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
+from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, has_time_dependent_terms, total_energy_rate
+from rigidmd.mechanics.batches import LANES, kick_group, rotate_group
+from rigidmd.mechanics.free_rotor import rotate_by_vector
 
 #: Random numbers that a flow may draw for one molecule in a step.
 DRAWS = 1 << 20
 #: Times of two kicks, 0 of one that there is not: kicks by the present load that are still to be done.
-NONE_WAITS = (0.0, 0.0)
+NO_PENDING_KICKS = (0.0, 0.0)
 #: Molecules that are kicked, moved and turned before the next ones: so many that a core keeps them at hand.
-AT_HAND = 32 * TOGETHER
+CACHE_GROUP = 32 * LANES
 
 
-class Model(NamedTuple):
-    """What never changes during a run of molecules."""
-
-    species: np.ndarray  # (n,) species of each molecule
-    mass: np.ndarray  # (species,) u
-    inverse_mass: np.ndarray  # (species,) 0 of what is frozen: nothing moves it
-    inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
-    inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
-    rotor: SplitRotor | ExactRotor | NoRotor
-    keeps_momentum: np.ndarray = np.ones(3, bool)  # (3,) components of the total momentum that nothing changes
-
-
-def code_of(model: NamedTuple, bath: tuple) -> Code | None:
+def molecule_code(model: NamedTuple, thermostat: tuple) -> Code | None:
     """The machine code that moves molecules; None of a single body, whose flows are compiled into the loop."""
     if not isinstance(model, Model):
         return None
     state, load = EXAMPLE
     bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
-    return Code(move=(_move, (*bodies, state, load, NONE_WAITS, 0.0, False)), **bath_code(bath, model))
+    return Code(
+        move=(_move, (*bodies, state, load, NO_PENDING_KICKS, 0.0, False)), **thermostat_code(thermostat, model)
+    )
 
 
-class Row(NamedTuple):
+class FlowArrays(NamedTuple):
     """The flows of a scheme as arrays, in their order."""
 
     kind: np.ndarray  # (flows,) KICK, DRIFT, BATH, REST, BOX or STRETCH
@@ -56,7 +47,7 @@ class Row(NamedTuple):
     last: int  # the last drift
 
 
-def row_of(scheme: Scheme) -> Row:
+def flow_arrays(scheme: Scheme) -> FlowArrays:
     """The flows of a scheme."""
     kind = np.array([flow.kind for flow in scheme.flows])
     fraction = np.array([flow.fraction for flow in scheme.flows])
@@ -65,17 +56,33 @@ def row_of(scheme: Scheme) -> Row:
     moment[last:] = 1.0
     gradient = np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None
     every = np.array([flow.every for flow in scheme.flows])
-    return Row(kind, fraction, moment, every, gradient, last)
+    return FlowArrays(kind, fraction, moment, every, gradient, last)
 
 
 @kernel
-def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor):
+def advance(
+    model,
+    code,
+    state,
+    load,
+    terms,
+    thermostat,
+    barostat,
+    flows,
+    gradient_workspace,
+    thermostat_workspace,
+    barostat_workspace,
+    dt,
+    until,
+    observed,
+    progress,
+):
     """Step until `until` steps of dt have been taken, counted in state.step.
 
-    code : see `code_of`
-    terms : of a body its workspaces, of molecules a `Loader`
+    code : see `molecule_code`
+    terms : of a body its workspaces, of molecules a `TermTable`
     probe : room for gradients; None compiles none
-    heat, room : of a bath, of a box (`baths.heat_room`, `boxes.box_room`)
+    thermostat_workspace, barostat_workspace : of a thermostat, of a box (`baths.thermostat_workspace`, `boxes.barostat_workspace`)
     looked : whether the forces at the end are computed with their energies and virials, if a kick needs them there
     cursor (3,) : flows done in this step; whether `load` is that of the present positions (1) or that with the gradient
         (2); whether a move of the box is made and not yet judged
@@ -85,154 +92,215 @@ def advance(model, code, state, load, terms, bath, box, row, probe, heat, room, 
     first of the next are done in one pass with the drift. A status code: when it is not OK, state and cursor are such
     that calling again continues without a trace.
     """
-    waiting = NONE_WAITS
+    pending = NO_PENDING_KICKS
     while state.step[NOW] < until:
-        while cursor[0] < len(row.kind):
-            k = cursor[0]
-            h = row.fraction[k] * dt
-            if row.kind[k] == KICK:
-                if probe is None:
-                    if cursor[1] == 0:
-                        last = looked and state.step[NOW] + 1 == until and k > row.last
-                        status = load_for(box, terms, state, load, room, row, TALLIED if last else PLAIN)
+        while progress[0] < len(flows.kind):
+            k = progress[0]
+            h = flows.fraction[k] * dt
+            if flows.kind[k] == KICK:
+                if gradient_workspace is None:
+                    if progress[1] == 0:
+                        last = observed and state.step[NOW] + 1 == until and k > flows.last
+                        status = compute_load_for_barostat(
+                            barostat,
+                            terms,
+                            state,
+                            load,
+                            barostat_workspace,
+                            flows,
+                            WITH_ENERGIES if last else FORCES_ONLY,
+                        )
                         if status != OK:
                             return status
-                        cursor[1] = 1
+                        progress[1] = 1
                 else:
-                    while cursor[1] < (1 if row.gradient[k] == 0.0 else 2):
-                        waiting = catch_up(model, code, state, load, waiting)
-                        status = evaluate(model, state, load, terms, probe, row.gradient[k] * dt * dt, cursor[1] == 1)
+                    while progress[1] < (1 if flows.gradient[k] == 0.0 else 2):
+                        pending = apply_pending_kicks(model, code, state, load, pending)
+                        status = evaluate(
+                            model, state, load, terms, gradient_workspace, flows.gradient[k] * dt * dt, progress[1] == 1
+                        )
                         if status != OK:
                             return status
-                        cursor[1] += 1
-                pay(model, terms, state, 0.5 * h)
-                waiting = kick(model, code, state, load, waiting, h)
-                pay(model, terms, state, 0.5 * h)
-            elif row.kind[k] == DRIFT:
-                drift(model, code, state, load, waiting, h)
-                waiting = NONE_WAITS
-                state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + row.moment[k]) * dt
-                cursor[1] = 0
-            elif (state.step[NOW] - state.step[ORIGIN] + 1) % row.every[k] == 0:
-                waiting = catch_up(model, code, state, load, waiting)
-                if row.kind[k] == BATH:
-                    apply(bath, model, code, state, heat, h, DRAWS * k)
-                elif row.kind[k] == BOX:
-                    status = move_box(box, model, terms, state, load, room, cursor, h, DRAWS * k)
+                        progress[1] += 1
+                accumulate_work(model, terms, state, 0.5 * h)
+                pending = kick(model, code, state, load, pending, h)
+                accumulate_work(model, terms, state, 0.5 * h)
+            elif flows.kind[k] == DRIFT:
+                drift(model, code, state, load, pending, h)
+                pending = NO_PENDING_KICKS
+                state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                progress[1] = 0
+            elif (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0:
+                pending = apply_pending_kicks(model, code, state, load, pending)
+                if flows.kind[k] == THERMOSTAT:
+                    apply_thermostat(thermostat, model, code, state, thermostat_workspace, h, DRAWS * k)
+                elif flows.kind[k] == BAROSTAT:
+                    status = apply_barostat(
+                        barostat, model, terms, state, load, barostat_workspace, progress, h, DRAWS * k
+                    )
                     if status != OK:
                         return status
-                elif row.kind[k] == STRETCH:
-                    stretch(box, state, h)
-                    cursor[1] = 0
+                elif flows.kind[k] == SCALE_BOX:
+                    scale_box(barostat, state, h)
+                    progress[1] = 0
                 else:
-                    rest(model, state)
-            cursor[0] += 1
-        cursor[0] = 0
+                    remove_momentum_flow(model, state)
+            progress[0] += 1
+        progress[0] = 0
         state.step[NOW] += 1
-    catch_up(model, code, state, load, waiting)
+    apply_pending_kicks(model, code, state, load, pending)
     return OK
 
 
-#: Numbers of `Advance`: what a call is told (`until`, `looked`), its status, and the three of the cursor.
-UNTIL, LOOKED, STATUS, CURSOR = 0, 1, 2, 3
+#: Numbers of `Advance`: what a call is told (`until`, `observed`), its status, and the three of the cursor.
+UNTIL, OBSERVED, STATUS, PROGRESS = 0, 1, 2, 3
 
 
 class Advance:
-    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `looked` and the cursor.
+    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `observed` and the cursor.
 
     At the end it measures the state and its load while the cores still have them at hand.
     """
 
     def __init__(self, *arguments):
-        self._dt, self._told = np.zeros(1), np.zeros(CURSOR + 3, np.int64)
-        self._extent, self._sums = np.zeros(len(Extent._fields)), np.zeros(SUMS)
-        self._call = Bound(_advance, (arguments, self._dt, self._told, self._extent, self._sums))
+        self._dt, self._integers = np.zeros(1), np.zeros(PROGRESS + 3, np.int64)
+        self._extent, self._sums = np.zeros(len(LargestValues._fields)), np.zeros(SUM_COUNT)
+        self._call = BoundTask(_advance, (arguments, self._dt, self._integers, self._extent, self._sums))
 
-    def begin(self, dt: float, until: int, looked: bool, loaded: bool) -> None:
+    def begin(self, dt: float, until: int, observed: bool, loaded: bool) -> None:
         """Say what the next calls do. loaded : whether the load is that of the present positions"""
         self._dt[0] = dt
-        self._told[:] = until, looked, OK, 0, loaded, 0
+        self._integers[:] = until, observed, OK, 0, loaded, 0
 
     def __call__(self) -> int:
         """Go on; a status code."""
         self._call()
-        return int(self._told[STATUS])
+        return int(self._integers[STATUS])
 
     @property
     def loaded(self) -> bool:
         """Whether the load is that of the present positions."""
-        return self._told[CURSOR + 1] != 0
+        return self._integers[PROGRESS + 1] != 0
 
     @property
-    def extent(self) -> Extent:
+    def extent(self) -> LargestValues:
         """That of the state, and of the load as last computed."""
-        return Extent(*self._extent.tolist())
+        return LargestValues(*self._extent.tolist())
 
     @property
-    def sums(self) -> Sums | None:
+    def sums(self) -> StateSums | None:
         """The sums over the state and its load; None if the last call was not to be looked at."""
-        return sums_of(self._sums) if self._told[LOOKED] else None
+        return unpack_sums(self._sums) if self._integers[OBSERVED] else None
 
 
 @kernel(outer=True)
-def advance_body(model, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor):
+def advance_body(
+    model,
+    state,
+    load,
+    terms,
+    thermostat,
+    barostat,
+    flows,
+    gradient_workspace,
+    thermostat_workspace,
+    barostat_workspace,
+    dt,
+    until,
+    observed,
+    progress,
+):
     """`advance` of a body, for Python."""
-    return advance(model, None, state, load, terms, bath, box, row, probe, heat, room, dt, until, looked, cursor)
+    return advance(
+        model,
+        None,
+        state,
+        load,
+        terms,
+        thermostat,
+        barostat,
+        flows,
+        gradient_workspace,
+        thermostat_workspace,
+        barostat_workspace,
+        dt,
+        until,
+        observed,
+        progress,
+    )
 
 
 @task()
-def _advance(parcel, block):
-    (model, code, state, load, terms, bath, box, row, probe, heat, room), dt, told, extent, sums = opened(parcel)
-    told[STATUS] = advance(
-        model, code, state, load, terms, bath, box, row, probe, heat, room, dt[0], told[UNTIL], told[LOOKED] != 0,
-        told[CURSOR:],
+def _advance(arguments, block):
+    (
+        (
+            model,
+            code,
+            state,
+            load,
+            terms,
+            thermostat,
+            barostat,
+            flows,
+            gradient_workspace,
+            thermostat_workspace,
+            barostat_workspace,
+        ),
+        dt,
+        integers,
+        extent,
+        sums,
+    ) = load_arguments(arguments)
+    integers[STATUS] = advance(
+        model, code, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace, barostat_workspace, dt[0], integers[UNTIL], integers[OBSERVED] != 0,
+        integers[PROGRESS:],
     )  # fmt: skip
-    if told[STATUS] == OK:
+    if integers[STATUS] == OK:
         find_largest(
             state.position.ravel(), state.velocity.ravel(), state.rotation.ravel(),
             state.angular_momentum_body.ravel(), load.force.ravel(), load.torque_body.ravel(), extent,
         )  # fmt: skip
-        if told[LOOKED] != 0:
-            add_up(
+        if integers[OBSERVED] != 0:
+            fill_sums(
                 model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
                 state.angular_momentum_body, load.force, load.torque_body, sums,
             )  # fmt: skip
 
 
-def kick(model, code, state, load, waiting, h):
+def kick(model, code, state, load, pending, h):
     """Exact flow of the potential, in place: V += h F/m, L += h n_body. Returns the kicks that wait: of molecules, with
     those that have waited before, the kick itself; a body is kicked at once."""
     raise TypeError("compiled code only")
 
 
-def drift(model, code, state, load, waiting, h):
+def drift(model, code, state, load, pending, h):
     """The kicks that wait, and the flow of the kinetic energy, in place: free flight and free rotation."""
     raise TypeError("compiled code only")
 
 
-def catch_up(model, code, state, load, waiting):
+def apply_pending_kicks(model, code, state, load, pending):
     """Do the kicks that wait, in place; returns that none waits."""
     raise TypeError("compiled code only")
 
 
-def pay(model, terms, state, h):
+def accumulate_work(model, terms, state, h):
     """Add to the books what driving terms do over h; half before a kick, half after. On a body by their power at the
     present velocity; on molecules by the rate at which their energy changes where nothing moves."""
     raise TypeError("compiled code only")
 
 
-def rest(model, state):
+def remove_momentum_flow(model, state):
     """Take out the components of the total momentum that nothing changes, in place: the same velocity from all
     molecules; its energy goes into the books."""
     raise TypeError("compiled code only")
 
 
-@implements(rest)
-def _rest_molecules(model, state):
+@implements(remove_momentum_flow)
+def _remove_momentum_of_molecules(model, state):
     if not is_a(model, Model):
         return lambda model, state: None
 
-    def rest_molecules(model, state):
+    def remove_momentum_of_molecules(model, state):
         mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
         for m in range(len(state.velocity)):
             own = model.mass[model.species[m]]
@@ -246,37 +314,37 @@ def _rest_molecules(model, state):
             state.velocity[m, 0] -= px / mass
             state.velocity[m, 1] -= py / mass
             state.velocity[m, 2] -= pz / mass
-        state.books[TAKEN] -= (px * px + py * py + pz * pz) / (2 * mass)
+        state.energy_ledger[REMOVED] -= (px * px + py * py + pz * pz) / (2 * mass)
 
-    return rest_molecules
+    return remove_momentum_of_molecules
 
 
 @implements(kick, Model)
-def _kick_molecules(model, code, state, load, waiting, h):
-    if waiting[0] == 0.0:
+def _kick_molecules(model, code, state, load, pending, h):
+    if pending[0] == 0.0:
         return h, 0.0
-    if waiting[1] == 0.0:
-        return waiting[0], h
-    catch_up(model, code, state, load, waiting)
+    if pending[1] == 0.0:
+        return pending[0], h
+    apply_pending_kicks(model, code, state, load, pending)
     return h, 0.0
 
 
 @implements(drift, Model)
-def _drift_molecules(model, code, state, load, waiting, h):
-    _move_all(model, code, state, load, waiting, h, True)
+def _drift_molecules(model, code, state, load, pending, h):
+    _move_all(model, code, state, load, pending, h, True)
 
 
-@implements(catch_up)
-def _catch_up(model, code, state, load, waiting):
+@implements(apply_pending_kicks)
+def _apply_pending_kicks(model, code, state, load, pending):
     if not is_a(model, Model):
-        return lambda model, code, state, load, waiting: waiting
+        return lambda model, code, state, load, pending: pending
 
-    def catch_up_molecules(model, code, state, load, waiting):
-        if waiting[0] != 0.0:
-            _move_all(model, code, state, load, waiting, 0.0, False)
-        return NONE_WAITS
+    def apply_pending_kicks_of_molecules(model, code, state, load, pending):
+        if pending[0] != 0.0:
+            _move_all(model, code, state, load, pending, 0.0, False)
+        return NO_PENDING_KICKS
 
-    return catch_up_molecules
+    return apply_pending_kicks_of_molecules
 
 
 @implements(displace, Model)
@@ -287,7 +355,7 @@ def _displace_molecules(model, state, load, tau):
             state.position[m, k] += share * load.force[m, k]
     for m in range(len(state.rotation)):
         inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
-        turn_along(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
+        rotate_by_vector(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
 
 
 @implements(add_gyration, Model)
@@ -299,37 +367,39 @@ def _add_gyration_of_molecules(model, load, tau, gain):
             gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]
 
 
-@implements(pay)
-def _pay_for_molecules(model, terms, state, h):
+@implements(accumulate_work)
+def _accumulate_work_of_molecules(model, terms, state, h):
     if not is_a(model, Model):
         return None
-    if not is_driven(terms):
+    if not has_time_dependent_terms(terms):
         return lambda model, terms, state, h: None
 
-    def pay_for_molecules(model, terms, state, h):
-        state.books[WORK] += h * total_energy_rate(terms)
+    def accumulate_work_of_molecules(model, terms, state, h):
+        state.energy_ledger[WORK] += h * total_energy_rate(terms)
 
-    return pay_for_molecules
+    return accumulate_work_of_molecules
 
 
 @kernel
-def _move_all(model, code, state, load, waiting, h, drifts):
+def _move_all(model, code, state, load, pending, h, drifts):
     bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
-    call_blocks(code, "move", packed((*bodies, state, load, waiting, h, drifts)), blocks_of(len(state.position)))
+    call_blocks(
+        code, "move", pack_arguments((*bodies, state, load, pending, h, drifts)), blocks_of(len(state.position))
+    )
 
 
 @task()
-def _move(parcel, block):
+def _move(arguments, block):
     """The kicks that wait; and then, if there is a drift, free flight and free rotation."""
-    rotor, species, inverse_mass, inverse_inertia, state, load, waiting, h, drifts = opened(parcel)
-    first, end = share_of(len(state.position), block, TOGETHER)
-    for start in range(first, end, AT_HAND):
-        stop = min(end, start + AT_HAND)
-        for kick in waiting:
+    rotor, species, inverse_mass, inverse_inertia, state, load, pending, h, drifts = load_arguments(arguments)
+    first, end = molecules_of_block(len(state.position), block, LANES)
+    for start in range(first, end, CACHE_GROUP):
+        stop = min(end, start + CACHE_GROUP)
+        for kick in pending:
             if kick != 0.0:
                 kick_group(species, inverse_mass, inverse_inertia, state, load, start, stop, kick)
         if drifts:
             for m in range(start, stop):
                 for k in range(3):
                     state.position[m, k] += h * state.velocity[m, k]
-            turn_group(rotor, species, state.rotation, state.angular_momentum_body, start, stop, h)
+            rotate_group(rotor, species, state.rotation, state.angular_momentum_body, start, stop, h)

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from rigidmd.compile import implements, is_a
-from rigidmd.compile.own import foreign
-from rigidmd.dynamics.thermostats import apply
+from rigidmd.compile.kernels import compile_user_function
+from rigidmd.dynamics.thermostats import apply_thermostat
 from rigidmd.forces.terms import add_forces
 
 #: The classes that are forces and thermostats.
@@ -42,7 +42,7 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
 
     def register(function: Function) -> Function:
         _check_arguments(function, ("term", "state", "load", "tally"))
-        compiled = foreign(function)
+        compiled = compile_user_function(function)
         FORCES.add(kind)
 
         @implements(add_forces)
@@ -59,10 +59,10 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     """Make a NamedTuple class a thermostat: a flow on the momenta.
 
     @rigidmd.compiled_thermostat(Berendsen)
-    def rescale(bath, model, state, h, draw): ...
+    def rescale(thermostat, model, state, h, draw): ...
 
     The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the kinetic
-    energy that it puts in to `state.books[0]`, so that energy less heat is conserved. It acts half before and half
+    energy that it puts in to `state.energy_ledger[0]`, so that energy less heat is conserved. It acts half before and half
     after each step (`halved = False` in the class: all of it after the step); with integrator = "baoab" in its middle.
     `draw` is for counted random numbers (`rigidmd.dynamics.noise`). `changes_momentum = True` in the class says that it
     changes the total momentum.
@@ -70,14 +70,16 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     _check_class(kind)
 
     def register(function: Function) -> Function:
-        _check_arguments(function, ("bath", "model", "state", "h", "draw"))
-        compiled = foreign(function)
+        _check_arguments(function, ("thermostat", "model", "state", "h", "draw"))
+        compiled = compile_user_function(function)
         THERMOSTATS.add(kind)
 
-        @implements(apply)
-        def _apply(bath, model, code, state, room, h, draw):
-            if is_a(bath, kind):
-                return lambda bath, model, code, state, room, h, draw: compiled(bath, model, state, h, draw)
+        @implements(apply_thermostat)
+        def _apply(thermostat, model, code, state, workspace, h, draw):
+            if is_a(thermostat, kind):
+                return lambda thermostat, model, code, state, workspace, h, draw: compiled(
+                    thermostat, model, state, h, draw
+                )
 
         return function
 

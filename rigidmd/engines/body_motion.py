@@ -1,4 +1,4 @@
-"""The motion of a single body as the columns of motion.csv, with the errors of its invariants."""
+"""The motion of a single body: the columns of motion.csv, with the errors of the conserved quantities."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,19 +7,17 @@ import numpy as np
 
 from rigidmd.core.state import WORK, State
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.columns import BODY, BODY_COLUMNS, MATRIX, Column
-from rigidmd.forces.body.applied import Drive, SteadyForce, Told, steady_energies
-from rigidmd.forces.body.frame import Inertial
+from rigidmd.engines.samples import BODY, BODY_COLUMNS, MATRIX, Column
+from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce, steady_energies
+from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.mechanics.free_rotor import DrivenRotor
-from rigidmd.mechanics.rotation import direction, to_euler_angles, to_quaternion
-from rigidmd.mechanics.time_functions import is_steady
-from rigidmd.mechanics.translation import Immersed, inertial_masses
+from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion, unit_vector
+from rigidmd.mechanics.time_functions import is_constant_function
+from rigidmd.mechanics.translation import FluidTranslation, inertial_masses
 
 
 class Snapshot(NamedTuple):
-    """Time and state of a sample."""
-
     time: float
     state: State
 
@@ -28,12 +26,11 @@ class Snapshot(NamedTuple):
 class Motion:
     """The samples of a run as columns.
 
-    columns : arrays (t,), in SI units, by their names; `described` explains them. Position, velocity,
-        attitude and omega are relative to the frame; L is the angular momentum relative to axes that do not turn, that
-        of wheels (h) included, along the frame's (lab) or body's axes; the kinetic energy is that of I omega, without
-        that of wheels about their axes
-    invariants : what should stay constant; column NAME_error is its error since the start, energies relative to the
-        largest kinetic energy, L to the largest |L|
+    columns : name -> array (t,) in SI units; `described` explains them. Position, velocity, attitude and omega are
+        relative to the frame. L is the angular momentum relative to non-rotating axes, wheels (h) included, along the
+        axes of the frame (lab) or of the body. The kinetic energy is without that of wheels about their axes.
+    invariants : names of conserved quantities. Column NAME_error is the change since the start, of energies relative
+        to the largest kinetic energy, of L relative to the largest |L|.
     """
 
     columns: dict[str, np.ndarray]
@@ -46,7 +43,7 @@ class Motion:
         return f"<Motion: {len(self)} samples of {', '.join(self.columns)}>"
 
     def __getitem__(self, column: str) -> np.ndarray:
-        """A column as an array (t,) in SI units; "Q", of a body that turns, as matrices (t, 3, 3)."""
+        """A column as an array (t,) in SI units. "Q", for a body that rotates, gives matrices (t, 3, 3)."""
         if column not in self.described:
             raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
         if column == MATRIX:
@@ -67,7 +64,6 @@ class Motion:
 
 
 def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
-    """All columns of the samples of a run."""
     times = np.array([s.time for s in snapshots])
     parts = [np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)]
     states = State._make([*parts, np.zeros(0)])
@@ -85,7 +81,7 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
 
 
 def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of a family, by their names, from values (t, n)."""
+    """The columns of a family from values (t, n)."""
     return dict(zip(BODY[family].names, values.T, strict=True))
 
 
@@ -106,26 +102,26 @@ def _rotation_columns(
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """The same rotations, with signs that do not change from one sample to the next."""
-    turned = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
-    return quaternions * np.concatenate([[1.0], np.cumprod(np.where(turned < 0, -1.0, 1.0))])[:, None]
+    """The same rotations, with signs that do not jump from one sample to the next."""
+    overlap = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
+    return quaternions * np.concatenate([[1.0], np.cumprod(np.where(overlap < 0, -1.0, 1.0))])[:, None]
 
 
 def is_balanced(system: BodySystem) -> bool:
-    """Whether the energy less the work done is conserved: if the frame does not turn, or turns uniformly."""
+    """Whether the energy less the work is conserved: in an inertial frame or one that rotates uniformly."""
     frame = system.body.frame
-    return isinstance(frame, Inertial) or is_steady(frame.angular_velocity)
+    return isinstance(frame, InertialFrame) or is_constant_function(frame.angular_velocity)
 
 
 def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
-    """Kinetic energy (less Omega . J in a turning frame), potential energy, their sum, and the work of other forces."""
+    """Kinetic energy (less Omega . J in a rotating frame), potential energy, their sum, and work of other forces."""
     n = len(times)
     kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
     if system.rotates:
         rotation, momentum = states.rotation.reshape(n, 3, 3), states.angular_momentum_body.reshape(n, 3)
         inertia, carried = system.moments(times)
-        own = np.divide((momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0)
-        kinetic += 0.5 * own.sum(axis=1)
+        twice = np.divide((momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0)
+        kinetic += 0.5 * twice.sum(axis=1)
         about_origin += np.einsum("tij,tj->ti", rotation, momentum)
     if system.translates:
         position, impulse = states.position.reshape(n, 3), system.mass * states.velocity.reshape(n, 3)
@@ -140,17 +136,17 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
         "kinetic": kinetic,
         "potential": potential,
         "energy": kinetic + potential,
-        "work": states.books.reshape(n, 3)[:, WORK],
+        "work": states.energy_ledger.reshape(n, 3)[:, WORK],
     }
 
 
 def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Relative errors since the start of the invariants of this scene."""
+    """Relative changes since the start of the quantities that this scene conserves."""
     body = system.body
     forces = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
-    driven = any(isinstance(term, Drive | Told) for term in system.terms.values())
+    driven = any(isinstance(term, TimeDependentForce | PythonForce) for term in system.terms.values())
     lossless = isinstance(body.resistance, NoResistance)
-    inertial = isinstance(body.frame, Inertial)
+    inertial = isinstance(body.frame, InertialFrame)
     errors = {}
     if is_balanced(system):
         balance = columns["energy"] - columns["work"]
@@ -160,7 +156,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
     momentum = {k: columns[f"L_lab_{k}"] for k in "xyz"}
     size = np.sqrt(sum(part**2 for part in momentum.values()))
     arms = [term.point for term in forces if term.force.any()]
-    if lossless and not driven and inertial and not isinstance(body.flight, Immersed):
+    if lossless and not driven and inertial and not isinstance(body.flight, FluidTranslation):
         if not any(arm.any() for arm in arms):
             gap = np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values()))
             errors["L_lab"] = _relative(gap, size.max())
@@ -172,15 +168,15 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
                 errors[f"L_{k}"] = _relative(momentum[k] - momentum[k][0], size.max())
     axis = _kept_axis(system, arms, driven)
     if axis is not None:
-        own = columns[f"L_body_{axis + 1}"]
-        errors[f"L_{axis + 1}"] = _relative(own - own[0], size.max())
+        along = columns[f"L_body_{axis + 1}"]
+        errors[f"L_{axis + 1}"] = _relative(along - along[0], size.max())
     return errors
 
 
 def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int | None:
-    """The symmetry axis of a body if no torque acts about it: L along it is conserved."""
+    """The symmetry axis of a body if no torque acts about it, so that L along it is conserved."""
     body = system.body
-    if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.flight, Immersed):
+    if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.flight, FluidTranslation):
         return None
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -188,16 +184,10 @@ def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int 
         on_axis = not any(arm[[i, j]].any() for arm in arms)
         if isinstance(body.rotor, DrivenRotor):
             inertia, momentum = body.rotor.inertia, body.rotor.momentum
-            symmetric &= is_steady(inertia) and not any(part[:, [i, j]].any() for part in momentum[1:])
+            symmetric &= is_constant_function(inertia) and not any(part[:, [i, j]].any() for part in momentum[1:])
         if not isinstance(body.resistance, NoResistance):
-            symmetric &= not any(
-                part[k]
-                for part in (
-                    body.resistance.rotation_dry,
-                    body.resistance.rotation_linear,
-                    body.resistance.rotation_quadratic,
-                )
-            )
+            drag = body.resistance
+            symmetric &= not any(x[k] for x in (drag.rotation_dry, drag.rotation_linear, drag.rotation_quadratic))
         if symmetric and on_axis:
             return k
     return None
@@ -208,11 +198,11 @@ def _relative(error: np.ndarray, scale: float) -> np.ndarray:
 
 
 def drawn_axis(system: BodySystem) -> np.ndarray:
-    """The body axis (3,) whose path is drawn: that of the scene, else towards the centre of mass, of symmetry, or 3."""
+    """The body axis (3,) whose path is drawn: given in the scene, else to the centre of mass, of symmetry, or 3."""
     if system.scene.output.axis is not None:
-        return direction(np.array(system.scene.output.axis))
+        return unit_vector(np.array(system.scene.output.axis))
     if system.centre.any():
-        return direction(system.centre)
+        return unit_vector(system.centre)
     for k in (2, 0, 1):
         if system.inertia[k - 1] == system.inertia[k - 2] != system.inertia[k]:
             return system.axes[:, k]

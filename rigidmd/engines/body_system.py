@@ -1,4 +1,4 @@
-"""The system of a scene of a single body: what an engine moves."""
+"""The system of a scene of a single body, which an engine moves."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ Part = TypeVar("Part", bound=NamedTuple)
 
 
 class Pose(NamedTuple):
-    """Position, attitude and velocities of a body, relative to the frame, for Python functions that apply forces."""
+    """Position, attitude and velocities of a body relative to the frame. Functions in `applied` are called with it."""
 
     time: float  # s
     position: np.ndarray  # (3,) centre of mass, m
@@ -38,11 +38,10 @@ class Pose(NamedTuple):
 
 @dataclass
 class BodySystem:
-    """The system of a single body. The engine uses its principal axes; `axes` leads back to those of the scene.
+    """The system of a single body, in its principal axes. `axes` (3, 3) has them as columns, in the scene's body axes.
 
-    axes (3, 3): the principal axes as columns, in the body's axes. inertia (3,): principal moments at the start, kg m²,
-    about the pivot or the centre of mass, added inertia of a fluid included; centre (3,): centre of mass from there, in
-    the body's axes; points (k, 3): what the trajectory shows, in the body's axes from there.
+    inertia (3,): principal moments at the start, kg m², about the pivot or the centre of mass, with the added inertia
+    of a fluid. centre (3,): centre of mass from there; points (k, 3): points of the trajectory; both in the body axes.
     """
 
     scene: BodyScene
@@ -64,26 +63,26 @@ class BodySystem:
 
     @property
     def notes(self) -> list[str]:
-        """A sentence for duration and interval of samples that are not whole numbers of steps."""
+        """Notes on a duration or an interval that is not a whole number of steps."""
         run, found = self.scene.run, []
         interval = not_none(self.scene.output.interval_s)
         given = interval != run.duration_s / SAMPLES
         for key, wanted in (("run.duration_s", run.duration_s), ("output.interval_s", given and interval)):
-            taken = wanted and max(1, round(wanted / run.timestep_s)) * run.timestep_s
-            if not run.is_auto and wanted and abs(taken - wanted) > 1e-9 * wanted:
+            used = wanted and max(1, round(wanted / run.timestep_s)) * run.timestep_s
+            if not run.is_auto and wanted and abs(used - wanted) > 1e-9 * wanted:
                 found.append(
-                    f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: it is {taken:g} s"
+                    f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: {used:g} s is used"
                 )
         return found
 
     @property
     def rotates(self) -> bool:
-        """Whether it has an orientation."""
+        """Whether the body has an orientation. A point has none."""
         return len(self.state.rotation) > 0
 
     @property
     def translates(self) -> bool:
-        """Whether it is not pinned."""
+        """Whether the body is not pinned."""
         return len(self.state.position) > 0
 
     @property
@@ -93,7 +92,7 @@ class BodySystem:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Three of translation unless pinned, and those of rotation."""
+        """Translational (none if pinned) and rotational degrees of freedom."""
         return 3 * self.translates + int((self.inertia > 0).sum())
 
     @property
@@ -111,47 +110,51 @@ class BodySystem:
         )
 
     def engine(self) -> Engine:
-        """A new engine for this body at time 0, which calls the Python functions that apply forces."""
+        """A new engine for this body at time 0, which calls the functions in `applied`."""
         kind = OdeEngine if self.scene.run.integrator in SOLVERS else Engine
-        return kind(*self.during(0.0), applied={name: self._asker(f) for name, f in self.applied.items()})
+        return kind(
+            *self.terms_at(0.0), python_forces={name: self._load_function(f) for name, f in self.applied.items()}
+        )
 
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""
-        parts = (*self.body, *self.terms.values())
-        times = {float(t) for part in parts for value in part if isinstance(value, TimeFunction) for t in value.times}
-        run = self.scene.run
+        run, components = self.scene.run, (*self.body, *self.terms.values())
+        functions = [value for part in components for value in part if isinstance(value, TimeFunction)]
+        times = {float(t) for function in functions for t in function.times}
         return sorted(t for t in times if 0 < t < run.steps * run.timestep_s)
 
-    def piece_at(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
-        """Body and terms as they are from a time to the next break."""
+    def terms_at(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
+        """Body and terms from a time to the next break."""
         flight, rotor, frame, resistance = self.body
         body = Body(_at(flight, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
         return body, {name: _at(term, time) for name, term in self.terms.items()}
 
-    def _asker(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
-        def ask(time: float, state: State) -> tuple:
-            told = function(self.pose(time, state))
+    def _load_function(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
+        """A user's function of a pose as a function of time and state that returns force and torque, checked."""
+
+        def load(time: float, state: State) -> tuple:
+            given = function(self.pose(time, state))
             try:
-                force, torque = (np.asarray(part, dtype=float).reshape(3) for part in told)
+                force, torque = (np.asarray(part, dtype=float).reshape(3) for part in given)
             except (TypeError, ValueError):
                 raise SimulationError(
-                    f"t = {time:g} s: an applied function gave {told!r}, must give force and torque of 3 numbers each"
+                    f"t = {time:g} s: an applied function gave {given!r}, must give force and torque of 3 numbers each"
                 ) from None
             if not self.translates:  # the force acts at the centre of mass, the torque is about the pivot
                 torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
             if not (np.isfinite(force).all() and np.isfinite(torque).all()):
-                raise SimulationError(f"t = {time:g} s: an applied function gave what is no finite number: {told!r}")
+                raise SimulationError(f"t = {time:g} s: an applied function gave infinite or NaN values: {given!r}")
             return force, self.axes.T @ torque
 
-        return ask
+        return load
 
     def pose(self, time: float, state: State) -> Pose:
-        """The state in the body's own axes, relative to the frame."""
+        """The pose of a state in the scene's body axes, relative to the frame."""
         motion = self.motion(np.array([time]), State(*(np.array(array) for array in zip(state, strict=True))))
         return Pose(time, *(part[0] for part in motion))
 
     def motion(self, times: np.ndarray, states: State):
-        """(position, velocity, rotation, angular_velocity_body) over times (t,) of states stacked along axis 0."""
+        """position, velocity, rotation, angular_velocity_body at times (t,), of states stacked along axis 0."""
         n = len(times)
         frame = self.frame_rates(times)
         if self.rotates:
@@ -159,16 +162,16 @@ class BodySystem:
             rotation = engine_rotation @ self.axes.T
             inertia, carried = self.moments(times)
             with np.errstate(divide="ignore", invalid="ignore"):
-                own = np.where(inertia > 0, (states.angular_momentum_body.reshape(n, 3) - carried) / inertia, 0.0)
-            omega = own @ self.axes.T - np.einsum("tji,tj->ti", rotation, frame)
+                principal = np.where(inertia > 0, (states.angular_momentum_body.reshape(n, 3) - carried) / inertia, 0.0)
+            omega = principal @ self.axes.T - np.einsum("tji,tj->ti", rotation, frame)
         else:
             engine_rotation = rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
             omega = np.zeros((n, 3))
         if self.translates:
             position, velocity = states.position.reshape(n, 3), states.velocity.reshape(n, 3)
             if isinstance(self.body.flight, FluidTranslation):
-                share = self.mass / self.body.flight.inertial_mass
-                velocity = np.einsum("tij,j,tkj,tk->ti", engine_rotation, share, engine_rotation, velocity)
+                ratio = self.mass / self.body.flight.inertial_mass
+                velocity = np.einsum("tij,j,tkj,tk->ti", engine_rotation, ratio, engine_rotation, velocity)
             velocity = velocity - np.cross(frame, position)
         else:
             position = rotation @ self.centre
@@ -176,28 +179,28 @@ class BodySystem:
         return position, velocity, rotation, omega
 
     def frame_rates(self, times: np.ndarray) -> np.ndarray:
-        """Angular velocity (t, 3) of the frame along its axes."""
+        """Angular velocity (t, 3) of the frame, in its own axes."""
         if isinstance(self.body.frame, InertialFrame):
             return np.zeros((len(times), 3))
         return values_at(self.body.frame.angular_velocity, times)
 
     def moments(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Principal moments and the momentum of rotors (t, 3) each, principal axes."""
+        """Principal moments (t, 3) and angular momentum of the rotors (t, 3), in the principal axes."""
         rotor = self.body.rotor
         if isinstance(rotor, DrivenRotor):
             return values_at(rotor.inertia, times), values_at(rotor.momentum, times)
         return np.broadcast_to(self.inertia, (len(times), 3)), np.zeros((len(times), 3))
 
-    # The interface for trajectories: points as sites, Å for metres, ps for seconds.
+    # Interface for trajectories: points as sites, Å for metres, ps for seconds.
 
     @property
     def scale(self) -> float:
-        """Å in the trajectory for a metre."""
+        """Å of the trajectory per metre."""
         return not_none(self.scene.output.trajectory_A_per_m)
 
     @property
     def sites(self) -> Sites:
-        """The points as sites of one molecule."""
+        """The points as the sites of one molecule."""
         n = len(self.points)
         names = np.array(self.point_names, dtype=object)
         return Sites(np.zeros(n, int), self.points, names, np.full(n, "X", dtype=object), np.full(n, self.mass / n))
@@ -220,6 +223,6 @@ class BodySystem:
 
 
 def _at(part: Part, time: float) -> Part:
-    """A part of a body with each of its courses continued from a time."""
+    """A component of a body, with its prescribed functions of time continued from `time`."""
     courses = {key: piece_at(value, time) for key, value in part._asdict().items() if isinstance(value, TimeFunction)}
     return part._replace(**courses)

@@ -1,4 +1,4 @@
-"""Two engines at one state, term by term: they must agree before either is believed."""
+"""Comparison of two engines at one state, term by term, for `rigidmd verify` and before runs on external engines."""
 
 from typing import NamedTuple
 
@@ -10,90 +10,80 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.units import KJ_PER_MOL
 
-#: By which sums of plain pairs may part, relative to their size: engines have constants of their own, as 332.06371.
+#: Tolerance of pair sums, relative to their size: engines have slightly different constants, such as 332.06371.
 PLAIN = 1e-6
-#: Energies of a term that its virial may be, as of 1/r¹²: the energy is the smaller where attraction cancels repulsion.
+#: Ratio of virial and energy of a 1/r¹² term. The energy may be smaller, where attraction cancels repulsion.
 STEEPEST = 12
-#: Estimated errors of an Ewald sum by which forces may part; each engine has one.
+#: Tolerance of forces with an Ewald sum, in estimated errors. Each engine has such an error.
 ERRORS = 5.0
-#: Share of what its error of forces does over 1/alpha that every site may add to the energy of an Ewald sum. Measured:
-#: 0.003 (512 SPC/E, PME and PPPM at 1e-5).
-SHARE = 0.02
+#: Tolerance of the energy of an Ewald sum per site, in (error of the force)/alpha. Measured: 0.003 (512 SPC/E, PME and
+#: PPPM at 1e-5).
+PER_SITE = 0.02
 
 
-class Line(NamedTuple):
-    """One quantity on two engines."""
+class Comparison(NamedTuple):
+    """One quantity computed by two engines."""
 
     name: str
     unit: str
     here: float
     there: float
-    apart: float  # how far they part
-    allowed: float
+    difference: float
+    tolerance: float
 
     @property
     def agrees(self) -> bool:
-        """Whether they part by no more than is explained."""
-        return bool(self.apart <= self.allowed)
+        return bool(self.difference <= self.tolerance)
 
 
-def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Line]:
-    """Energies by term, forces and torques on bodies, and the virial of two engines at a state."""
+def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Comparison]:
+    """Compare energies by term, forces and torques on bodies, and the virial of two engines at a state."""
     ours, theirs = observe(system, here, state), observe(system, there, state)
     virial = sum(abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values())
-    every = {**ours.components, **theirs.components}
+
     kinetic = sum(kinetic_energies(system, state))
     size = sum(abs(ours.components[name]) for name in system.terms if name in ours.components) + kinetic
     size = max(size, virial / STEEPEST)
-    force_error = system.force_error or 0.0
-    reach = _reach(system)
-    sites = system.site_count
-    slack = force_error * reach * (SHARE * sites + ERRORS * np.sqrt(sites))
+    force_error, sites, alpha = system.force_error or 0.0, system.site_count, system.scene.forces.ewald_alpha_per_A
+    ewald = force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
     lines = []
-    for name in every:
+    for name in {**ours.components, **theirs.components}:
         a, b = (seen.components.get(name, 0.0) for seen in (ours, theirs))
-        allowed = PLAIN * size + (slack if name.startswith("coulomb") else 0.0)
-        lines.append(_energy(name.replace("_", " "), a, b, allowed))
-    lines.append(_energy("potential energy", ours.potential, theirs.potential, PLAIN * size + slack))
+        tolerance = PLAIN * size + (ewald if name.startswith("coulomb") else 0.0)
+        lines.append(_energy(name.replace("_", " "), a, b, tolerance))
+    lines.append(_energy("potential energy", ours.potential, theirs.potential, PLAIN * size + ewald))
     each = np.sqrt(sites / len(system.model.species)) * ERRORS * force_error
     radius = max(m.radius for m in system.species)
-    for name, unit, k, allowed in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):
+    for name, unit, k, tolerance in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):
         if len(ours.load[k]):
-            lines.append(
-                _of_bodies(f"rms {name} on a molecule", unit, ours.load[k], theirs.load[k], allowed, size, system)
-            )
+            title, pair = f"rms {name} on a molecule", (ours.load[k], theirs.load[k])
+            lines.append(_of_bodies(title, unit, *pair, tolerance, size, system))
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
         a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
-        lines.append(_energy("virial", a, b, PLAIN * max(size, virial) + 3 * slack))
+        lines.append(_energy("virial", a, b, PLAIN * max(size, virial) + 3 * ewald))
     return lines
 
 
-def _reach(system: System) -> float:
-    """1/alpha of an Ewald sum, Å."""
-    alpha = system.scene.forces.ewald_alpha_per_A
-    return 1 / alpha if alpha else 0.0
-
-
-def _energy(name: str, here: float, there: float, allowed: float) -> Line:
-    return Line(name, "kJ/mol", *(x / KJ_PER_MOL for x in (here, there, abs(there - here), allowed)))
+def _energy(name: str, here: float, there: float, tolerance: float) -> Comparison:
+    return Comparison(name, "kJ/mol", *(x / KJ_PER_MOL for x in (here, there, abs(there - here), tolerance)))
 
 
 def _of_bodies(
-    name: str, unit: str, here: np.ndarray, there: np.ndarray, allowed: float, size: float, system: System
-) -> Line:
-    """rms over bodies. They may part relative to it, or where it all but vanishes to the energy of a body."""
+    name: str, unit: str, here: np.ndarray, there: np.ndarray, tolerance: float, size: float, system: System
+) -> Comparison:
+    """Rms over bodies. The tolerance is relative to it, or to the energy of a body where it nearly vanishes."""
     rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (here, there, there - here)]
     scale = max(rms[0], size / len(system.model.species) / (system.smallest_diameter if "Å" in unit else 1.0))
-    return Line(name, unit, *(x / KJ_PER_MOL for x in (*rms, PLAIN * scale + allowed)))
+    return Comparison(name, unit, *(x / KJ_PER_MOL for x in (*rms, PLAIN * scale + tolerance)))
 
 
-def in_words(lines: list[Line], there: str) -> str:
-    """The lines as a table."""
+def describe_comparison(lines: list[Comparison], there: str) -> str:
+    """A table of comparisons; `there` is the name of the other engine."""
     wide = max(len(line.name) for line in lines)
-    rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {there:>20}  {'apart':>9}  {'allowed':>9}"]
+    rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {there:>20}  {'difference':>10}  {'tolerance':>9}"]
     rows += [
-        f"  {line.name:<{wide}}  {line.here:>20.10g}  {line.there:>20.10g}  {line.apart:>9.2g}  {line.allowed:>9.2g}"
-        f"  {line.unit}{'' if line.agrees else '   <- parts'}"
+        f"  {line.name:<{wide}}  {line.here:>20.10g}  {line.there:>20.10g}  {line.difference:>10.2g}"
+        f"  {line.tolerance:>9.2g}  {line.unit}{'' if line.agrees else '   <- differs'}"
         for line in lines
     ]
     return "\n".join(rows)

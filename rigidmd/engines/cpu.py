@@ -1,5 +1,8 @@
-"""The Python side of the compiled code. It owns lists, grids, sums and machine code, enlarges arrays at the request of
-kernels, and handles their status codes."""
+"""The engine that runs compiled code on the CPU, for molecules and for a single body.
+
+This is the Python side of the kernels: it owns their lists, grids, sums and machine code, enlarges arrays when a kernel
+returns that one is full, and raises exceptions for status codes.
+"""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple, Protocol, cast
@@ -7,15 +10,15 @@ from typing import Literal, NamedTuple, Protocol, cast
 import numpy as np
 
 from rigidmd.compile import compile_together, set_threads
-from rigidmd.compile.machine import threads_for
-from rigidmd.compile.own import CompileError
+from rigidmd.compile.kernels import CompileError
+from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import (
-    ASK,
     BEHIND_WALL,
     CELL_CHANGED,
     EXAMPLE,
     LIST_FULL,
+    NEEDS_PYTHON_FORCES,
     NOT_FINITE,
     NOW,
     ORIGIN,
@@ -23,63 +26,61 @@ from rigidmd.core.state import (
     State,
     no_load,
 )
-from rigidmd.dynamics.barostats import BoxRoom, NoBox, Piston, box_room
+from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, Piston, barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.dynamics.force_gradient import Probe, probe_for
-from rigidmd.dynamics.observables import Extent, Sums, sums_over
-from rigidmd.dynamics.step_loop import Advance, Model, advance_body, code_of, row_of
-from rigidmd.dynamics.thermostats import NoBath, heat_room
+from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
+from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.observables import LargestValues, StateSums, sums_of_state
+from rigidmd.dynamics.step_loop import Advance, advance_body, flow_arrays, molecule_code
+from rigidmd.dynamics.thermostats import NoThermostat, thermostat_workspace
 from rigidmd.engines.protocol import Tally
 from rigidmd.errors import SimulationError
-from rigidmd.forces.fields.walls import Behind, LennardJonesWalls
+from rigidmd.forces.fields.walls import LennardJonesWalls, SiteBehindWall
 from rigidmd.forces.terms import (
-    Loading,
     NoForce,
     Setup,
-    in_common,
-    memory_of,
-    recalled,
-    tally_now,
+    TermDispatcher,
+    checkpoint_arrays,
+    compute_load_with_energies,
+    restored,
+    with_capacity,
     with_code,
-    with_room,
+    with_common_scratch,
     workspace_of,
 )
-from rigidmd.mechanics.free_rotor import NONE, ExactRotor, SplitRotor
+from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
 __all__ = ["BehindWallError", "CompileError", "Engine", "NotFiniteError", "Precision", "keep_time"]
 
 Precision = Literal["double", "mixed"]
-#: Owners of arrays in the memory of an engine, besides its terms, and the arrays of each.
+#: Owners of arrays in `Engine.memory` besides the terms, and the arrays of each.
 LOAD, BOX = "load", "box"
-REMEMBERED = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
-#: dt, `until` and `looked` of `Engine.advance`.
-Orders = tuple[float, int, bool]
+MEMORY_FIELDS = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
+#: dt, `until` and `observed` of `Engine.advance`.
+StepArguments = tuple[float, int, bool]
 DTYPES = {"double": np.float64, "mixed": np.float32}
-#: Relative difference of forces and virials that were computed on two machines.
+#: Relative difference of forces and virials between two machines, by arithmetic.
 ROUNDING = {np.float64: 1e-8, np.float32: 1e-3}
 
 
-class Asks(Protocol):
-    """A workspace of what Python computes."""
+class ComputedByPython(Protocol):
+    """The workspace of a term that a Python function computes."""
 
-    def answer(self, function: Callable, state: State) -> None:
-        """Let a function fill it in for a state."""
+    def update(self, function: Callable, state: State) -> None:
+        """Fill the workspace in for a state by calling the function."""
         ...
 
 
 class Engine:
-    """Moves states of a model under terms with compiled code.
+    """An engine of compiled code, see `rigidmd.engines.protocol.Engine`.
 
-    Parameters
-    ----------
     model : the constant part of the system
     terms : name -> term, in the order in which forces are added
     precision : arithmetic between sites; "mixed": pairs in single precision, sums and motion in double
-    skin : extra radius of neighbour lists, Å; speed only
-    applied : the functions that terms of type `Told` (of a body) and `ToldForces` stand for: name -> function, as their
-        workspaces call it
-    threads : number of threads that compute, at most those of `NUMBA_NUM_THREADS`; None: all. Speed only
-    presses : whether a piston will move, which needs virials at every step and no energies. Speed only
+    skin : extra radius of neighbour lists, Å; affects speed only
+    python_forces : name of a term that Python computes -> its function, as the term's workspace calls it
+    threads : number of threads, at most `NUMBA_NUM_THREADS`; None for all of them; affects speed only
+    needs_virials : whether every step needs virials and no energies, as for a piston; affects speed only
     """
 
     def __init__(
@@ -88,292 +89,293 @@ class Engine:
         terms: dict[str, NamedTuple],
         precision: Precision = "double",
         skin: float = 1.9,
-        applied: dict[str, Callable] | None = None,
+        python_forces: dict[str, Callable] | None = None,
         threads: int | None = None,
-        presses: bool = False,
+        needs_virials: bool = False,
     ):
         self.model = model
         self.terms = terms
         self.names = list(terms)
-        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, np.ones(1, np.int64), presses)
-        self._applied = applied or {}
+        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, np.ones(1, np.int64), needs_virials)
+        self._python_forces = python_forces or {}
         self.threads = threads
         self._workspaces: tuple[NamedTuple, ...] | None = None
         self._codes: dict = {}
         self.load: Load | None = None
-        self._probe: Probe | None = None
-        self._heat = heat_room()
-        self._loadings: dict[str, Loading] = {}
-        self._seen: Load | None = None
-        self._room: BoxRoom | None = None
+        self._probe: GradientWorkspace | None = None
+        self._heat = thermostat_workspace()
+        self._dispatchers: dict[str, TermDispatcher] = {}
+        self._evaluated: Load | None = None
+        self._box_workspace: BarostatWorkspace | None = None
         self._stale = True
         self._first = True
         self._checked: State | None = None
         self._moved: State | None = None
-        self._known: Load | None = None  # what was last told of the steps
-        self._bound: tuple[tuple, Advance] | None = None  # what it is bound to
+        self._observed_load: Load | None = None  # returned by the last `evaluate_current`
+        self._advance: tuple[tuple, Advance] | None = None  # with the objects that it is bound to
         self._row: tuple[Scheme, tuple] | None = None
 
     @property
     def workspaces(self) -> dict[str, NamedTuple]:
-        """Name of a term -> its present workspace; empty before the first use."""
+        """Name of a term -> its present workspace. Empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
     def change(self, model: Model | Body, terms: dict[str, NamedTuple]) -> None:
-        """Continue with a model and terms of the same types, as at a break of given functions of time."""
+        """Continue with a model and terms of the same types, as at a kink of prescribed functions of time."""
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
 
     def forget(self) -> None:
-        """Declare that positions were changed from outside since the last step."""
         self._stale = True
 
     def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
-        """What a scheme moves besides the bodies, for `state.bath`; chains and pistons begin at rest."""
-        row = _scheme_of(row)
-        return np.zeros(getattr(row.bath, "variables", 0) + isinstance(row.box, Piston))
+        """The variables of the thermostat and the barostat of a scheme, at rest."""
+        row = _as_scheme(row)
+        return np.zeros(getattr(row.thermostat, "variables", 0) + isinstance(row.barostat, Piston))
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state, with the variables of a row."""
-        return state.copy()._replace(bath=self.variables(state, row))
+        return state.copy()._replace(extra_variables=self.variables(state, row))
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
-        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError.
-
-        looked : whether `look` follows; speed only
-        """
-        row = _scheme_of(row)
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+        row = _as_scheme(row)
         workspaces = self._prepare(state)
         keep_time(state, dt)
-        if state is not self._moved and "steps" in self._loadings:  # the energies of its last step are of another state
-            self._loadings["steps"].loader.known[0] = 0
+        if state is not self._moved and "steps" in self._dispatchers:  # its energies belong to another state
+            self._dispatchers["steps"].table.tallies_valid[0] = 0
         self._moved = state
         if self.load is None:
             self.load = no_load(state)
         move = self._move_molecules if isinstance(self.model, Model) else self._move_body
-        self._known = None
-        self._stale = not move(state, self.load, row, workspaces, (float(dt), int(until), looked))
+        self._observed_load = None
+        self._stale = not move(state, self.load, row, workspaces, (float(dt), int(until), observed))
 
-    def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: Orders) -> bool:
-        """`advance` of molecules; whether the load is that of the new positions."""
-        loading = self._loading_for("steps", workspaces)
-        bound_to = (self.model, row, state, load, loading)
-        if self._bound is None or any(now is not then for now, then in zip(bound_to, self._bound[0], strict=True)):
-            model, rest = self.model_for(row), self._rest_of(row, state)
+    def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, step: StepArguments) -> bool:
+        """Advance molecules. Returns whether the load belongs to the new positions."""
+        dispatcher = self._dispatcher("steps", workspaces)
+        bound_to = (self.model, row, state, load, dispatcher)
+        if self._advance is None or any(now is not then for now, then in zip(bound_to, self._advance[0], strict=True)):
+            model, rest = self.model_for(row), self._flow_arguments(row, state)
             kind = (type(model.rotor), type(rest[0]))
             if kind not in self._codes:
-                self._codes[kind] = code_of(model, rest[0])
-            self._bound = bound_to, Advance(model, self._codes[kind], state, load, loading.loader, *rest)
-        advance = self._bound[1]
-        advance.begin(*orders, not self._stale)
+                self._codes[kind] = molecule_code(model, rest[0])
+            self._advance = bound_to, Advance(model, self._codes[kind], state, load, dispatcher.table, *rest)
+        advance = self._advance[1]
+        advance.begin(*step, not self._stale)
         other = self._probe and self._probe.load
-        loading.bind(workspaces, state, load, other)
+        dispatcher.bind(workspaces, state, load, other)
         while status := advance():
-            loading.bind(self._answer(status, state), state, load, other)
+            dispatcher.bind(self._handle_status(status, state), state, load, other)
         return advance.loaded
 
-    def _move_body(self, state: State, load: Load, row: Scheme, workspaces: tuple, orders: Orders) -> bool:
-        """`advance` of a body; whether the load is that of the new position."""
+    def _move_body(self, state: State, load: Load, row: Scheme, workspaces: tuple, step: StepArguments) -> bool:
+        """Advance a body. Returns whether the load belongs to the new position."""
         if self._row is None or self._row[0] is not row:
-            self._row = row, self._rest_of(row, state)
+            self._row = row, self._flow_arguments(row, state)
         model, rest, cursor = self.model_for(row), self._row[1], np.array([0, not self._stale, 0], np.int64)
-        while status := advance_body(model, state, load, workspaces, *rest, *orders, cursor):
-            workspaces = self._answer(status, state)
-        return cursor[1] != 0  # False also if there was no step, so that no forces were evaluated
+        while status := advance_body(model, state, load, workspaces, *rest, *step, cursor):
+            workspaces = self._handle_status(status, state)
+        return cursor[1] != 0  # also False after no step, because then no forces were evaluated
 
-    def _rest_of(self, row: Scheme, state: State) -> tuple:
-        """What `advance` needs for a row besides the bodies and what acts on them."""
+    def _flow_arguments(self, row: Scheme, state: State) -> tuple:
+        """The arguments of the compiled step loop that depend on the integrator."""
         if row.has_gradient and self._probe is None:
-            self._probe = probe_for(state)
-        if row.box is not None and self._room is None:
-            self._room = box_room(state)
-        probe, room = self._probe if row.has_gradient else None, self._room if row.box is not None else None
-        return row.bath or NoBath(), row.box or NoBox(), row_of(row), probe, self._heat, room
+            self._probe = gradient_workspace(state)
+        if row.barostat is not None and self._box_workspace is None:
+            self._box_workspace = barostat_workspace(state)
+        probe, box = (
+            self._probe if row.has_gradient else None,
+            self._box_workspace if row.barostat is not None else None,
+        )
+        return row.thermostat or NoThermostat(), row.barostat or NoBarostat(), flow_arrays(row), probe, self._heat, box
 
-    def _loading_for(self, use: str, workspaces: tuple[NamedTuple, ...]) -> Loading:
-        """The terms behind a loader, one for steps and one for looks, each bound to a load of its own."""
-        if use not in self._loadings:
-            self._loadings[use] = Loading(workspaces, isinstance(self.model, Model), self._setup.with_energies)
-        return self._loadings[use]
+    def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
+        """The dispatcher of all terms for `use` (steps or observations), which writes to a separate load."""
+        if use not in self._dispatchers:
+            self._dispatchers[use] = TermDispatcher(
+                workspaces, isinstance(self.model, Model), self._setup.with_energies
+            )
+        return self._dispatchers[use]
 
     def model_for(self, scheme: Scheme) -> Model | Body:
-        """The model with the rotor that a scheme needs; only asymmetric bodies turn differently with an exact one."""
+        """The model with the rotor of a scheme. The exact rotor differs only for asymmetric bodies."""
         rotor = self.model.rotor
-        if scheme.exact_rotor and isinstance(rotor, SplitRotor) and (rotor.symmetry == NONE).any():
+        if scheme.exact_rotor and isinstance(rotor, SplitRotor) and (rotor.symmetry == NO_SYMMETRY).any():
             return self.model._replace(rotor=ExactRotor(*rotor))
         return self.model
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
         workspaces = self._prepare(state)
-        if self._seen is None or len(self._seen.force) != len(state.velocity):
-            self._seen = no_load(state)
-        load, loading = self._seen, self._loading_for("looks", workspaces)
-        while status := tally_now(loading.bind(workspaces, state, load), *load):
-            workspaces = self._answer(status, state)
-        return self._told(load, loading)
+        if self._evaluated is None or len(self._evaluated.force) != len(state.velocity):
+            self._evaluated = no_load(state)
+        load, dispatcher = self._evaluated, self._dispatcher("observations", workspaces)
+        while status := compute_load_with_energies(dispatcher.bind(workspaces, state, load), *load):
+            workspaces = self._handle_status(status, state)
+        return self._copies(load, dispatcher)
 
-    def look(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """`evaluate` at the state that was just moved; what its last step has computed is not computed again."""
-        moving = self._loadings.get("steps")
-        if self.load is None or moving is None or state is not self._moved or self._stale or not moving.loader.known[0]:
+    def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        moving = self._dispatchers.get("steps")
+        if (
+            self.load is None
+            or moving is None
+            or state is not self._moved
+            or self._stale
+            or not moving.table.tallies_valid[0]
+        ):
             return self.evaluate(state)
-        self._known, tallies = self._told(self.load, moving)
-        return self._known, tallies
+        self._observed_load, tallies = self._copies(self.load, moving)
+        return self._observed_load, tallies
 
-    def sums(self, state: State, load: Load) -> Sums:
-        """The sums over a state of molecules and the load on it, as `look` or `evaluate` has given it."""
-        found = self._bound[1].sums if self._bound is not None and load is self._known else None
-        return found or sums_over(cast(Model, self.model), state, load)
+    def sums(self, state: State, load: Load) -> StateSums:
+        """Sums over a state of molecules and a load that `evaluate_current` or `evaluate` returned for it."""
+        found = self._advance[1].sums if self._advance is not None and load is self._observed_load else None
+        return found or sums_of_state(cast(Model, self.model), state, load)
 
-    def extent(self, state: State) -> Extent | None:
-        """The extent of the state that was just moved, and of the load on it; None of any other."""
-        if self._bound is None or self._stale or state is not self._moved:
+    def extent(self, state: State) -> LargestValues | None:
+        """The extent of the state that was just moved and of its load. None for any other state."""
+        if self._advance is None or self._stale or state is not self._moved:
             return None
-        return self._bound[1].extent
+        return self._advance[1].extent
 
-    def _told(self, load: Load, loading: Loading) -> tuple[Load, dict[str, Tally]]:
-        """Copies of a load and of the tallies of its terms."""
-        tallies = loading.loader.tallies
+    def _copies(self, load: Load, dispatcher: TermDispatcher) -> tuple[Load, dict[str, Tally]]:
+        """A copy of a load, and the tally of each term."""
+        tallies = dispatcher.table.tallies
         virials = tallies[:, 1:].copy().reshape(-1, 3, 3)
-        told = [Tally(energy, virial) for energy, virial in zip(tallies[:, 0].tolist(), virials, strict=True)]
-        return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, told, strict=False))
+        by_term = [Tally(energy, virial) for energy, virial in zip(tallies[:, 0].tolist(), virials, strict=True)]
+        return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, by_term, strict=False))
 
     def snapshot(self) -> State:
-        """A copy of the state that was last moved."""
         if self._moved is None:
             raise ValueError("this engine has moved no state yet")
         return self._moved.copy()
 
     def memory(self) -> dict[str, np.ndarray] | None:
-        """Lists as last built, forces at the present positions, what the box knows: for `recall`."""
-        found = {
-            f"{name}.{key}": array for name, own in self.workspaces.items() for key, array in memory_of(own).items()
-        }
+        """Neighbour lists as last built, forces at the present positions, and the memory of the barostat."""
+        found = {}
+        for name, workspace in self.workspaces.items():
+            found |= {f"{name}.{key}": array for key, array in checkpoint_arrays(workspace).items()}
         if self.load is not None and not self._stale:
-            found |= self._named(self.load, LOAD)
-        return found | (self._named(self._room, BOX) if self._room is not None else {})
+            found |= self._arrays_of(self.load, LOAD)
+        return found | (self._arrays_of(self._box_workspace, BOX) if self._box_workspace is not None else {})
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
-        """Go on from a state with what `memory` gave for it, to the same bits. Raises ValueError if they do not fit."""
         self._prepare(state)
         kept = {name: {key: memory[f"{name}.{key}"] for key in of} for name, of in _by_owner(memory).items()}
-        if strange := kept.keys() - {*self.names, *REMEMBERED}:
-            raise ValueError(f"an engine of {', '.join(self.names)} remembers no {', '.join(sorted(strange))}")
+        if unknown := kept.keys() - {*self.names, *MEMORY_FIELDS}:
+            raise ValueError(f"an engine of {', '.join(self.names)} has no memory of {', '.join(sorted(unknown))}")
         self._recall_lists(state, kept)
         self.load, self._stale = no_load(state), LOAD not in kept
-        self._loadings.pop("steps", None)  # what it knows of energies belongs to another moment
+        self._dispatchers.pop("steps", None)  # its energies belong to another state
         if LOAD in kept:
-            _fill(self.load, kept[LOAD])
+            _copy_into(self.load, kept[LOAD])
         if BOX in kept:
-            self._room = room = box_room(state)
-            _fill(room, kept[BOX])
-            if room.known[0] not in (0, 1) or not 0 <= room.counts[1] <= room.counts[0]:
-                raise ValueError("the moves of the box are not counted as a run counts them")
-        if LOAD in kept and not self._applied:
+            self._box_workspace = box = barostat_workspace(state)
+            _copy_into(box, kept[BOX])
+            if box.known[0] not in (0, 1) or not 0 <= box.counts[1] <= box.counts[0]:
+                raise ValueError("the numbers of tried and accepted moves of the box are invalid")
+        if LOAD in kept and not self._python_forces:
             self._check_recalled(state, kept)
 
     def _recall_lists(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
-        """New workspaces with the lists that were kept, all or none."""
-        own, now = tuple(with_code(workspace) for workspace in self.room(state)), float(state.time[NOW])
+        """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
+        spaces, now = tuple(with_code(workspace) for workspace in self.new_workspaces(state)), float(state.time[NOW])
         if kept.keys() & set(self.names):
-            pairs = zip(self.names, own, strict=False)
-            own = tuple(recalled(workspace, kept.get(name, {}), self._setup.skin, now) for name, workspace in pairs)
-        self._workspaces = in_common(own)
+            pairs = zip(self.names, spaces, strict=False)
+            spaces = tuple(restored(workspace, kept.get(name, {}), self._setup.skin, now) for name, workspace in pairs)
+        self._workspaces = with_common_scratch(spaces)
 
     def _check_recalled(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
-        """Raise ValueError unless the forces that were kept are those of the state, computed with the lists."""
+        """Raise ValueError unless the kept forces are those that the kept lists give at the state."""
         try:
             load, tallies = self.evaluate(state)
         except SimulationError as error:
-            raise ValueError(f"its state has no forces: {error}") from None
+            raise ValueError(f"forces cannot be evaluated at its state: {error}") from None
         rounding = ROUNDING[self._setup.dtype]
         for name, found, there in zip(Load._fields, load, self.load or (), strict=True):
             if np.abs(found - there).max(initial=0.0) > rounding * np.abs(found).max(initial=0.0):
                 raise ValueError(f"its state has another {name} than was kept with it")
-        lists = {name: memory_of(workspace) for name, workspace in self.workspaces.items()}
-        served = all(np.array_equal(array, kept[name][key]) for name, of in lists.items() for key, array in of.items())
+        lists = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
+        same = all(np.array_equal(array, kept[name][key]) for name, of in lists.items() for key, array in of.items())
         if BOX in kept:
-            if self._room is not None and self._room.known[0]:
-                parts = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
-                apart = np.abs(parts.sum(0) - self._room.tally[0]) > rounding * np.abs(parts).sum(0).max()
-                if apart[int(self._setup.presses) :].any():  # a piston asks for no energies
+            if self._box_workspace is not None and self._box_workspace.known[0]:
+                terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
+                differs = np.abs(terms.sum(0) - self._box_workspace.tally[0]) > rounding * np.abs(terms).sum(0).max()
+                if differs[int(self._setup.needs_virials) :].any():  # a piston needs no energies
                     raise ValueError("its state has another energy or virial than was kept with it")
-            if not served:  # they were built for a box that was tried and given up
+            if not same:  # they were built for a trial box that was rejected
                 self._recall_lists(state, kept)
-        elif not served:
+        elif not same:
             raise ValueError("its neighbour lists are not those of its state")
 
     @staticmethod
-    def _named(arrays: NamedTuple, owner: str) -> dict[str, np.ndarray]:
-        return {f"{owner}.{name}": getattr(arrays, name) for name in REMEMBERED[owner]}
+    def _arrays_of(arrays: NamedTuple, owner: str) -> dict[str, np.ndarray]:
+        return {f"{owner}.{name}": getattr(arrays, name) for name in MEMORY_FIELDS[owner]}
 
     @property
     def moves(self) -> tuple[int, int]:
         """Moves of the box tried and accepted so far."""
-        return (0, 0) if self._room is None else (int(self._room.counts[0]), int(self._room.counts[1]))
+        return (0, 0) if (box := self._box_workspace) is None else (int(box.counts[0]), int(box.counts[1]))
 
-    def room(self, state: State) -> tuple[NamedTuple, ...]:
-        """New workspaces for the cell of a state, without machine code; they show the memory needed."""
+    def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
+        """New workspaces for the cell of a state, without machine code. Their arrays show the memory needed."""
         setup = self._setup._replace(cell=state.cell)
-        return in_common(tuple(workspace_of(term, setup) for term in self.terms.values())) or (NoForce(),)
+        return with_common_scratch(tuple(workspace_of(term, setup) for term in self.terms.values())) or (NoForce(),)
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
-        """Check the arrays for compiled code; return its workspaces, made at the first use."""
+        """Check the arrays of a state for compiled code, and return the workspaces, which the first use makes."""
         if state is not self._checked:
             _check_arrays(state)
             self._checked = state
         if isinstance(self.model, Model):
-            set_threads(threads_for(self.threads))
+            set_threads(usable_threads(self.threads))
         if self._workspaces is None:
-            room = self.room(state)
+            spaces = self.new_workspaces(state)
             if self._first and isinstance(self.model, Model):
-                compile_together(lambda: self._codes_for(room))
+                compile_together(lambda: self._compile(spaces))
             self._first = False
-            self._workspaces = tuple(with_code(workspace) for workspace in room)
+            self._workspaces = tuple(with_code(workspace) for workspace in spaces)
         return self._workspaces
 
-    def _codes_for(self, room: tuple[NamedTuple, ...]) -> None:
-        """Make all machine code of molecules that does not depend on a thermostat or a barostat."""
-        workspaces = tuple(with_code(workspace) for workspace in room)
-        Loading(workspaces, True, self._setup.with_energies)
-        code_of(self.model, NoBath())
+    def _compile(self, spaces: tuple[NamedTuple, ...]) -> None:
+        """Compile all code for molecules that does not depend on a thermostat or a barostat."""
+        workspaces = tuple(with_code(workspace) for workspace in spaces)
+        TermDispatcher(workspaces, True, self._setup.with_energies)
+        molecule_code(self.model, NoThermostat())
 
-    def _answer(self, status: int, state: State) -> tuple[NamedTuple, ...]:
-        """Handle a status of compiled code; return the workspaces with which to call it again."""
+    def _handle_status(self, status: int, state: State) -> tuple[NamedTuple, ...]:
+        """Handle a status code of a kernel, and return the workspaces with which to call it again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
-            enlarged = tuple(with_room(workspace, state.cell) for workspace in workspaces)
-            workspaces = self._workspaces = in_common(enlarged)
+            enlarged = tuple(with_capacity(workspace, state.cell) for workspace in workspaces)
+            workspaces = self._workspaces = with_common_scratch(enlarged)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:
             found = [workspace.behind(state) for workspace in workspaces if isinstance(workspace, LennardJonesWalls)]
             raise BehindWallError(next(behind for behind in found if behind is not None))
-        elif status == ASK:
+        elif status == NEEDS_PYTHON_FORCES:
             for name, workspace in zip(self.names, workspaces, strict=False):
-                if name in self._applied:
-                    cast(Asks, workspace).answer(self._applied[name], state)
+                if name in self._python_forces:
+                    cast(ComputedByPython, workspace).update(self._python_forces[name], state)
         return workspaces
 
 
-def _scheme_of(row: Scheme | Solver) -> Scheme:
-    """The row itself. Raises TypeError unless it is a scheme."""
+def _as_scheme(row: Scheme | Solver) -> Scheme:
+    """Return `row` as a `Scheme`. Raises TypeError for a solver."""
     if not isinstance(row, Scheme):
-        raise TypeError(f"{row.name} is a general solver; OdeEngine moves a body by it")
+        raise TypeError(f"{row.name} is a general solver, which only OdeEngine uses")
     return row
 
 
 def keep_time(state: State, dt: float) -> None:
-    """Begin a new stretch of equal steps, in place, if the step has changed or time was set from outside."""
+    """Begin a new segment of equal steps, in place, if the step has changed or time was set from outside."""
     time, step = state.time.tolist(), state.step.tolist()
     if time[NOW] != time[ORIGIN] + (step[NOW] - step[ORIGIN]) * dt:
-        state.begin_stretch()
+        state.begin_segment()
 
 
 def _by_owner(memory: dict[str, np.ndarray]) -> dict[str, list[str]]:
-    """Owner -> names of its arrays, of names such as owner.array."""
+    """Owner -> names of its arrays, from names of the form owner.array."""
     found: dict[str, list[str]] = {}
     for name in memory:
         owner, _, key = name.rpartition(".")
@@ -381,8 +383,8 @@ def _by_owner(memory: dict[str, np.ndarray]) -> dict[str, list[str]]:
     return found
 
 
-def _fill(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
-    """Copy arrays of a memory into those of a tuple. Raises ValueError if they do not fit."""
+def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
+    """Copy kept arrays into the arrays of a tuple. Raises ValueError if they do not fit."""
     for name, array in kept.items():
         there = getattr(arrays, name)
         if (there.shape, there.dtype) != (array.shape, array.dtype):
@@ -393,7 +395,7 @@ def _fill(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
 
 
 def _check_arrays(state: State) -> None:
-    """Raise TypeError if an array of a state has another type than code is compiled for."""
+    """Raise TypeError if an array of a state has another type than the compiled code expects."""
     for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
         if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
             raise TypeError(
@@ -403,7 +405,7 @@ def _check_arrays(state: State) -> None:
 
 
 class NotFiniteError(SimulationError):
-    """Positions or momenta that are not finite, or positions too large to define forces."""
+    """A position or momentum is not finite, or a position is too large to define forces."""
 
     def __init__(self, state: State):
         moving = [array for array in state[:4] if len(array)]
@@ -412,17 +414,17 @@ class NotFiniteError(SimulationError):
         if np.isfinite(size).all():
             self.molecule = int(rows[0].argmax())
             distance = rows[0][self.molecule]
-            self.fault = f"it is {distance:.3g} Å from the origin, too far to tell in which image of the box"
+            self.reason = f"it is {distance:.3g} Å from the origin, too far to find its image of the box"
         else:
             self.molecule = int(size.argmax())
-            self.fault = "its position or momentum is not finite"
-        super().__init__(f"molecule {self.molecule + 1} is lost: {self.fault}")
+            self.reason = "its position or momentum is not finite"
+        super().__init__(f"molecule {self.molecule + 1} is lost: {self.reason}")
 
 
 class BehindWallError(SimulationError):
     """A site is behind a wall that it cannot pass."""
 
-    def __init__(self, behind: Behind):
+    def __init__(self, behind: SiteBehindWall):
         self.molecule = behind.molecule
-        self.fault = str(behind)
-        super().__init__(f"molecule {self.molecule + 1} {self.fault}")
+        self.reason = str(behind)
+        super().__init__(f"molecule {self.molecule + 1} {self.reason}")

@@ -1,7 +1,8 @@
-"""A system as other engines see it: kinds of sites, parameters between kinds, laws in words and numbers.
+"""The force field of a system as another program would see it: kinds of sites, and pair potentials between kinds.
 
-Everything is taken from the terms that rigidmd itself runs, so that mixing rules, special pairs and endings are decided
-once. `unsupported_terms` names what no other engine can express.
+The engines LAMMPS and OpenMM and the exports to LAMMPS, OpenMM and GROMACS are made from this view. It is read from the
+terms that rigidmd itself runs, so that mixing rules, special pairs and truncation are decided once.
+`unsupported_terms` lists what no other program can express.
 """
 
 from math import inf
@@ -16,7 +17,7 @@ from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.scene.models import gather_per_molecule
 
-#: Terms that the portrait has a place for; all others are fields and forces of the user's own.
+#: Terms that the view includes. All others are fields and user-defined forces.
 KNOWN = (
     "lennard_jones", "coulomb", "coulomb_real", "coulomb_reciprocal", "coulomb_background", "coulomb_surface",
 )  # fmt: skip
@@ -25,21 +26,21 @@ CoulombLaw = ReactionField | DampedShiftedForce | ScreenedCoulomb
 
 
 class SiteKind(NamedTuple):
-    """Sites that nothing tells apart but their place in the molecule."""
+    """Sites with the same element, mass, charge and Lennard-Jones parameters."""
 
-    name: str  # species.site of the first of them
+    name: str  # species.site of the first one
     element: str
     mass: float  # u; 0 for a massless site
     charge: float  # e
 
 
 class ForceFieldView(NamedTuple):
-    """A system without anything of the engine that runs it. s sites, in the order of the system."""
+    """The sites of a system (s, in its order) and their pair potentials, independent of any engine."""
 
     system: System
     kinds: list[SiteKind]
-    kind: np.ndarray  # (s,) of each site
-    frozen: np.ndarray  # (n,) whether each molecule is
+    kind: np.ndarray  # (s,) index into `kinds`
+    frozen: np.ndarray  # (n,) whether each molecule is frozen
     sigma: np.ndarray  # (kinds, kinds) Å
     epsilon: np.ndarray  # (kinds, kinds) u Å²/ps²; 0 where there is no Lennard-Jones force
     lennard_jones: LennardJones | None
@@ -47,22 +48,19 @@ class ForceFieldView(NamedTuple):
 
     @property
     def truncation(self) -> str:
-        """How forces end at the cut-off."""
         return self.system.scene.forces.truncation
 
     @property
     def electrostatics(self) -> str:
-        """Kind of electrostatics; none where no site has a charge."""
+        """The electrostatics of the scene; "none" if no site has a charge."""
         return "none" if self.coulomb is None else self.system.scene.forces.electrostatics
 
     @property
-    def is_periodic_coulomb(self) -> bool:
-        """Whether Coulomb forces act on all periodic images."""
+    def has_ewald_sum(self) -> bool:
         return isinstance(self.coulomb, ScreenedCoulomb)
 
     @property
     def is_periodic(self) -> bool:
-        """Whether there is a periodic box."""
         return self.system.space.volume < inf
 
     @property
@@ -77,29 +75,27 @@ class ForceFieldView(NamedTuple):
 
     @property
     def is_body(self) -> np.ndarray:
-        """Whether each molecule (n,) turns; all others are points or frozen."""
-        turning = np.array([m.inertia.any() for m in self.system.species])
-        return turning[self.system.model.species] & ~self.frozen
+        """Whether each molecule (n,) is a rigid body that rotates. All others are points or frozen."""
+        rotates = np.array([m.inertia.any() for m in self.system.species])
+        return rotates[self.system.model.species] & ~self.frozen
 
 
 def force_field_of(system: System) -> ForceFieldView:
-    """The portrait of a system. Raises nothing; `unsupported_terms` tells what it leaves out."""
+    """The force field of a system. It leaves out the terms that `unsupported_terms` lists."""
     index = system.model.species
-    marks = [
-        list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), depth, strict=True))
-        for m, depth in zip(system.species, _kinds_of_law(system), strict=True)
+    parameters = [
+        list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), kind, strict=True))
+        for m, kind in zip(system.species, _lennard_jones_kinds(system), strict=True)
     ]
-    names = [[f"{m.name}.{site}" for site in m.site_names] for m in system.species]
-    known = dict.fromkeys(mark for of_species in marks for mark in of_species)
-    order = {mark: k for k, mark in enumerate(known)}
-    first: dict[tuple, str] = {}
-    for own, called in zip(marks, names, strict=True):
-        for mark, name in zip(own, called, strict=True):
-            first.setdefault(mark, name)
-    kinds = [SiteKind(first[mark], *mark[:3]) for mark in known]
-    of_species = [np.array([order[mark] for mark in own]) for own in marks]
-    law = _law(system, "lennard_jones", LennardJones)
-    sigma, epsilon = _pairs([mark[3] for mark in known], law)
+    first: dict[tuple, str] = {}  # parameters of a kind -> name of its first site
+    for m, of_sites in zip(system.species, parameters, strict=True):
+        for site, of_site in zip(m.site_names, of_sites, strict=True):
+            first.setdefault(of_site, f"{m.name}.{site}")
+    order = {of_kind: k for k, of_kind in enumerate(first)}
+    kinds = [SiteKind(name, *of_kind[:3]) for of_kind, name in first.items()]
+    of_species = [np.array([order[of_site] for of_site in of_sites]) for of_sites in parameters]
+    lennard_jones = _potential(system, "lennard_jones", LennardJones)
+    sigma, epsilon = _pairs([of_kind[3] for of_kind in first], lennard_jones)
     return ForceFieldView(
         system=system,
         kinds=kinds,
@@ -107,39 +103,40 @@ def force_field_of(system: System) -> ForceFieldView:
         frozen=(system.model.inverse_mass == 0)[index],
         sigma=sigma,
         epsilon=epsilon,
-        lennard_jones=law,
-        coulomb=_law(system, "coulomb", ReactionField)
-        or _law(system, "coulomb", DampedShiftedForce)
-        or _law(system, "coulomb_real", ScreenedCoulomb),
+        lennard_jones=lennard_jones,
+        coulomb=_potential(system, "coulomb", ReactionField)
+        or _potential(system, "coulomb", DampedShiftedForce)
+        or _potential(system, "coulomb_real", ScreenedCoulomb),
     )
 
 
 def unsupported_terms(system: System) -> list[str]:
-    """What a system has that other engines do not, in words."""
+    """Descriptions of the terms of a system that no other program has."""
     found = [
-        f"{name.replace('_', ' ')}: {'a force of your own' if name in system.user_terms else 'a field'}"
+        f"{name.replace('_', ' ')}: {'a user-defined force' if name in system.user_terms else 'a field'}"
         for name in system.terms
         if name not in KNOWN
     ]
     if "coulomb_surface" in system.terms:
         found.append("forces.ewald_surface_permittivity: a surface term")
     if system.thermostat is not None:
-        found.append("a thermostat of your own")
+        found.append("a user-defined thermostat")
     return found
 
 
-Law = TypeVar("Law")
+Potential = TypeVar("Potential")
 
 
-def _law(system: System, name: str, kind: type[Law]) -> Law | None:
+def _potential(system: System, name: str, kind: type[Potential]) -> Potential | None:
+    """The pair potential of a term if it is of a class, else None."""
     term = system.terms.get(name)
-    return term.law if isinstance(term, PairForces) and isinstance(term.law, kind) else None
+    return term.potential if isinstance(term, PairForces) and isinstance(term.potential, kind) else None
 
 
-def _kinds_of_law(system: System) -> list[list[int]]:
-    """For each species the kind in the Lennard-Jones law of each of its sites; -1 for none."""
+def _lennard_jones_kinds(system: System) -> list[list[int]]:
+    """The Lennard-Jones kind of each site of each species; -1 for sites without Lennard-Jones forces."""
     found = [[-1] * len(m.masses) for m in system.species]
-    term, law = system.terms.get("lennard_jones"), _law(system, "lennard_jones", LennardJones)
+    term, law = system.terms.get("lennard_jones"), _potential(system, "lennard_jones", LennardJones)
     if law is None or not isinstance(term, PairForces):
         return found
     sites = term.sites
@@ -147,24 +144,22 @@ def _kinds_of_law(system: System) -> list[list[int]]:
         members = np.flatnonzero(system.model.species == k)
         if len(members) == 0:
             continue
-        own = slice(sites.first[members[0]], sites.first[members[0] + 1])
-        offsets = sites.offsets()[own]
-        for kind, offset in zip(law.kind[own], offsets, strict=True):
-            place = int(np.linalg.norm(m.positions_body - offset, axis=1).argmin())
-            found[k][place] = int(kind)
+        first = slice(sites.first[members[0]], sites.first[members[0] + 1])
+        for kind, offset in zip(law.kind[first], sites.offsets()[first], strict=True):
+            found[k][int(np.linalg.norm(m.positions_body - offset, axis=1).argmin())] = int(kind)
     return found
 
 
 def _pairs(kinds: list[int], law: LennardJones | None) -> tuple[np.ndarray, np.ndarray]:
-    """sigma and epsilon between kinds of sites, from the law's own coefficients."""
+    """sigma and epsilon between Lennard-Jones kinds, from the coefficients of the potential."""
     size = len(kinds)
     sigma, epsilon = np.ones((size, size)), np.zeros((size, size))
     if law is None:
         return sigma, epsilon
-    for i, own in enumerate(kinds):
+    for i, one in enumerate(kinds):
         for j, other in enumerate(kinds):
-            if own < 0 or other < 0 or law.c6[own, other] == 0:
+            if one < 0 or other < 0 or law.c6[one, other] == 0:
                 continue
-            c12, c6 = law.c12[own, other], law.c6[own, other]
+            c12, c6 = law.c12[one, other], law.c6[one, other]
             sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
     return sigma, epsilon

@@ -1,7 +1,7 @@
-"""Rigid molecules for engines that know only points, distances that are kept, and sites that follow points.
+"""Rigid molecules for engines without rigid bodies: mass points at constrained distances, and virtual sites.
 
-A rigid body moves as any other with its mass, centre and inertia does (textbook: equimomental systems). So 1, 2, 3 or 4
-mass points stand for it, and every other site is placed by those.
+Rigid bodies with the same mass, centre of mass and inertia move alike (textbook: equimomental systems). So 1, 2, 3 or 4
+mass points represent a molecule for OpenMM and GROMACS, and every other site is a virtual site.
 """
 
 from math import sqrt
@@ -11,37 +11,36 @@ import numpy as np
 
 from rigidmd.scene.models import Molecule
 
-#: A distribution whose second moment across a plane is less than this part of the largest one is planar: its inertia
-#: is that of the plane to rounding.
+#: A molecule is planar if its second moment across a plane is below this fraction of the largest one.
 FLAT = 1e-13
-#: A site further than this part of a molecule's radius from the line or plane of its mass points is off it.
+#: A site is off the line or plane of the mass points beyond this fraction of the molecule's radius.
 OFF = 1e-9
-#: Two numbers that differ by less than this part are the same: then water is isosceles whatever rounding did.
+#: Relative difference of equal numbers, so that water is isosceles in spite of rounding.
 SAME = 1e-12
-#: OpenMM compares distances in single precision.
+#: The same for sides of triangles in OpenMM, which compares distances in single precision.
 ISOSCELES = 1e-6
 TRIANGLE = np.array([[0, 1, 0], [-sqrt(0.75), -0.5, 0], [sqrt(0.75), -0.5, 0]]) * sqrt(2)
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 
 
-class Place(NamedTuple):
-    """Where a site is: sum of weight times point, and cross times (second - first) x (third - first)."""
+class VirtualSite(NamedTuple):
+    """A site at sum(weight * point) + cross * (second - first) x (third - first)."""
 
-    weight: np.ndarray  # (p,) their sum is 1
-    cross: float  # 1/Å; 0 unless the site is off the plane of three points
+    weight: np.ndarray  # (p,) with sum 1
+    cross: float  # 1/Å; not 0 only for a site off the plane of three points
 
 
 class MassPoints(NamedTuple):
-    """The p points that stand for a rigid molecule, and where its other sites are."""
+    """The p points that represent a rigid molecule, and its virtual sites."""
 
     mass: np.ndarray  # (p,) u
     position_body: np.ndarray  # (p, 3) Å
-    site: np.ndarray  # (p,) the site that a point is; -1 for none
-    placed: dict[int, Place]  # of all sites that are no mass points
+    site: np.ndarray  # (p,) index of the site at the point; -1 without one
+    virtual_sites: dict[int, VirtualSite]  # all sites that are not at mass points
 
     @property
     def distances(self) -> list[tuple[int, int, float]]:
-        """Pairs of points and their distances, Å, which together make a rigid body."""
+        """All pairs of points and their distances, Å."""
         found: list[tuple[int, int, float]] = []
         for i in range(len(self.mass)):
             for j in range(i):
@@ -50,33 +49,34 @@ class MassPoints(NamedTuple):
         return found
 
     def positions(self, point: np.ndarray) -> dict[int, np.ndarray]:
-        """Positions of the placed sites for points (p, 3)."""
+        """Positions of the virtual sites for points (p, 3)."""
         normal = np.cross(point[1] - point[0], point[2] - point[0]) if len(point) == 3 else np.zeros(3)
-        return {site: place.weight @ point + place.cross * normal for site, place in self.placed.items()}
+        return {k: site.weight @ point + site.cross * normal for k, site in self.virtual_sites.items()}
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
-    """The points for a molecule; all its sites where it is frozen, which nothing moves.
+    """The mass points of a molecule. For a frozen molecule these are all its sites.
 
-    sites : whether its sites may be the points, where just enough of them have mass
+    sites : whether sites may be the points if just enough of them have mass
     """
     if frozen:
-        every = np.arange(len(molecule.masses))
-        return MassPoints(molecule.masses, molecule.positions_body, every, {})
+        return MassPoints(molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {})
     mass, position, site = _points(molecule, sites)
     others = [k for k in range(len(molecule.masses)) if k not in site]
     limit = OFF * molecule.radius
-    return MassPoints(mass, position, site, {k: _place(position, molecule.positions_body[k], limit) for k in others})
+    return MassPoints(
+        mass, position, site, {k: _virtual_site(position, molecule.positions_body[k], limit) for k in others}
+    )
 
 
 def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Masses, positions and sites of the points: sites themselves if just enough have mass, else a simplex."""
+    """Masses, positions and sites of the points: the sites if just enough of them have mass, else a simplex."""
     heavy = np.flatnonzero(molecule.masses > 0)
     total, inertia = molecule.mass, molecule.inertia
     second = np.maximum(inertia.sum() / 2 - inertia, 0.0)  # sum of m x² along each axis
     if not inertia.any():
         return np.array([total]), np.zeros((1, 3)), heavy[:1]
-    if sites and _serve(molecule, heavy):
+    if sites and _can_be_points(molecule, heavy):
         return molecule.masses[heavy], molecule.positions_body[heavy], heavy
     reach = np.sqrt(second / total)
     if molecule.kind == "linear":
@@ -92,9 +92,9 @@ def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np
     return np.full(count, total / count), points * reach, np.full(count, -1)
 
 
-def _serve(molecule: Molecule, heavy: np.ndarray) -> bool:
-    """Whether the sites with mass are themselves the points. HDO's are not: SETTLE, by which OpenMM and GROMACS keep
-    isosceles triangles, takes the two masses of the base for equal, and OpenMM's then ends in numbers that are none."""
+def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
+    """Whether the sites with mass can be the points. The sites of HDO cannot: SETTLE, by which OpenMM and GROMACS
+    constrain isosceles triangles, assumes equal masses at the base, and OpenMM's then gives NaN."""
     if molecule.kind == "linear" or len(heavy) != 3:
         return molecule.kind == "linear" and len(heavy) == 2
     mass, where = molecule.masses[heavy], molecule.positions_body[heavy]
@@ -105,15 +105,15 @@ def _serve(molecule: Molecule, heavy: np.ndarray) -> bool:
     )
 
 
-def _place(points: np.ndarray, where: np.ndarray, limit: float) -> Place:
-    """How points (p, 3) place a site at `where` (3,)."""
+def _virtual_site(points: np.ndarray, where: np.ndarray, limit: float) -> VirtualSite:
+    """The virtual site of points (p, 3) at `where` (3,)."""
     if len(points) == 1:
-        return Place(np.ones(1), 0.0)
+        return VirtualSite(np.ones(1), 0.0)
     edges = (points[1:] - points[0]).T
-    part = np.linalg.lstsq(edges, where - points[0], rcond=None)[0]
+    weight = np.linalg.lstsq(edges, where - points[0], rcond=None)[0]
     cross = 0.0
     if len(points) == 3:
         normal = np.cross(points[1] - points[0], points[2] - points[0])
         height = float((where - points[0]) @ normal) / float(np.linalg.norm(normal))
         cross = height / float(np.linalg.norm(normal)) if abs(height) > limit else 0.0
-    return Place(np.append(1 - part.sum(), part), cross)
+    return VirtualSite(np.append(1 - weight.sum(), weight), cross)

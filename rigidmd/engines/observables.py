@@ -1,4 +1,4 @@
-"""Energies, temperatures, pressure, momentum and the orthogonality of Q at one moment."""
+"""Observables of molecules at one state: energies, temperatures, pressure, momentum and the orthogonality of Q."""
 
 from math import inf, nan
 from typing import NamedTuple
@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.momenta import Freedom
-from rigidmd.dynamics.observables import sums_over
+from rigidmd.dynamics.momenta import DegreesOfFreedom
+from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines import cpu
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
@@ -17,7 +17,7 @@ UNIT = np.eye(3)
 
 
 class Reading(NamedTuple):
-    """Observables of molecules at one moment, in the units of the log. NaN if one does not exist."""
+    """Observables of molecules at one state, in the units of the log. Quantities that do not exist are NaN."""
 
     components: dict[str, float]  # potential energy by term and constant, kJ/mol
     potential: float  # their sum, kJ/mol
@@ -43,13 +43,13 @@ class Reading(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """Observables at one moment, in internal units (Å, ps, u, K, u Å²/ps²)."""
+    """Observables of molecules at one state, in internal units (Å, ps, u, K, u Å²/ps²)."""
 
     components: dict[str, float]  # potential energy by term and constant
     virial: np.ndarray  # (3, 3) molecular
     kinetic_translation: float
     kinetic_rotation: float
-    temperature_translation: float  # K; NaN where there is no such motion
+    temperature_translation: float  # K; NaN without degrees of freedom
     temperature_rotation: float
     temperature: float
     temperature_translation_unbiased: float  # see `observe`; NaN with any integrator but velocity Verlet
@@ -61,17 +61,14 @@ class Observation(NamedTuple):
 
     @property
     def potential(self) -> float:
-        """Sum of the components."""
         return sum(self.components.values())
 
     @property
     def kinetic(self) -> float:
-        """Translation and rotation."""
         return self.kinetic_translation + self.kinetic_rotation
 
     @property
     def energy(self) -> float:
-        """Potential and kinetic."""
         return self.potential + self.kinetic
 
     @property
@@ -86,12 +83,12 @@ class Observation(NamedTuple):
 
     @property
     def reading(self) -> Reading:
-        """The same in the units of the log."""
-        of_energy = ("potential", "kinetic_translation", "kinetic_rotation", "kinetic", "energy", "virial")
-        own = {name: getattr(self, name) for name in Reading._fields if hasattr(self, name)}
+        """The observables in the units of the log."""
+        energies = ("potential", "kinetic_translation", "kinetic_rotation", "kinetic", "energy", "virial")
+        values = {name: getattr(self, name) for name in Reading._fields if hasattr(self, name)}
         return Reading(
-            **own
-            | {name: own[name] / KJ_PER_MOL for name in of_energy}
+            **values
+            | {name: values[name] / KJ_PER_MOL for name in energies}
             | {
                 "components": {name: energy / KJ_PER_MOL for name, energy in self.components.items()},
                 "force": self.load.force / KJ_PER_MOL,
@@ -111,40 +108,37 @@ def observe(
     engine: Engine,
     state: State,
     verlet_step: float = nan,
-    freedom: Freedom | None = None,
+    freedom: DegreesOfFreedom | None = None,
     moved: bool = False,
 ) -> Observation:
     """All observables, from one evaluation of forces and energies.
 
-    freedom : degrees of freedom that temperatures count; those of a conserved total momentum when not given
-
-    moved : whether the engine has just moved this state, so that it may know its forces and energies
-
+    freedom : degrees of freedom of the temperatures; by default `system.freedom`
+    moved : whether the engine has just moved this state, so that it may have its forces and energies already
     verlet_step : time step (ps) if the state comes from velocity Verlet. Between its kicks the kinetic energy is higher
     than at its steps by dt²/8 [sum F²/m + sum n . I^-1 n] on average: for a mode of frequency w the first is too high
     by x/12 and the second too low by x/6, x = (w dt)². The weighted mean (twice the first plus once the second)/3 is
     right to O(x²) (Eastwood et al. 2010, J. Chem. Theory Comput. 6, 2045): the unbiased temperatures.
 
-    Pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
-    tensor is the symmetric part: the rest is the rate at which orientations take angular momentum up, 0 on average.
+    The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
+    tensor is the symmetric part. The rest is the rate at which orientations gain angular momentum, 0 on average.
     """
-    load, tallies = engine.look(state) if moved else engine.evaluate(state)
+    load, tallies = engine.evaluate_current(state) if moved else engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
-    volume, beyond = state.volume, 0.0
+    volume, tail_pressure = state.volume, 0.0
     if system.tail is not None:
         components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(volume)
-        beyond = system.tail.pressure(volume)
+        tail_pressure = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
-    own = isinstance(engine, cpu.Engine)
-    sums = engine.sums(state, load) if own else sums_over(system.model, state, load)
+    sums = engine.sums(state, load) if isinstance(engine, cpu.Engine) else sums_of_state(system.model, state, load)
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
-    slant = verlet_step**2 / 12
-    translation_unbiased = translation + slant * sums.force
-    rotation_unbiased = rotation + slant * sums.torque
+    correction = verlet_step**2 / 12
+    translation_unbiased = translation + correction * sums.force
+    rotation_unbiased = rotation + correction * sums.torque
     freedom = freedom or system.freedom
     pressure = np.full((3, 3), nan)
     if volume < inf:
-        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + beyond) * UNIT
+        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + tail_pressure) * UNIT
     return Observation(
         components=components,
         virial=virial,
@@ -163,8 +157,8 @@ def observe(
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:
-    """Of translation and rotation, u Å²/ps²."""
-    sums = sums_over(system.model, state)
+    """Kinetic energies of translation and rotation, u Å²/ps²."""
+    sums = sums_of_state(system.model, state)
     return 0.5 * sums.translation, 0.5 * sums.rotation
 
 

@@ -21,8 +21,8 @@ from rigidmd.engines.cpu import Engine, keep_time
 from rigidmd.engines.protocol import Halted
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import frame_rate
-from rigidmd.forces.body.resistance import braking
-from rigidmd.forces.terms import load_bodies, total_power
+from rigidmd.forces.body.resistance import add_resistance
+from rigidmd.forces.terms import compute_body_load, total_power
 from rigidmd.mechanics.free_rotor import moment_rates
 from rigidmd.mechanics.odes import (
     EulerAngles,
@@ -34,7 +34,7 @@ from rigidmd.mechanics.odes import (
     read_attitude,
     variables_of,
 )
-from rigidmd.mechanics.translation import along, inertial_mass
+from rigidmd.mechanics.translation import body_component, inertial_mass
 
 FORMS: dict[str, Form] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
@@ -69,7 +69,7 @@ def read(form, model, state, time, y):
         for k in range(3):
             state.position[m, k] = y[n + k]
             state.velocity[m, k] = y[n + 3 + k]
-    state.books[WORK] = y[-1]
+    state.energy_ledger[WORK] = y[-1]
 
 
 @kernel(outer=True)
@@ -80,11 +80,11 @@ def slopes(form, model, terms, state, load, time, y, dy):
     W' = the power of drives and resistance, relative to the frame, and of changes of I and h.
     """
     read(form, model, state, time, y)
-    status = load_bodies(terms, state, load, None)
+    status = compute_body_load(terms, state, load, None)
     if status != OK:
         return status
     velocity, omega = relative_motion(model, state)
-    dy[-1] = total_power(terms, state, velocity, omega) + braking(model.resistance, state, load, velocity, omega)
+    dy[-1] = total_power(terms, state, velocity, omega) + add_resistance(model.resistance, state, load, velocity, omega)
     W = frame_rate(model.frame, time)
     n = form.variables
     for m in range(len(state.rotation)):
@@ -97,8 +97,8 @@ def slopes(form, model, terms, state, load, time, y, dy):
             inertia, growth, _, motor = moment_rates(model.rotor, time, k)
             torque = load.torque_body[m, k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
             for b in range(len(state.position)):
-                pi = model.flight.mass * along(q, state.velocity[b], i)
-                pj = model.flight.mass * along(q, state.velocity[b], j)
+                pi = model.flight.mass * body_component(q, state.velocity[b], i)
+                pj = model.flight.mass * body_component(q, state.velocity[b], j)
                 torque += pi * pj * (1 / inertial_mass(model.flight, j) - 1 / inertial_mass(model.flight, i))
             dy[n + k] = torque / inertia if inertia > 0 else 0.0
             dy[-1] -= (motor + 0.5 * growth * y[n + k]) * y[n + k]
@@ -148,7 +148,7 @@ def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
 class OdeEngine(Engine):
     """An engine that moves a body by a general solver.
 
-    The variables are in `state.bath`, which `begin` makes; the rest of the state is computed from them. DOP853 and
+    The variables are in `state.extra_variables`, which `begin` makes; the rest of the state is computed from them. DOP853 and
     Radau step beyond the requested time, so for them it also holds the begin and the length of the last step: (time,
     length, variables there, variables now, sizes of all variables but the work). DOP853 continues from it to the bit;
     Radau within its tolerance, because it also remembers a Jacobian.
@@ -177,12 +177,14 @@ class OdeEngine(Engine):
                 inertia, _, carried, _ = moment_rates_of(self.model.rotor, state.time[NOW], k)
                 omega.append((state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0)
         flight = [state.position.ravel(), state.velocity.ravel()]
-        y = np.concatenate([variables_of(_form(solver, state), state.rotation), omega, *flight, state.books[[WORK]]])
+        y = np.concatenate(
+            [variables_of(_form(solver, state), state.rotation), omega, *flight, state.energy_ledger[[WORK]]]
+        )
         if solver.name != RK4:
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._sizes(solver, state, y)])
         return y
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         """As `Engine.advance`. DOP853 and Radau choose their own steps in between. Raises SimulationError, Halted."""
         solver = _solver_of(row)
         self._prepare(state)
@@ -210,10 +212,10 @@ class OdeEngine(Engine):
 
         start : where the run began, if forces have not changed since
         """
-        solver, variables = _solver_of(row), len(state.bath) // 3
+        solver, variables = _solver_of(row), len(state.extra_variables) // 3
         if solver.name != RK4:
-            time, length = state.bath[:2]
-            sizes = state.bath[2 + 2 * variables :]
+            time, length = state.extra_variables[:2]
+            sizes = state.extra_variables[2 + 2 * variables :]
             if not (0 <= time <= state.time[NOW] and length >= 0 and (sizes > 0).all()):
                 raise ValueError("the last step of its solver is none")
             if start is not None and not np.array_equal(sizes, self.variables(start, row)[2 + 2 * variables :]):
@@ -234,7 +236,7 @@ class OdeEngine(Engine):
         self._anew = True
 
     def _rk4(self, form: Form, state: State, dt: float, until: int) -> None:
-        y = state.bath
+        y = state.extra_variables
         cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
         while status := rk4(form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor):
             if status == SINGULAR:
@@ -243,14 +245,14 @@ class OdeEngine(Engine):
         read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
     def _adaptive(self, form: Form, state: State, solver: Solver, dt: float, until: int) -> None:
-        variables = len(state.bath) // 3
-        begun, there, y, sizes = np.split(state.bath, [2, 2 + variables, 2 + 2 * variables])
+        variables = len(state.extra_variables) // 3
+        begun, there, y, sizes = np.split(state.extra_variables, [2, 2 + variables, 2 + 2 * variables])
         end = state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt
         if self._anew:
             begun[:], there[:] = (state.time[NOW], 0.0), y
             sizes[:] = self._sizes(solver, state, y)
             self._anew = False
-        kept, running = state.bath.copy(), self._solver
+        kept, running = state.extra_variables.copy(), self._solver
         if running is None:
             if singular(form, there, there, 0.0):
                 raise SingularError(there[1], begun[0])
@@ -271,7 +273,7 @@ class OdeEngine(Engine):
                 )
             self._between = running.dense_output()
             if self.halts():  # back to the last look: the slopes have moved the state
-                state.bath[:] = kept
+                state.extra_variables[:] = kept
                 read(form, self.model, state, state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt, y)
                 raise Halted
         if self._between is not None:

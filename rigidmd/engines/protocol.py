@@ -1,4 +1,8 @@
-"""Engines move states. `Engine` is their protocol; `cpu` runs compiled code, `textbook` general ODE solvers."""
+"""The protocol of engines. An engine moves the state of a system by steps of an integrator and evaluates its forces.
+
+`cpu` runs compiled code. `ode` moves a single body by a general ODE solver. `external` lets another program (LAMMPS or
+OpenMM) compute.
+"""
 
 from typing import NamedTuple, Protocol
 
@@ -9,40 +13,40 @@ from rigidmd.core.state import Load, State
 
 
 class Tally(NamedTuple):
-    """Contribution of one term at one moment."""
+    """Energy and virial of one term at one state."""
 
     energy: float  # u Å²/ps²
     virial: np.ndarray  # (3, 3) molecular, sum F (x) R, u Å²/ps²
 
 
 class Halted(Exception):
-    """An engine was asked to end between two looks; the state is that of the last one."""
+    """A run was asked to stop between two observations. The state is as at the last observation."""
 
 
 class Engine(Protocol):
-    """The methods of an engine that a run uses."""
+    """The methods of an engine that a run uses. `row` is the integrator."""
 
     def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
-        """What a row moves besides the bodies, for `state.bath`, as it is when a stretch of steps begins."""
+        """The extra variables of an integrator (`state.extra_variables`) at the begin of a segment."""
         ...
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
-        """A copy of a state, with the variables of a row."""
+        """A copy of a state with the variables of an integrator."""
         ...
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, looked: bool = False) -> None:
-        """Move the state in steps of dt until `until` steps are counted in it, in place. Raises SimulationError.
+    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+        """Move the state in place, in steps of dt, until its step counter is `until`. Raises SimulationError.
 
-        looked : whether `look` follows; speed only
+        observed : whether `evaluate_current` follows; affects speed only
         """
         ...
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, fresh arrays, and each term's energy and virial. Raises SimulationError."""
+        """Forces and torques at a state (new arrays), and energy and virial of each term. Raises SimulationError."""
         ...
 
-    def look(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """`evaluate` at the state that was just moved; what its last step has computed is not computed again."""
+    def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
+        """`evaluate` at the state that was just moved, with what its last step has already computed."""
         ...
 
     def snapshot(self) -> State:
@@ -50,13 +54,13 @@ class Engine(Protocol):
         ...
 
     def memory(self) -> dict[str, np.ndarray] | None:
-        """Arrays on which the next steps depend besides the state; None if there is more than arrays can hold."""
+        """The arrays besides the state on which the next steps depend; None if arrays cannot hold all of it."""
         ...
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
-        """Go on from a state with what `memory` gave for it, to the same bits. Raises ValueError if they do not fit."""
+        """Resume from a state with the arrays of `memory`, to the same bits. Raises ValueError if they do not fit."""
         ...
 
     def forget(self) -> None:
-        """Declare that positions were changed from outside since the last step."""
+        """Discard what depends on positions, because they were changed from outside since the last step."""
         ...

@@ -1,4 +1,7 @@
-"""Samples of a run of molecules: added one by one, read as columns."""
+"""The columns of log.csv (molecules) and motion.csv (a body), and the samples of a run of molecules.
+
+One table serves files, displays and documentation. For molecules it is the record `Sample`: each field has a `Column`.
+"""
 
 from array import array
 from bisect import bisect_right
@@ -8,12 +11,19 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
-from rigidmd.engines.columns import Column
 from rigidmd.scene.stage import Stage
 
 
+class Column(NamedTuple):
+    """Header, unit and description of a column."""
+
+    header: str  # in log.csv or motion.csv; empty for a column that is not written
+    unit: str  # "1" for plain numbers, empty for text
+    about: str
+
+
 class Sample(NamedTuple):
-    """One line of the log, in its units. Missing values are NaN: pressure without a box, T_rot of points."""
+    """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot of points."""
 
     step: Annotated[int, Column("Step", "1", "steps since the start")]
     time: Annotated[float, Column("Time (ps)", "ps", "time since the start")]
@@ -42,54 +52,94 @@ class Sample(NamedTuple):
     alpha: Annotated[float, Column("alpha (deg)", "°", "angle between b and c")]
     beta: Annotated[float, Column("beta (deg)", "°", "angle between c and a")]
     gamma: Annotated[float, Column("gamma (deg)", "°", "angle between a and b")]
-    heat: Annotated[float, Column("Heat (kJ/mole)", "kJ/mol", "what thermostats have put in since the start")]
-    work: Annotated[
-        float, Column("Work (kJ/mole)", "kJ/mol", "what boxes, drives and minimisations have put in since the start")
-    ]
+    heat: Annotated[float, Column("Heat (kJ/mole)", "kJ/mol", "heat that thermostats have added since the start")]
+    work: Annotated[float, Column("Work (kJ/mole)", "kJ/mol", "work of barostats, drives and minimisations so far")]
     pressure_xx: Annotated[float, Column("Pressure xx (bar)", "bar", "molecular pressure tensor, symmetric part")]
     pressure_yy: Annotated[float, Column("Pressure yy (bar)", "bar", "the same, yy")]
     pressure_zz: Annotated[float, Column("Pressure zz (bar)", "bar", "the same, zz")]
     pressure_xy: Annotated[float, Column("Pressure xy (bar)", "bar", "the same, xy")]
     pressure_xz: Annotated[float, Column("Pressure xz (bar)", "bar", "the same, xz")]
     pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
-    conserved: Annotated[
-        float, Column("", "kJ/mol", "energy less heat, work and what removals of momentum have put in")
-    ]
+    conserved: Annotated[float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
     user_energies: tuple[float, ...] = ()  # energies of the user-defined forces, kJ/mol
 
 
-COLUMNS: dict[str, Column] = {
-    name: get_args(hint)[1] for name, hint in get_type_hints(Sample, include_extras=True).items() if name != "user_energies"
-}
+_HINTS = get_type_hints(Sample, include_extras=True)
+COLUMNS: dict[str, Column] = {name: get_args(_HINTS[name])[1] for name in Sample._fields if name != "user_energies"}
 
 
 def user_columns(user_terms: Sequence[str]) -> dict[str, Column]:
-    """The columns of the user's own forces."""
+    """The columns of the energies of user-defined forces."""
     return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in user_terms}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
 
 
+class Family(NamedTuple):
+    """Columns of a body that are the components of one quantity."""
+
+    names: tuple[str, ...]
+    unit: str
+    about: str
+
+
+BODY = {
+    "time": Family(("time",), "s", "time"),
+    "position": Family(("x", "y", "z"), "m", "centre of mass"),
+    "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
+    "rotation": Family(
+        tuple(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "1", "rotation matrix Q by rows: lab = Q body"
+    ),
+    "quaternion": Family(("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"),
+    "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
+    "h_body": Family(tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"),
+    "omega_body": Family(tuple(f"omega_body_{k}" for k in (1, 2, 3)), "rad/s", "angular velocity, body axes"),
+    "omega_lab": Family(tuple(f"omega_lab_{k}" for k in "xyz"), "rad/s", "angular velocity, lab axes"),
+    "L_body": Family(tuple(f"L_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum with wheels, body axes"),
+    "L_lab": Family(tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"),
+    "kinetic": Family(("kinetic",), "J", "kinetic energy of I omega; less Omega · J in a rotating frame"),
+    "potential": Family(("potential",), "J", "potential energy"),
+    "energy": Family(("energy",), "J", "kinetic and potential energy"),
+    "work": Family(("work",), "J", "work of drives and resistance: energy - work is conserved"),
+    "energy_error": Family(
+        ("energy_error",), "1", "change of energy - work, as a fraction of the largest kinetic energy"
+    ),
+    "L_error": Family(
+        tuple(f"L_{k}_error" for k in ("lab", "size", "x", "y", "z", 1, 2, 3)),
+        "1",
+        "change of what is conserved of L, as a fraction of the largest abs(L)",
+    ),
+    "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
+}
+#: Additional key of `results[...]` for a body: several columns as one array.
+MATRIX = "Q"
+BODY_COLUMNS = {
+    name: Column("t" if name == "time" else name, family.unit, family.about)
+    for family in BODY.values()
+    for name in family.names
+}
+
+
 class Samples:
-    """The samples of a run in order, kept as a row of float64 each.
+    """The samples of a run in order: a table with one row of float64 per sample.
 
     stages : names of all stages
-    user_terms : names of the user's own forces, whose energies are columns too
-    table : of an earlier `table()`; raises ValueError if it is none
+    user_terms : names of user-defined forces, whose energies are columns
+    table : the result of an earlier `table()`. Raises ValueError if it is invalid.
     """
 
     def __init__(self, stages: Sequence[str], user_terms: tuple[str, ...] = (), table: np.ndarray | None = None):
         self.stages, self.user_terms = tuple(stages), user_terms
         self._numbers = [*NUMBERS, *user_terms]
-        self._values = array("d")  # it grows in place, in the machine's memory as NumPy has it
+        self._values = array("d")  # grows in place
         if table is not None:
             if table.ndim != 2 or table.shape[1] != len(self._numbers) or table.dtype != np.float64:
                 raise ValueError(f"samples have the shape {table.shape}")
             self._values.frombytes(table.tobytes())
             if not np.isin(self._column("stage"), np.arange(len(self.stages))).all():
-                raise ValueError("samples are of stages that the scene does not have")
+                raise ValueError("samples have stages that are not in the scene")
             step = self._column("step")
             if not ((np.abs(step) < 2**53) & (np.floor(step) == step)).all():
                 raise ValueError("samples have steps that are not whole numbers")
@@ -98,7 +148,6 @@ class Samples:
         return f"<Samples: {len(self)} of {', '.join(self.described)}>"
 
     def append(self, sample: Sample) -> None:
-        """Add a sample at the end."""
         self._values.extend((*_VALUES(sample), *sample.user_energies))
 
     def __len__(self) -> int:
@@ -117,11 +166,11 @@ class Samples:
 
     @property
     def rows(self) -> list[Sample]:
-        """All samples, which take five times the memory of the table."""
+        """All samples. They take five times the memory of the table."""
         return list(self)
 
     def row(self, k: int) -> Sample:
-        """Sample k; -1 is the last one."""
+        """Sample k; -1 for the last one."""
         first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
         values: dict[str, Any] = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
         values |= {name: int(values[name]) for name in ("step", "stage")}
@@ -129,24 +178,24 @@ class Samples:
         return Sample(**values, stage_name=self.stages[values["stage"]], user_energies=tuple(energies))
 
     def latest(self, time: float, since: int) -> int:
-        """The last row from `since` on that is not later than a time (ps); `since` if there is none."""
+        """Index of the last sample not later than a time (ps), at least `since`."""
         width, at = len(self._numbers), self._numbers.index("time")
         rows = range(len(self))
         return max(since, bisect_right(rows, time, lo=since, key=lambda k: self._values[k * width + at]) - 1)
 
     def of_stage(self, k: int) -> "Samples":
-        """The samples of stage k, which follow one another."""
+        """The samples of stage k, which are contiguous."""
         found, width = Samples(self.stages, self.user_terms), len(self._numbers)
         if len(rows := np.flatnonzero(self._column("stage") == k)):
             found._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
         return found
 
     def table(self) -> np.ndarray:
-        """All numbers (rows, columns) as float64, which holds every one of them: a copy."""
+        """A copy of all numbers (rows, columns) as float64, which represents each of them exactly."""
         return np.array(self._values, float).reshape(-1, len(self._numbers))
 
     def _column(self, name: str) -> np.ndarray:
-        """A view, which must be gone before the next sample comes."""
+        """A view of a column. It must be released before the next sample is appended."""
         return np.asarray(self._values)[self._numbers.index(name) :: len(self._numbers)]
 
     @property
@@ -158,5 +207,5 @@ _VALUES = attrgetter(*NUMBERS)
 
 
 def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
-    """Which samples (n,), of stages with these indices, are of motion: none of minimisations."""
+    """Whether each sample (n,) is of motion and not of a minimisation; `of` has the index of its stage."""
     return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])

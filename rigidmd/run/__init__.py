@@ -2,8 +2,7 @@
 
 from rigidmd.run.body import BodySimulation
 from rigidmd.run.molecular import MolecularSimulation
-from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Every, Observer
+from rigidmd.run.observers import Every, Moment, Observer
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
 from rigidmd.run.together import run_together

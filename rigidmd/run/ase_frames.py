@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidmd.core.process import quiet
+from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW
 from rigidmd.engines.system import System
 from rigidmd.io.ase_atoms import EV, atoms_of_sites, atoms_of_system
 from rigidmd.io.formats.traj import TrajReader
-from rigidmd.run.atom_forces import in_ase_units
+from rigidmd.run.atom_forces import ase_results
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def _final(results: "Results", system: System) -> "ase.Atoms":
 
     found = atoms_of_system(system, results.state, _wrapped(system))
     found.info["time_ps"] = float(results.state.time[NOW])
-    found.calc = SinglePointCalculator(found, **in_ase_units(system, system.engine(), results.state))
+    found.calc = SinglePointCalculator(found, **ase_results(system, system.engine(), results.state))
     return found
 
 
@@ -95,7 +95,7 @@ def _from_files(results: "Results") -> Callable[[int], tuple]:
         with contextlib.closing(TrajReader(path)) as file:
             stored = [file.read(k) for k in range(file.count)]
             return lambda k: (*file.of_sites(stored[k]), stored[k].cell)
-    with quiet():  # frames that are not evenly spaced: each has its time
+    with ignore_warnings():  # frames that are not evenly spaced: each has its time
         trajectory = cast(Any, results.universe().trajectory)
 
     def sites(k: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:

@@ -1,16 +1,16 @@
 """Forces on the atoms of rigid molecules, in two forms that have the same total force and torque on each molecule.
 
-`shared` gives every atom the force of the rigid motion that follows from the molecule's force F and torque,
+`gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's force F and torque,
 
     f_i = m_i (F/M + w x y_i),   K w = torque,   K = tr(C) 1 - C,   C = sum m_i y_i (x) r_i,
 
-with the atoms r_i and their places y_i in the rigid molecule, both from the centre of mass. These forces are minus the
-gradient of the energy as a function of atoms to which rigid molecules are fitted, bent or not: of a fit with masses m_i
-the turn follows a shift of the atoms by K turn = sum m_i y_i x shift_i. They vanish at a minimum, and are what
-constraints on all distances leave of any other form. K is the inertia tensor of molecules that are not bent.
+with the atoms r_i and their positions y_i in the rigid molecule, both from the centre of mass. These forces are minus
+the gradient of the energy as a function of atoms to which rigid molecules are fitted with masses m_i, bent or not: a
+shift of the atoms rotates the fit by phi, K phi = sum m_i y_i x shift_i. They vanish at a minimum. Constraints on all
+distances reduce any other form to them. K is the inertia tensor of molecules that are not bent.
 
-`of_sites` gives each atom the forces of its own site. Those of sites without mass are spread over the atoms. They hold
-forces inside molecules too, which constraints have to balance.
+`site_forces`: each atom has the forces on its site. Forces on massless sites are distributed over the atoms. Forces
+inside molecules are included; constraints have to balance them.
 """
 
 from typing import Any, Literal, cast
@@ -31,74 +31,74 @@ from rigidmd.io.ase_atoms import EV
 from rigidmd.run.force_errors import forces_inside
 from rigidmd.scene.models import Molecule
 
-#: A massless site this close to a combination of the atoms, as a fraction of the molecule's size, is one.
-COMBINED = 1e-9
-#: Least moment of inertia that counts, as a fraction of the largest: linear molecules have one of 0.
-LEAST_MOMENT = 1e-9
+#: Distance of a massless site from a linear combination of the atoms that is rounding, as a fraction of the radius.
+COMBINATION_TOLERANCE = 1e-9
+#: Smaller moments of inertia, as fractions of the largest, are 0, as one moment of linear molecules is.
+MIN_MOMENT = 1e-9
 
-#: Which forces atoms have.
+#: `gradient_forces` or `site_forces`.
 Form = Literal["gradient", "sites"]
-#: Of a stress in ASE: xx, yy, zz, yz, xz, xy.
+#: Components of a stress in ASE: xx, yy, zz, yz, xz, xy.
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
-def in_ase_units(
+def ase_results(
     system: System, engine: Engine, state: State, form: Form = "gradient", atoms: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Energy (eV), forces (a, 3) on the sites with mass (eV/Å) and, in a box, stress (6,) (eV/Å³) as ASE has them.
 
-    The stress is that of the molecular virial, without the ideal part: the derivative of the energy for a strain that
-    moves centres of mass and turns nothing, over the volume. form : "gradient" is `shared`, "sites" is `of_sites`
+    The stress is from the molecular virial, without the ideal part: the derivative of the energy for a strain that moves
+    centres of mass and rotates nothing, over the volume.
     """
     still = state._replace(
         velocity=np.zeros_like(state.velocity), angular_momentum_body=np.zeros_like(state.angular_momentum_body)
     )
     seen = observe(system, engine, still)
-    force = shared(system, state, seen.load, atoms)
+    force = gradient_forces(system, state, seen.load, atoms)
     if form == "sites":
-        force = of_sites(system, engine, state, seen.load, atoms)
+        force = site_forces(system, engine, state, seen.load, atoms)
     found = {"energy": seen.potential / EV, "forces": force / EV}
     if np.isfinite(state.cell).all():
         found["stress"] = np.array([-seen.pressure_tensor[at] for at in VOIGT]) / EV
     return found
 
 
-def shared(system: System, state: State, load: Load, atoms: np.ndarray | None = None) -> np.ndarray:
+def gradient_forces(system: System, state: State, load: Load, atoms: np.ndarray | None = None) -> np.ndarray:
     """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file, with the totals of `load`.
 
     atoms : positions (a, 3) where they are not those of rigid molecules, Å
     """
-    return _shared(system, state, load.force, _torque_lab(state, load), atoms)
+    return _gradient_forces(system, state, load.force, _torque_lab(state, load), atoms)
 
 
-def of_sites(system: System, engine: Engine, state: State, load: Load, atoms: np.ndarray | None = None) -> np.ndarray:
+def site_forces(system: System, engine: Engine, state: State, load: Load, atoms: np.ndarray | None = None) -> np.ndarray:
     """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with the totals of `load`.
 
-    engine : has just evaluated `load` at the state. What acts on whole molecules, such as gravity, is `shared`.
+    engine : has just evaluated `load` at the state. Forces on whole molecules, such as gravity, are in the first form.
     """
     force = np.zeros((system.site_count, 3))
-    arm = _arms(system, state)
+    arm = _site_arms(system, state)
     for name, workspace in engine.workspaces.items():
         sites = getattr(workspace, "sites", None)
         if not hasattr(workspace, "site_force") or not isinstance(sites, BodySites | CentralSites):
             continue
-        own = np.array(cast(Any, workspace).site_force)
-        at = _places(system, sites)
+        on_site = np.array(cast(Any, workspace).site_force)
+        at = _site_indices(system, sites)
         if isinstance(workspace, EwaldWorkspace | PmeWorkspace):
             real = cast(PairForces, system.terms[name.replace("reciprocal", "real")])
-            law = cast(ScreenedCoulomb, real.law)
+            law = cast(ScreenedCoulomb, real.potential)
             position = (state.position[system.sites.molecule] + arm)[at]
-            own = own + forces_inside(law.charge, position, sites.first, law.alpha)
-        np.add.at(force, at, own)
+            on_site = on_site + forces_inside(law.charge, position, sites.first, law.alpha)
+        np.add.at(force, at, on_site)
     atom = system.sites.mass > 0
-    found = force[atom] + _spread(system, state, force)[atom]
+    found = force[atom] + _massless_forces_on_atoms(system, state, force)[atom]
     of_atom, n = system.sites.molecule[atom], len(state.position)
-    rest = load.force - _summed(of_atom, found, n)
-    torque = _torque_lab(state, load) - _summed(of_atom, np.cross(_from_centre(system, state, arm, atoms), found), n)
-    return found + _shared(system, state, rest, torque, atoms)
+    rest = load.force - _sum_per_molecule(of_atom, found, n)
+    torque = _torque_lab(state, load) - _sum_per_molecule(of_atom, np.cross(_from_centre(system, state, arm, atoms), found), n)
+    return found + _gradient_forces(system, state, rest, torque, atoms)
 
 
-def _shared(
+def _gradient_forces(
     system: System, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
 ) -> np.ndarray:
     atom = system.sites.mass > 0
@@ -106,18 +106,18 @@ def _shared(
     total = system.model.mass[system.model.species][:, None]
     found = mass * (force / total)[of_atom]
     if len(state.rotation):
-        arm = _arms(system, state)
+        arm = _site_arms(system, state)
         y, r = arm[atom], _from_centre(system, state, arm, atoms)
-        moments = _summed(of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force))
+        moments = _sum_per_molecule(of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force))
         moments = 0.5 * (moments + moments.swapaxes(1, 2))  # it is symmetric where the fit is the best
         tensor = moments.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
-        turn = np.einsum("nij,nj->ni", np.linalg.pinv(tensor, rcond=LEAST_MOMENT, hermitian=True), torque)
+        turn = np.einsum("nij,nj->ni", np.linalg.pinv(tensor, rcond=MIN_MOMENT, hermitian=True), torque)
         found += mass * np.cross(turn[of_atom], y)
     return found
 
 
-def _arms(system: System, state: State) -> np.ndarray:
-    """Places (s, 3) of sites from their centres of mass, lab frame."""
+def _site_arms(system: System, state: State) -> np.ndarray:
+    """Positions (s, 3) of sites from their centres of mass, lab frame."""
     return system.site_positions(state) - state.position[system.sites.molecule]
 
 
@@ -132,14 +132,14 @@ def _torque_lab(state: State, load: Load) -> np.ndarray:
     return np.einsum("nij,nj->ni", state.rotation, load.torque_body)
 
 
-def _summed(owner: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+def _sum_per_molecule(owner: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     found = np.zeros((n, *values.shape[1:]))
     np.add.at(found, owner, values)
     return found
 
 
-def _places(system: System, sites: BodySites | CentralSites) -> np.ndarray:
-    """Index (s,) of the sites of a law among all sites."""
+def _site_indices(system: System, sites: BodySites | CentralSites) -> np.ndarray:
+    """Index (s,) of the sites of a pair potential among all sites."""
     counts = np.array([len(m.masses) for m in system.species])[system.model.species]
     begin = np.cumsum(counts) - counts
     offset, found = sites.offsets(), np.zeros(len(sites.molecule), int)
@@ -148,14 +148,14 @@ def _places(system: System, sites: BodySites | CentralSites) -> np.ndarray:
         members = members[np.diff(sites.first)[members] > 0]
         if len(members) == 0:
             continue
-        own = np.arange(int(sites.first[members[0]]), int(sites.first[members[0] + 1]))
-        place = cdist(offset[own], m.positions_body).argmin(axis=1)
-        found[sites.first[members][:, None] + np.arange(len(own))] = begin[members][:, None] + place
+        of_first = np.arange(int(sites.first[members[0]]), int(sites.first[members[0] + 1]))
+        nearest = cdist(offset[of_first], m.positions_body).argmin(axis=1)
+        found[sites.first[members][:, None] + np.arange(len(of_first))] = begin[members][:, None] + nearest
     return found
 
 
-def _spread(system: System, state: State, force: np.ndarray) -> np.ndarray:
-    """What the forces (s, 3) on massless sites give the atoms (s, 3)."""
+def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -> np.ndarray:
+    """Forces (s, 3) on the atoms that are equivalent to the forces (s, 3) on massless sites."""
     found = np.zeros_like(force)
     counts = np.array([len(m.masses) for m in system.species])[system.model.species]
     begin = np.cumsum(counts) - counts
@@ -164,24 +164,24 @@ def _spread(system: System, state: State, force: np.ndarray) -> np.ndarray:
         if len(bare) == 0:
             continue
         first = begin[system.model.species == k][:, None]
-        turned = state.rotation if len(state.rotation) else np.tile(np.eye(3), (len(counts), 1, 1))
-        Q = turned[system.model.species == k]
-        share = np.array([_shares(m, int(site)) for site in bare])  # (bare, heavy, 3, 3)
+        rotation = state.rotation if len(state.rotation) else np.tile(np.eye(3), (len(counts), 1, 1))
+        Q = rotation[system.model.species == k]
+        matrices = np.array([_transfer_matrices(m, int(site)) for site in bare])  # (bare, heavy, 3, 3)
         body = np.einsum("nij,nbi->nbj", Q, force[first + bare])
-        found[first + heavy] = np.einsum("nij,bhjk,nbk->nhi", Q, share, body)
+        found[first + heavy] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
     return found
 
 
-def _shares(molecule: Molecule, site: int) -> np.ndarray:
-    """Matrices (heavy, 3, 3), body frame, from the force on a massless site to those on the atoms, with the same total
-    force and torque: of a site that is a linear combination of the atoms its coefficients, else the smallest forces."""
-    place, heavy = molecule.positions_body[site], molecule.positions_body[molecule.masses > 0]
+def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
+    """Matrices (heavy, 3, 3), body frame, from the force on a massless site to forces on the atoms with the same total
+    force and torque: by the coefficients of a site that is a linear combination of the atoms, or else the smallest."""
+    position, heavy = molecule.positions_body[site], molecule.positions_body[molecule.masses > 0]
     rows = np.vstack([heavy.T, np.ones(len(heavy))])
-    weight = np.linalg.lstsq(rows, np.append(place, 1.0), rcond=COMBINED)[0]
-    if np.abs(rows @ weight - np.append(place, 1.0)).max() <= COMBINED * max(molecule.radius, 1.0):
+    weight = np.linalg.lstsq(rows, np.append(position, 1.0), rcond=COMBINATION_TOLERANCE)[0]
+    if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(molecule.radius, 1.0):
         return weight[:, None, None] * np.eye(3)
     totals = np.hstack([np.vstack([np.eye(3), _cross(x)]) for x in heavy])
-    return (np.linalg.pinv(totals, rcond=COMBINED) @ np.vstack([np.eye(3), _cross(place)])).reshape(-1, 3, 3)
+    return (np.linalg.pinv(totals, rcond=COMBINATION_TOLERANCE) @ np.vstack([np.eye(3), _cross(position)])).reshape(-1, 3, 3)
 
 
 def _cross(x: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any, Unpack
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.body import build_body
-from rigidmd.compile.cache import kept_in_words
+from rigidmd.compile.cache import describe_cache
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
@@ -37,7 +37,7 @@ from rigidmd.scene.validation import not_none
 
 
 class BodyResumeData(ResumeData):
-    """What evolves in the run of a body and is not in its state."""
+    """Resume data of the run of a body."""
 
     stable: PositiveFloat | None = None  # the longest stable step, s
 
@@ -88,7 +88,7 @@ class BodySimulation(Simulation):
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
-        self._announce(f"compiling ({kept_in_words()})")
+        self._announce(f"compiling ({describe_cache()})")
         self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0)
         self._reset()
         self._segments = self._equal_step_segments()
@@ -107,8 +107,8 @@ class BodySimulation(Simulation):
 
     def _enter_segment(self, k: int) -> Segment:
         if k > 0:
-            self.state.begin_stretch(self.system.breaks()[k - 1])
-            self.engine.change(*self.system.during(float(self.state.time[NOW])))
+            self.state.begin_segment(self.system.breaks()[k - 1])
+            self.engine.change(*self.system.terms_at(float(self.state.time[NOW])))
         return self._segments[k]
 
     def _resume_json(self) -> dict[str, Any]:
@@ -121,9 +121,9 @@ class BodySimulation(Simulation):
         arrays, method = kept.of("state").arrays, self.system.method
         check_same_scene(self.scene, self._resume_data.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
-        k = kept.told["place"]["stretch"]
+        k = kept.told["position"]["segment"]
         if k > 0:
-            self.engine.change(*self.system.during(float(self.state.time[ORIGIN])))
+            self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
         if isinstance(self.engine, OdeEngine):
             self.engine.check(self.state, method, self._segments[k].dt, self.system.state if k == 0 else None)
@@ -133,7 +133,7 @@ class BodySimulation(Simulation):
         return self._segments[k]
 
     def _equal_step_segments(self) -> list[Segment]:
-        """Stretches between the breaks of given functions of time, in equal steps not longer than the scene's."""
+        """Segments between the breaks of functions of time, in equal steps no longer than the timestep of the scene."""
         run = self.scene.run
         segments, steps = [], 0
         for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
@@ -165,11 +165,9 @@ class BodySimulation(Simulation):
     def _samples(self) -> Motion:
         return motion(self.system, self._sampler.snapshots)
 
-    def _summary(self, samples: Motion, costs: RunTimes) -> dict[str, Any]:
+    def _summary(self, samples: Motion, times: RunTimes) -> dict[str, Any]:
         steps = sum(segment.steps for segment in self._segments)
-        found = summarise_body(
-            self.system, samples, steps, costs.preparing, costs.wall, sum(costs.computing), self._interrupted
-        )
+        found = summarise_body(self.system, samples, steps, times, self._interrupted)
         found["stable_timestep_s"] = self._resume_data.stable
         if getattr(self.engine, "is_stiff", False):
             self.note(
@@ -183,11 +181,9 @@ class BodySimulation(Simulation):
         return self._watch.check.explain(error, self.segment.dt, self._resume_data.stable)
 
     def write_scene(self, folder: Path) -> None:
-        """Write the scene as it runs."""
         write_scene(folder, self.scene)
 
     def introduction(self) -> str:
-        """A few lines for the start of a run."""
         system, run = self.system, self.scene.run
         pinned = "" if system.translates else ", pinned"
         first = (
@@ -197,7 +193,7 @@ class BodySimulation(Simulation):
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes of the introduction and those that were issued as warnings."""
+        """The summary as text, without the notes of the introduction and the warnings that were issued."""
         return body_summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def start_energy(self) -> dict:
@@ -209,9 +205,7 @@ class BodySimulation(Simulation):
         torque = load.torque_body @ self.system.axes.T
         return {
             "unit": "J",
-            "kinetic": float(seen["kinetic"][0]),
-            "potential": float(seen["potential"][0]),
-            "energy": float(seen["energy"][0]),
+            **{name: float(seen[name][0]) for name in ("kinetic", "potential", "energy")},
             "force_N": load.force[0].tolist() if len(load.force) else None,
             "torque_body_N_m": torque[0].tolist() if len(torque) else None,
         }

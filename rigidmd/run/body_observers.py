@@ -1,20 +1,19 @@
-"""Observers of a single body: snapshots, the watch, motion.csv, figures."""
+"""Observers of a single body: snapshots, checks, motion.csv, figures."""
 
 from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.state import NOW, State
+from rigidmd.core.state import NOW, STORED_NAMES
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.figures.body import FIGURES, draw_motion
 from rigidmd.figures.run import body_figures
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz
-from rigidmd.run.checks import BODY_PATIENCE, LOOKS, BodyCheck
-from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Observer
+from rigidmd.run.checks import EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK, BodyCheck
+from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.resume import state_from
 from rigidmd.scene.validation import not_none
 
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Sampler(Observer):
-    """Keeps snapshots, from which columns are made at the end."""
+    """Keeps snapshots, of which columns are made at the end."""
 
     ends = True
 
@@ -34,14 +33,14 @@ class Sampler(Observer):
 
     def memory(self) -> Checkpoint:
         stacked = {
-            name: np.array([getattr(snapshot.state, name) for snapshot in self.snapshots]) for name in State._fields
+            name: np.array([snapshot.state[k] for snapshot in self.snapshots]) for k, name in enumerate(STORED_NAMES)
         }
         return Checkpoint({}, stacked | {"t": np.array([snapshot.time for snapshot in self.snapshots])})
 
     def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
         times = kept.arrays["t"]
         if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.state.time[NOW]).all()):
-            raise ValueError("the times of its samples are not those of a run")
+            raise ValueError("the times of its samples cannot be of a run")
         arrays = [{name: array[k] for name, array in kept.arrays.items() if name != "t"} for k in range(len(times))]
         states = [state_from(of, run.state, exact=False) for of in arrays]
         self.snapshots = [Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)]
@@ -58,24 +57,25 @@ class BodyWatch(Observer):
     def __init__(self, run: "BodySimulation"):
         self.check = BodyCheck(run.system, run.scene.watch)
         every = max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
-        # at most half a second of computing and LOOKS samples
-        self.steps = min(BODY_PATIENCE // getattr(run.system.method, "force_evaluations", 1), LOOKS * every)
+        # at most half a second of computing
+        self.steps = min(
+            EVALUATIONS_PER_CHECK // getattr(run.system.method, "force_evaluations", 1), SAMPLES_PER_CHECK * every
+        )
         self._run = run
 
     def memory(self) -> Checkpoint:
-        return Checkpoint({"moved": self.check.moved}, {})
+        return Checkpoint({"moved": self.check.exchanged}, {})
 
     def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        least, self.check.moved = self.check.moved, float(kept.told["moved"])
-        if not least <= self.check.moved < inf:
-            raise ValueError(f"it has exchanged an energy of {self.check.moved:g} J")
-        if finding := self.check.finding(run.state, run.scene.run.timestep_s):
-            raise ValueError(f"its state is none of the run: {finding}")
+        least, self.check.exchanged = self.check.exchanged, float(kept.told["moved"])
+        if not least <= self.check.exchanged < inf:
+            raise ValueError(f"it has exchanged an energy of {self.check.exchanged:g} J")
+        if problem := self.check.failed_check(run.state, run.scene.run.timestep_s):
+            raise ValueError(f"its state cannot be of this run: {problem}")
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if the state exceeds a limit."""
-        if finding := self.check.finding(self._run.state, self._run.stretch.dt):
-            raise finding
+        if problem := self.check.failed_check(self._run.state, self._run.segment.dt):
+            raise problem
 
 
 class MotionFiles(Observer):
@@ -110,10 +110,9 @@ class Figures(Observer):
     draws = True
 
     def files(self) -> list[str]:
-        return [f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "svg")]
+        return [f"{figure}.{suffix}" for figure in FIGURES for suffix in ("png", "svg")]
 
     def end(self, run: "BodySimulation", results: "Results") -> None:
-        """Draw them if there are enough samples."""
         if isinstance(results.samples, Motion):
             failed = None
             for stem, figure in body_figures(run.system, results.samples).items():

@@ -1,4 +1,4 @@
-"""When a run writes a checkpoint, and when its time is up: wall time decides, and changes no bit of a run."""
+"""When a run writes a checkpoint, and when it has to end. Wall time decides, and changes no bit of the results."""
 
 import time as clock
 from math import inf
@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rigidmd.io.checkpoint import Checkpoint, write_checkpoint
 
-#: Seconds of computing between two looks at the clock and at signals.
-PIECE = 1.0
-#: Time left for the last checkpoint and the files of the end, in times that the longest checkpoint took; and seconds.
-COSTS, SPARE = 3.0, 2.0
+#: Seconds of computing after which the clock and signals are checked.
+SEGMENT_SECONDS = 1.0
+#: Time reserved for the last checkpoint and the final files: durations of the longest checkpoint, and seconds.
+RESERVED_CHECKPOINTS, RESERVED_SECONDS = 3.0, 2.0
 
 
 def checked_walltime(seconds: float) -> float:
@@ -19,14 +19,14 @@ def checked_walltime(seconds: float) -> float:
     return seconds
 
 
-class Keeper:
+class CheckpointSchedule:
     """Writes the checkpoints of a run.
 
     Parameters
     ----------
-    folder : folder of the run; None writes nothing
-    minutes : wall time between checkpoints; False writes none
-    deadline : `time.monotonic()` before which the run has to end; None for never
+    folder : of the run; None: no checkpoints
+    minutes : wall time between checkpoints; False: no checkpoints
+    deadline : `time.monotonic()` before which the run has to end, or None
     """
 
     def __init__(self, folder: Path | None, minutes: float | bool, deadline: float | None):
@@ -34,33 +34,32 @@ class Keeper:
         self._seconds = 60.0 * minutes
         self._deadline = deadline
         self._last = clock.monotonic()
-        self._cost = 0.0
+        self._longest_write = 0.0
         self._written: tuple[int, int, bool] | None = None
-        self.asked = False
+        self.requested = False
 
     @property
-    def keeps(self) -> bool:
-        """Whether it writes any."""
+    def writes(self) -> bool:
         return self._folder is not None
 
     @property
     def is_due(self) -> bool:
-        """Whether a checkpoint is due, or has been asked for."""
-        return self.asked or clock.monotonic() - self._last >= self._seconds
+        """Whether a checkpoint is due or requested."""
+        return self.requested or clock.monotonic() - self._last >= self._seconds
 
     @property
     def time_is_up(self) -> bool:
         """Whether the run has to end now to be ready at the deadline."""
-        ahead = PIECE + COSTS * self._cost + SPARE
-        return self._deadline is not None and clock.monotonic() + ahead > self._deadline
+        needed = SEGMENT_SECONDS + RESERVED_CHECKPOINTS * self._longest_write + RESERVED_SECONDS
+        return self._deadline is not None and clock.monotonic() + needed > self._deadline
 
-    def keep(self, checkpoint: Checkpoint, place: tuple[int, int, bool]) -> None:
-        """Write a checkpoint of a place (stretch, step, whether something was computed there), once. Raises
-        OutputError."""
-        self.asked = False
-        if self._folder is None or place == self._written:
+    def write_once(self, checkpoint: Checkpoint, position: tuple[int, int, bool]) -> None:
+        """Write a checkpoint, unless it is of the same position (segment, step, whether anything was computed in it) as
+        the last one. Raises OutputError."""
+        self.requested = False
+        if self._folder is None or position == self._written:
             return
         began = clock.monotonic()
         write_checkpoint(self._folder, checkpoint)
-        self._last, self._written = clock.monotonic(), place
-        self._cost = max(self._cost, self._last - began)
+        self._last, self._written = clock.monotonic(), position
+        self._longest_write = max(self._longest_write, self._last - began)

@@ -1,7 +1,7 @@
 """Checks that the numbers of a run are still meaningful, and messages if they are not.
 
-No check evaluates forces: states, loads and samples are those that the run has anyway. Only a finding starts a search
-for the pair of sites that causes it.
+No check evaluates forces: the run has states, loads and samples anyway. Only a failed check starts a search for the
+pair of sites that causes it.
 """
 
 from collections.abc import Iterable
@@ -13,8 +13,8 @@ import numpy as np
 from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.observables import Extent, extent_of
-from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.observables import LargestValues, largest_values
+from rigidmd.dynamics.model import Model
 from rigidmd.engines.body_motion import energies, is_balanced
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.cpu import BehindWallError, NotFiniteError
@@ -30,48 +30,44 @@ from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
-#: hydrogen bond stays at half of it. For molecules without any repulsion the fraction is the second one.
-CHARGED_OVERLAP_FRACTION, CHARGES_ONLY_OVERLAP_FRACTION = 0.3, 1.0
-#: A moment of inertia is suspiciously small below this fraction of that of the whole mass at the outermost site (for a
-#: body: of its largest moment). For water the fraction is 0.05.
+#: hydrogen bond stays at half of it. The second fraction is for molecules without any repulsion.
+CHARGED_OVERLAP, CHARGES_OVERLAP = 0.3, 1.0
+#: A moment of inertia is suspiciously small below this fraction of mass times the square of the distance of the
+#: outermost site (for a body: of its largest moment). For water the fraction is 0.05.
 MIN_INERTIA_FRACTION = 0.01
 #: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
-#: Most moves of molecules between two checks; for a body, evaluations of its forces, and looks.
+#: Most moves of molecules between two checks; for a body, most evaluations of its forces, and most samples.
 MOVES_PER_CHECK, EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 250_000, 1_000_000, 512
 
 
 class FailedCheck(SimulationError):
-    """An observation that shows something wrong, as a sentence.
+    """A check that failed, with a sentence that says how.
 
-    molecule : index of the molecule concerned; shorter : factor by which the step would have to be shorter to stay
-    within the limit, if known; unturned : whether Q is wrong
+    molecule : index of the molecule concerned
+    factor : by which the step would have to be shorter to stay within the limit, if known
+    rotation_not_orthogonal : whether Q is wrong; evaporated : whether the box has grown too large
     """
 
     def __init__(
-        self,
-        seen: str,
-        molecule: int | None = None,
-        shorter: float | None = None,
-        rotation_not_orthogonal: bool = False,
-        evaporated: bool = False,
-    ):
-        super().__init__(seen)
-        self.molecule = molecule
-        self.shorter = shorter
+        self, message: str, molecule: int | None = None, factor: float | None = None,
+        rotation_not_orthogonal: bool = False, evaporated: bool = False,
+    ):  # fmt: skip
+        super().__init__(message)
+        self.molecule, self.factor = molecule, factor
         self.rotation_not_orthogonal = rotation_not_orthogonal
         self.evaporated = evaporated
 
 
 class Cause(NamedTuple):
-    """The likely cause of a finding, and what to try."""
+    """The likely cause of a failed check, and what to try."""
 
     likely: str
     advice: str
 
 
 def check_interval(system: System) -> int:
-    """Steps between two checks of molecules, so many that a check costs less than 1 % of them."""
+    """Steps between two checks of molecules, which cost less than 1 % of the steps."""
     return max(20, MOVES_PER_CHECK // len(system.model.species))
 
 
@@ -87,16 +83,13 @@ def steps_between(system: System) -> int | None:
 
 
 class StepCheck:
-    """Checks of the next step of a run of molecules.
-
-    They remember the scale of momenta of the last good sample.
-    """
+    """Checks of the next step of a run of molecules, relative to the momenta of the last good sample."""
 
     def __init__(self, system: System, limits: Watch):
         self._system, self._limits = system, limits
         self.thermal = 0.0  # u Å²/ps²; 0 before the first sample
         model = system.model
-        # Distances of sites from the axes, in radii: of a spin, what counts is the move of the sites.
+        # Distances of sites from the axes, in radii: the move of the sites decides how large a rotation may be.
         arms = [axis_distances(m) / (m.radius or 1.0) for m in system.species]
         self._per_momentum = model.inverse_inertia * np.array(arms)  # (species, 3)
         self._most_per_momentum = float(self._per_momentum.max())
@@ -106,30 +99,29 @@ class StepCheck:
         self._deepest_well = max((m.epsilon.max() for m in system.species), default=0.0)
 
     def rescale(self, kinetic: float) -> None:
-        """Take the scale of momenta from a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
+        """Set the scale of momenta by a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
         self.thermal = max(2 * kinetic / max(self._system.freedom.total, 1), self._deepest_well)
 
-    def failed_check(self, state: State, load: Load, stage: Stage, extent: Extent | None) -> FailedCheck | None:
-        """`check_step` of a stage, if it has steps."""
+    def failed_check(self, state: State, load: Load, stage: Stage, extent: LargestValues | None) -> FailedCheck | None:
+        """The failed check of a stage's next step, if the stage has steps; see `check_step`."""
         if stage.is_minimisation:
             return None
         return self.check_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND, extent)
 
     def check_step(
-        self, state: State, load: Load, scheme: Scheme, dt: float, extent: Extent | None = None
+        self, state: State, load: Load, scheme: Scheme, dt: float, extent: LargestValues | None = None
     ) -> FailedCheck | None:
-        """What is wrong with the next step of a state: a force that is not finite, or too large a kick, move or turn.
+        """The failed check of the next step: a force that is not finite, or too large a kick, move or rotation.
 
         load : at this state or at the last kick; extent : of both, if it is known
         """
-        largest = extent or extent_of(state, load)
+        largest = extent or largest_values(state, load)
         return (
             None if self._is_within_limits(largest, scheme, dt) else self._check_each_molecule(state, load, scheme, dt)
         )
 
     @np.errstate(over="ignore", invalid="ignore")
     def _check_each_molecule(self, state: State, load: Load, scheme: Scheme, dt: float) -> FailedCheck | None:
-        """The finding of `check_step`, from every molecule."""
         system, limits, model = self._system, self._limits, self._system.model
         for what, values in (("force", load.force), ("torque", load.torque_body)):
             if not np.isfinite(values).all():
@@ -139,30 +131,31 @@ class StepCheck:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
             if size.max() > limits.kick:
                 m = int(size.argmax())
-                seen = f"one kick changes a momentum of {molecule_label(system, m)} by {size[m]:.3g} times its thermal size"
-                return FailedCheck(f"{seen} (watch.kick = {limits.kick:g})", m, shorter=size[m] / limits.kick)
+                which = molecule_label(system, m)
+                message = f"one kick changes a momentum of {which} by {size[m]:.3g} times its thermal size"
+                return FailedCheck(f"{message} (watch.kick = {limits.kick:g})", m, factor=size[m] / limits.kick)
         stride = dt * max(map(abs, scheme.drifts))
         if limits.move:
             way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
             m, diameter = int(way.argmax()), self._diameter
             if way[m] > limits.move * diameter:
-                seen = f"{molecule_label(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
-                seen += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
-                return FailedCheck(seen, m, shorter=way[m] / diameter / limits.move)
+                message = f"{molecule_label(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
+                message += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
+                return FailedCheck(message, m, factor=way[m] / diameter / limits.move)
         if limits.turn_rad and len(state.rotation):
             omega = state.angular_momentum_body * self._per_momentum[model.species]
             angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
             m = int(angle.argmax())
             if angle[m] > limits.turn_rad:
-                seen = f"{molecule_label(system, m)} turns by {angle[m]:.3g} rad between two force evaluations"
-                return FailedCheck(
-                    f"{seen} (watch.turn_rad = {limits.turn_rad:g})", m, shorter=angle[m] / limits.turn_rad
-                )
+                message = f"{molecule_label(system, m)} rotates by {angle[m]:.3g} rad between two force evaluations"
+                message += f" (watch.turn_rad = {limits.turn_rad:g})"
+                return FailedCheck(message, m, factor=angle[m] / limits.turn_rad)
         return None
 
-    def _is_within_limits(self, largest: Extent, scheme: Scheme, dt: float) -> bool:
-        """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces, velocities and
-        so on: nearly always, and many times as fast as to look at each of them."""
+    def _is_within_limits(self, largest: LargestValues, scheme: Scheme, dt: float) -> bool:
+        """Whether all loads are finite and no molecule can exceed a limit, by the largest of all forces and velocities.
+
+        It is nearly always true, and many times as fast as a check of each molecule."""
         limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
         if not largest.force + largest.torque < inf:
             return False
@@ -184,41 +177,39 @@ def axis_distances(molecule: Molecule) -> np.ndarray:
 
 
 def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> FailedCheck | None:
-    """What is wrong with a sample: Q, or the conserved energy against that of an earlier sample of its stage.
-
-    In a minimisation only Q is checked.
+    """The failed check of a sample: Q, or the change of the conserved energy since an earlier sample of the stage.
 
     The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
-    energy at a thermostat's temperature if that is larger.
+    energy at a thermostat's temperature if that is larger. In a minimisation only Q is checked.
     """
     if limits.orthogonality and not now.orthogonality_error <= limits.orthogonality:
-        seen = f"|QᵀQ - 1| is {now.orthogonality_error:.2g} (watch.orthogonality = {limits.orthogonality:g})"
-        return FailedCheck(f"a matrix Q is no longer a rotation: {seen}", rotation_not_orthogonal=True)
+        message = f"|QᵀQ - 1| is {now.orthogonality_error:.2g} (watch.orthogonality = {limits.orthogonality:g})"
+        return FailedCheck(f"a matrix Q is not a rotation: {message}", rotation_not_orthogonal=True)
     if system.scene.stages[now.stage].is_minimisation:
         return None
     grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
     if limits.volume and grown > limits.volume:
-        seen = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
-        return FailedCheck(f"{seen}, {now.density:.3g} g/cm³", evaporated=True)
+        message = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
+        return FailedCheck(f"{message}, {now.density:.3g} g/cm³", evaporated=True)
     if not limits.energy:
         return None
-    stage, share = system.scene.stages[now.stage], 1.0
+    stage, fraction = system.scene.stages[now.stage], 1.0
     kinetic = since.kinetic
     if stage.has_thermostat:
         kinetic = max(
             kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom_in(now.stage).total
         )
-        share = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
+        fraction = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
         return None
     scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
-    if abs(drift) * share <= limits.energy * scale:
+    if abs(drift) * fraction <= limits.energy * scale:
         return None
     n = len(system.model.species)
     return FailedCheck(
         f"the conserved energy changed by {drift / n:.3g} kJ/mol per molecule in {now.time - since.time:g} ps, "
-        f"{abs(drift) * share / scale if scale else inf:.3g} kinetic energies (watch.energy = {limits.energy:g})"
+        f"{abs(drift) * fraction / scale if scale else inf:.3g} kinetic energies (watch.energy = {limits.energy:g})"
     )
 
 
@@ -227,26 +218,28 @@ def molecule_label(system: System, molecule: int) -> str:
     return f"molecule {molecule + 1} ({system.species[system.model.species[molecule]].name})"
 
 
-class Pair(NamedTuple):
+class OverlappingPair(NamedTuple):
     """Two sites whose cores overlap."""
 
     first: int
     second: int
     distance: float  # Å
-    share: float  # of their diameter; of the smallest one of the scene if they have none
-    bare: bool  # opposite charges without repulsion between them
+    fraction: float  # of their diameter; of the smallest one of the scene if they have none
+    without_repulsion: bool  # opposite charges without repulsion between them
 
 
-def most_overlapping_pair(system: System, state: State, molecule: int | None) -> Pair | None:
-    """The pair of sites that overlaps most, preferably of this molecule; None without such a pair."""
+def site_labels(system: System, pair: OverlappingPair) -> list[str]:
+    """Names of both sites of a pair, each with its molecule."""
+    sites = system.sites
+    return [f"{sites.name[k]} of {molecule_label(system, sites.molecule[k])}" for k in (pair.first, pair.second)]
+
+
+def most_overlapping_pair(system: System, state: State, molecule: int | None) -> OverlappingPair | None:
+    """The pair of sites that overlaps most, preferably one of this molecule; None without such a pair."""
     if not np.abs(state.position).max() * np.finfo(float).eps < 1e-3 * system.smallest_diameter:
         return None  # a coordinate is too large to resolve distances
     sigma = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
-    near = system.of_sites(
-        lambda m: np.full(
-            len(m.epsilon), CHARGED_OVERLAP_FRACTION if m.epsilon.any() else CHARGES_ONLY_OVERLAP_FRACTION
-        )
-    )
+    near = system.of_sites(lambda m: np.full(len(m.epsilon), CHARGED_OVERLAP if m.epsilon.any() else CHARGES_OVERLAP))
     acts = any(name.startswith("coulomb") for name in system.terms)
     charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
     found = []
@@ -254,18 +247,18 @@ def most_overlapping_pair(system: System, state: State, molecule: int | None) ->
     for i, j, distance in close_pairs(system, state, (reach, every_site)):
         repel = sigma[i] > 0 and sigma[j] > 0
         size = (sigma[i] + sigma[j]) / 2 if repel else system.smallest_diameter
-        bare = not repel and charge[i] * charge[j] < 0
-        if (repel or bare) and distance <= (OVERLAP if repel else max(near[i], near[j])) * size:
-            found.append(Pair(i, j, distance, distance / size, bare))
-    own = [pair for pair in found if molecule in system.sites.molecule[[pair.first, pair.second]]]
-    return min(own or found, key=lambda pair: pair.share, default=None)
+        attract = not repel and charge[i] * charge[j] < 0
+        if (repel or attract) and distance <= (OVERLAP if repel else max(near[i], near[j])) * size:
+            found.append(OverlappingPair(i, j, distance, distance / size, attract))
+    of_molecule = [pair for pair in found if molecule in system.sites.molecule[[pair.first, pair.second]]]
+    return min(of_molecule or found, key=lambda pair: pair.fraction, default=None)
 
 
 def _first_overlap(
     system: System, molecule: int | None, states: Iterable[tuple[str, State]]
-) -> tuple[str, Pair | None]:
-    """Moment and sites of the first overlap of this molecule; without one, of the first of all."""
-    first: tuple[str, Pair | None] = ("", None)
+) -> tuple[str, OverlappingPair | None]:
+    """Time and sites of the first overlap of this molecule, or else of any."""
+    first: tuple[str, OverlappingPair | None] = ("", None)
     for where, state in states:
         if all(np.isfinite(array).all() for array in state):
             pair = most_overlapping_pair(system, state, molecule)
@@ -279,16 +272,16 @@ def _first_overlap(
 def explain(
     system: System, error: SimulationError, states: Iterable[tuple[str, State]], dt: float, stable: float | None
 ) -> str:
-    """The finding in full: what was seen, the likely cause, what to try.
+    """The message of a failed check in full: what was observed, the likely cause, what to try.
 
-    states : states to search for overlapping sites, each with the words for its moment; dt, stable : the step and, if
-    known, the longest stable one, ps
+    states : states to search for overlapping sites, each with words for its time; dt, stable : the step and, if known,
+    the longest stable one, ps
     """
     if isinstance(error, NotFiniteError):
-        seen = f"{molecule_label(system, error.molecule)} is lost: {error.fault}"
-        failed = FailedCheck(seen, error.molecule)
+        message = f"{molecule_label(system, error.molecule)} is lost: {error.reason}"
+        failed = FailedCheck(message, error.molecule)
     elif isinstance(error, BehindWallError):
-        failed = FailedCheck(f"{molecule_label(system, error.molecule)} {error.fault}", error.molecule)
+        failed = FailedCheck(f"{molecule_label(system, error.molecule)} {error.reason}", error.molecule)
     elif isinstance(error, FailedCheck):
         failed = error
     else:
@@ -296,23 +289,20 @@ def explain(
     text = str(failed)
     where, pair = ("", None) if failed.evaporated else _first_overlap(system, failed.molecule, states)
     if pair is not None:
-        a, b = (
-            f"{system.sites.name[site]} of {molecule_label(system, system.sites.molecule[site])}"
-            for site in (pair.first, pair.second)
-        )
-        whose = "the smallest" if pair.bare else "their"
-        text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.share:.2g} of {whose} diameter"
+        a, b = site_labels(system, pair)
+        whose = "the smallest" if pair.without_repulsion else "their"
+        text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.fraction:.2g} of {whose} diameter"
     likely, advice = _cause(system, failed, pair, dt, stable)
     return f"{text}. Likely cause: {likely}. Try {advice}"
 
 
-def _cause(system: System, failed: FailedCheck, pair: Pair | None, dt: float, stable: float | None) -> Cause:
+def _cause(system: System, failed: FailedCheck, pair: OverlappingPair | None, dt: float, stable: float | None) -> Cause:
     shorter = f"a shorter timestep_fs than {dt / FEMTOSECOND:g}"
     if stable is not None and stable < dt:
         shorter = f"timestep_fs below {stable / FEMTOSECOND:.2g}, where the stiffest motion is stable"
-    elif failed.shorter is not None and failed.shorter < 1 / ROUNDING:
-        shorter = f"timestep_fs = {dt / failed.shorter / FEMTOSECOND:.2g} or less"
-    if pair is not None and pair.bare:
+    elif failed.factor is not None and failed.factor < 1 / ROUNDING:
+        shorter = f"timestep_fs = {dt / failed.factor / FEMTOSECOND:.2g} or less"
+    if pair is not None and pair.without_repulsion:
         a, b = system.sites.name[[pair.first, pair.second]]
         return Cause(
             "a charge on a site without repulsion has collapsed onto an opposite one",
@@ -327,11 +317,11 @@ def _cause(system: System, failed: FailedCheck, pair: Pair | None, dt: float, st
     if failed.molecule is not None:
         species = system.species[system.model.species[failed.molecule]]
         even = species.mass * axis_distances(species) ** 2
-        share = np.divide(species.inertia, even, out=np.ones(3), where=species.inertia > 0)
-        if share.min() < MIN_INERTIA_FRACTION:
+        fraction = np.divide(species.inertia, even, out=np.ones(3), where=species.inertia > 0)
+        if fraction.min() < MIN_INERTIA_FRACTION:
             return Cause(
-                f"bad inertia: a moment of {species.name} is {species.inertia[share.argmin()]:.2g} u Å², "
-                f"{share.min():.1g} of that of its mass at the outermost site, so torques turn it too fast",
+                f"bad inertia: a moment of {species.name} is {species.inertia[fraction.argmin()]:.2g} u Å², "
+                f"{fraction.min():.1g} of that of its mass at the outermost site, so torques rotate it too fast",
                 f"more of its mass on the outer sites, or {shorter}",
             )
     if failed.evaporated:
@@ -349,10 +339,7 @@ def _cause(system: System, failed: FailedCheck, pair: Pair | None, dt: float, st
 
 
 class BodyCheck:
-    """Checks of the run of a body.
-
-    They remember the largest energy exchanged so far, the scale of energy errors.
-    """
+    """Checks of the run of a body, relative to `exchanged`, the largest energy exchanged so far (J)."""
 
     def __init__(self, system: BodySystem, limits: BodyWatch):
         self.system = system
@@ -360,7 +347,7 @@ class BodyCheck:
         self._start = self._energies(system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
-        self.moved = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * swing)
+        self.exchanged = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * swing)
 
     def _energies(self, state: State) -> dict[str, float]:
         columns = energies(self.system, state.time[:1], State(*(array[None] for array in state)))
@@ -368,24 +355,24 @@ class BodyCheck:
 
     @np.errstate(over="ignore", invalid="ignore")
     def failed_check(self, state: State, dt: float) -> FailedCheck | None:
-        """What is wrong with a state of the run."""
+        """The failed check of a state of the run, if there is one."""
         system, limits = self.system, self.limits
         largest = not_none(limits.orthogonality)
         if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
-            seen = f"Q is no longer a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
-            return FailedCheck(seen, rotation_not_orthogonal=True)
+            message = f"Q is not a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            return FailedCheck(message, rotation_not_orthogonal=True)
         if system.rotates and limits.turn_rad:
             omega = system.pose(float(state.time[0]), state).angular_velocity_body
             angle = dt * float(np.linalg.norm(omega))
             if angle > limits.turn_rad:
-                seen = f"the body turns by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
-                return FailedCheck(seen, shorter=angle / limits.turn_rad)
+                message = f"the body rotates by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
+                return FailedCheck(message, factor=angle / limits.turn_rad)
         if not limits.energy or not is_balanced(system):
             return None
         start, now = self._start, self._energies(state)
-        self.moved = max(self.moved, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
+        self.exchanged = max(self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
         error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
-        scale = self.moved + ROUNDING * abs(now["energy"])
+        scale = self.exchanged + ROUNDING * abs(now["energy"])
         if error <= limits.energy * scale:
             return None
         return FailedCheck(
@@ -394,7 +381,7 @@ class BodyCheck:
         )
 
     def explain(self, error: SimulationError, dt: float, stable: float | None) -> str:
-        """The finding in full: what was seen, the likely cause, what to try."""
+        """The message of a failed check in full: what was observed, the likely cause, what to try."""
         system = self.system
         if isinstance(error, NotFiniteError):
             failed = FailedCheck("position or momentum of the body is not finite")
@@ -405,8 +392,8 @@ class BodyCheck:
         shorter = f"a shorter timestep_s than {dt:g}"
         if stable is not None and stable < dt:
             shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
-        elif failed.shorter is not None:
-            shorter = f"timestep_s = {dt / failed.shorter:.2g} or less"
+        elif failed.factor is not None:
+            shorter = f"timestep_s = {dt / failed.factor:.2g} or less"
         inertia = system.inertia
         if failed.rotation_not_orthogonal:
             cause = Cause(
@@ -431,7 +418,7 @@ def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
     """Largest kick of each molecule (n,) in a step, relative to the thermal size of that momentum.
 
     A kick F dt beyond sqrt(m kT), or n dt beyond sqrt(I kT), comes from an overlap, not from a liquid. The measure is
-    relative to the scene's own masses, temperature and time step.
+    relative to the masses, temperature and time step of the scene.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.abs(load.force).max(axis=1) * dt * np.sqrt(model.inverse_mass[model.species] / thermal)

@@ -14,7 +14,7 @@ from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR
 
 
-class Point(NamedTuple):
+class EnthalpyPoint(NamedTuple):
     """A state with its energy and the gradient there."""
 
     state: State
@@ -67,7 +67,7 @@ class Enthalpy:
         self._lengths = np.sqrt(shared * n) * np.cbrt(state.volume / n) if len(shared) else np.zeros(0)
         self._ends = np.cumsum([state.position.size, self.turns.size])
 
-    def at(self, state: State) -> Point:
+    def at(self, state: State) -> EnthalpyPoint:
         """Energy and gradient at a state, which is not copied. Raises SimulationError."""
         load, tallies = self.engine.evaluate(state)
         parts = [*(tally.energy for tally in tallies.values()), *self._system.constants.values()]
@@ -89,7 +89,7 @@ class Enthalpy:
                 slopes / self._lengths,
             ]
         )
-        return Point(state, sum(parts), sum(map(abs, parts)), load, pressure, gradient)
+        return EnthalpyPoint(state, sum(parts), sum(map(abs, parts)), load, pressure, gradient)
 
     def moved(self, state: State, move: np.ndarray) -> State:
         """A copy of a state after a move (k,)."""
@@ -106,7 +106,7 @@ class Enthalpy:
             found.rotation[:] = state.rotation @ from_vector(turn / self._arm)
         return found
 
-    def gain(self, point: Point, other: Point, move: np.ndarray) -> float:
+    def gain(self, point: EnthalpyPoint, other: EnthalpyPoint, move: np.ndarray) -> float:
         """Change of the enthalpy by a move from a point to another, u Å²/ps².
 
         Deviatoric pressures act as true (Cauchy) stress, as in `boxes`: their work is that in the mean volume of the
@@ -125,7 +125,7 @@ class Enthalpy:
         lengths = [np.linalg.norm(part, axis=1).max(initial=0.0) for part in (shift, turn)]
         return float(max(lengths)), float(np.abs(strain).max())
 
-    def largest(self, point: Point) -> tuple[float, float, float]:
+    def largest(self, point: EnthalpyPoint) -> tuple[float, float, float]:
         """Largest force (u Å/ps²), torque about a principal axis (u Å²/ps²) and deviation of the pressure (u/(Å ps²)).
 
         Pressures are averaged over the components that share a coordinate; 0 if the cell does not relax.

@@ -12,19 +12,19 @@ from rigidmd.dynamics.momenta import mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.direct_sum import EwaldSum, EwaldWorkspace
-from rigidmd.forces.ewald.errors import charges_of, mesh_error, radius_of, real_error, wave_error
+from rigidmd.forces.ewald.errors import charges_of, k_cutoff_of_count, k_space_error, pme_error, real_error
 from rigidmd.forces.ewald.pme import Pme, PmeWorkspace
 from rigidmd.forces.neighbors.pair_loop import PairForces, PairWorkspace
-from rigidmd.forces.neighbors.sites import place_sites
+from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB
 
 #: Accuracy of the reference sum, relative to the estimated error of the sum under test.
-TIGHTER = 1e-3
-TIGHTEST = 1e-12  # e²/Å²; float64 has no more digits
+REFERENCE_ERROR = 1e-3
+MIN_REFERENCE_ERROR = 1e-12  # e²/Å²; float64 has no more digits
 
 
-class Accuracy(NamedTuple):
+class CoulombErrors(NamedTuple):
     """Errors of the Coulomb forces on sites, u Å/ps², and of the Coulomb energy."""
 
     estimated: float  # rms
@@ -40,19 +40,18 @@ class Accuracy(NamedTuple):
         return self.measured / self.force
 
 
-def accuracy(system: System, state: State) -> Accuracy:
+def coulomb_errors(system: System, state: State) -> CoulombErrors:
     """Errors of a system's Ewald sums at a state. Raises SceneError if it has none."""
     scene = system.scene
     if system.force_error is None:
         method = scene.forces.electrostatics
         raise SceneError(
-            scene.source,
-            [f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"],
+            scene.source, [f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"]
         )
     forces = scene.forces.model_copy(
         update={
             "electrostatics": "ewald",
-            "ewald_accuracy": max(TIGHTER * system.force_error / COULOMB, TIGHTEST),
+            "ewald_accuracy": max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR),
             **dict.fromkeys(("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")),
             **dict.fromkeys(("pme_order", "pme_grid")),
         }
@@ -63,7 +62,7 @@ def accuracy(system: System, state: State) -> Accuracy:
     found, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((found - exact)[moves], axis=1)
-    return Accuracy(
+    return CoulombErrors(
         estimated=system.force_error,
         measured=float(np.sqrt((error**2).mean())),
         largest=float(error.max()),
@@ -84,14 +83,14 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
         [(int(n), m.charges[c], m.positions_body[c]) for n, m, c in zip(counts, system.species, charged, strict=True)]
     )
     if isinstance(over, Pme):
-        wave = mesh_error(charges, over.alpha, cell, over.grid, over.order)
+        wave = pme_error(charges, over.alpha, cell, over.grid, over.order)
     else:
         over = cast(EwaldSum, over)
-        wave = wave_error(charges, over.alpha, radius_of(over.waves.total, volume), volume)
+        wave = k_space_error(charges, over.alpha, k_cutoff_of_count(over.k_vectors.total, volume), volume)
     return float(np.hypot(real_error(charges, over.alpha, system.cutoff, volume), wave)) * COULOMB
 
 
-def rounding(system: System, state: State) -> tuple[float, float] | None:
+def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:
     """Relative rms errors of forces and torques from `precision = "mixed"`; None in double precision."""
     scene = system.scene
     if scene.precision == "double":
@@ -120,8 +119,8 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
         if isinstance(workspace, (PairWorkspace, EwaldWorkspace, PmeWorkspace)):
             force = force + workspace.site_force
     position = np.empty_like(force)
-    place_sites(real.sites, state, position)
-    law = cast(ScreenedCoulomb, real.law)
+    compute_site_positions(real.sites, state, position)
+    law = cast(ScreenedCoulomb, real.potential)
     force = force + forces_inside(law.charge, position, real.sites.first, law.alpha)
     constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
     return force, sum(tally.energy for tally in tallies.values()) + constants

@@ -1,4 +1,4 @@
-"""Minimisation of energy or enthalpy in the rigid degrees of freedom, from a state to a minimum near it."""
+"""Minimisation of energy or enthalpy in the rigid degrees of freedom, from a state to a minimum near it, by L-BFGS."""
 
 from collections import deque
 from collections.abc import Callable
@@ -11,9 +11,9 @@ from rigidmd.dynamics.barostats import LONGEST_DRIFT
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.run import checks
-from rigidmd.run.enthalpy import Enthalpy, Point
-from rigidmd.run.minimum import Minimum
-from rigidmd.run.overlap_removal import LONGEST_MOVE, relieve
+from rigidmd.run.enthalpy import Enthalpy, EnthalpyPoint
+from rigidmd.run.overlap_removal import LONGEST_MOVE, remove_overlaps
+from rigidmd.run.summary import Minimum
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, KJ_PER_MOL
 
@@ -46,13 +46,13 @@ def minimise(
     stop: Callable[[], bool] = lambda: False,
     advanced: Callable[[float], object] = lambda iterations: None,
 ) -> Minimum:
-    """Move a state, in place, to a minimum of energy or enthalpy as a stage asks for; momenta and time do not change.
+    """Move a state, in place, to a minimum of energy or enthalpy with the limits of a stage; momenta and time stay.
 
-    The method is L-BFGS (Nocedal & Wright 2006, algorithm 7.5) with moves of bounded length. Convergence is judged by
-    forces, torques and pressure alone. The change of energy is booked as work.
+    The method is L-BFGS (Nocedal & Wright 2006, algorithm 7.5) with moves of bounded length. Forces, torques and
+    pressure alone decide on convergence. The change of energy is added to the energy ledger as work.
 
-    A library's optimiser does not fit. Rotations are no vector space: each iteration starts from the present
-    orientations. An unbounded line search can put a charge without repulsion of its own, such as a hydrogen of water,
+    The optimisers of libraries are not suitable: rotations form no vector space, so each iteration starts from the
+    present orientations, and an unbounded line search can put a charge without repulsion, such as a hydrogen of water,
     on an opposite charge.
 
     stop : called before each iteration; the minimisation ends if it is true; advanced : called after each with 1
@@ -63,21 +63,21 @@ def minimise(
     point = start = enthalpy.at(state.copy())
     if not start.is_finite:
         raise SimulationError("energy or forces are not finite numbers: sites of different molecules coincide")
-    relief_steps = _relieve(system, enthalpy, point.state, stop)
-    if relief_steps:
+    overlap_steps = _remove_overlaps(system, enthalpy, point.state, stop)
+    if overlap_steps:
         point = enthalpy.at(point.state)
     descent = _Descent(enthalpy, system.smallest_diameter)
-    iterations, why = 0, ""
+    iterations, ended_by = 0, ""
     while not (converged := _is_within(enthalpy, point, stage)):
         if iterations == stage.most_iterations:
-            why = f"most_iterations = {stage.most_iterations}"
+            ended_by = f"most_iterations = {stage.most_iterations}"
             break
         if stop():
-            why = "interrupted"
+            ended_by = "interrupted"
             break
         found = descent.step(point)
         if found is None:
-            why = "no move lowers the energy any further"
+            ended_by = "no move lowers the energy any further"
             break
         point = found
         iterations += 1
@@ -89,16 +89,16 @@ def minimise(
         _check_charges(system, point)
     for name in ("position", "rotation", "cell"):
         getattr(state, name)[:] = getattr(point.state, name)
-    state.books[WORK] += point.energy - start.energy
+    state.energy_ledger[WORK] += point.energy - start.energy
     force, torque, deviation = enthalpy.largest(point)
     pressure = tuple(point.pressure.tolist()) if np.isfinite(point.pressure).all() else None
     return Minimum(
-        converged, why, iterations, relief_steps, start.energy, point.energy, force, torque, pressure,
+        converged, ended_by, iterations, overlap_steps, start.energy, point.energy, force, torque, pressure,
         deviation if stage.changes_box else None,
     )  # fmt: skip
 
 
-def _is_within(enthalpy: Enthalpy, point: Point, stage: Stage) -> bool:
+def _is_within(enthalpy: Enthalpy, point: EnthalpyPoint, stage: Stage) -> bool:
     force, torque, deviation = enthalpy.largest(point)
     return (
         force <= stage.force_limit_kJ_mol_A * KJ_PER_MOL
@@ -118,14 +118,14 @@ class _Descent:
         self._enthalpy = enthalpy
         self._longest = LONGEST_MOVE * diameter
         self._memory: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
-        self._share = FIRST_MOVE  # of the longest move, while no curvature is known
+        self._fraction = FIRST_MOVE  # of the longest move, while no curvature is known
 
-    def step(self, point: Point) -> Point | None:
+    def step(self, point: EnthalpyPoint) -> EnthalpyPoint | None:
         """The next point, lower than this one; None if there is none. Raises SimulationError."""
         found = self._along(point, self._direction(point.gradient))
         if found is None and self._memory:
             self._memory.clear()
-            self._share = FIRST_MOVE
+            self._fraction = FIRST_MOVE
             found = self._along(point, self._direction(point.gradient))
         if found is None:
             return None
@@ -134,58 +134,55 @@ class _Descent:
         if move @ change > 1e-8 * np.linalg.norm(move) * np.linalg.norm(change):
             self._memory.append((move, change))
         elif not self._memory:
-            self._share = min(2 * self._share, 1.0)
+            self._fraction = min(2 * self._fraction, 1.0)
         return other
 
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
         """The quasi-Newton move, or one along the negative gradient; no longer than allowed."""
         if self._memory:
             found = gradient.copy()
-            shares = []
+            weights = []
             for move, change in reversed(self._memory):
-                shares.append(move @ found / (move @ change))
-                found -= shares[-1] * change
+                weights.append(move @ found / (move @ change))
+                found -= weights[-1] * change
             move, change = self._memory[-1]
             found *= move @ change / (change @ change)
-            for (move, change), share in zip(self._memory, reversed(shares), strict=True):
-                found += (share - change @ found / (move @ change)) * move
+            for (move, change), weight in zip(self._memory, reversed(weights), strict=True):
+                found += (weight - change @ found / (move @ change)) * move
             if found @ gradient > 1e-6 * np.linalg.norm(found) * np.linalg.norm(gradient):
                 return -found * min(1.0, self._bound(found))
             self._memory.clear()
-            self._share = FIRST_MOVE
-        return -gradient * self._share * self._bound(gradient)
+            self._fraction = FIRST_MOVE
+        return -gradient * self._fraction * self._bound(gradient)
 
     def _bound(self, move: np.ndarray) -> float:
         """The factor that makes a move as long as allowed."""
         length, strain = self._enthalpy.reach(move)
         return 1 / max(length / self._longest, strain / LONGEST_DRIFT)
 
-    def _along(self, point: Point, direction: np.ndarray) -> tuple[np.ndarray, Point] | None:
-        """An accepted move along a direction and the point that it leads to; None if there is none.
-
-        Raises SimulationError.
-        """
-        slope, share, noise = float(direction @ point.gradient), 1.0, ROUNDING * point.scale
+    def _along(self, point: EnthalpyPoint, direction: np.ndarray) -> tuple[np.ndarray, EnthalpyPoint] | None:
+        """An accepted move along a direction, and the point it leads to; None without one. Raises SimulationError."""
+        slope, length, noise = float(direction @ point.gradient), 1.0, ROUNDING * point.scale
         for _ in range(TRIALS):
-            move = share * direction
+            move = length * direction
             try:
                 other = self._enthalpy.at(self._enthalpy.moved(point.state, move))
             except SimulationError:  # behind a wall, or a box too small for the cut-off
-                if share < SHORTEST:
+                if length < SHORTEST:
                     raise
-                share *= 0.1
+                length *= 0.1
                 continue
             gain = self._enthalpy.gain(point, other, move) if other.is_finite else inf
-            lower = gain <= DECREASE * share * slope
+            lower = gain <= DECREASE * length * slope
             flat = gain <= noise and other.gradient @ direction <= OPPOSITE_SLOPE * abs(slope)
             if lower or flat:
                 return move, other
-            share *= min(0.5, max(0.1, -slope * share / (2 * (gain - slope * share)))) if isfinite(gain) else 0.1
+            length *= min(0.5, max(0.1, -slope * length / (2 * (gain - slope * length)))) if isfinite(gain) else 0.1
         return None
 
 
-def _relieve(system: System, enthalpy: Enthalpy, state: State, stop: Callable[[], bool]) -> int:
-    """Move overlapping molecules apart, in place; the number of steps."""
+def _remove_overlaps(system: System, enthalpy: Enthalpy, state: State, stop: Callable[[], bool]) -> int:
+    """Remove overlaps of molecules, in place; the number of steps."""
     deepest = max((m.epsilon.max() for m in system.species), default=0.0)
     if not (deepest > 0 and enthalpy.free.any()):
         return 0
@@ -193,10 +190,10 @@ def _relieve(system: System, enthalpy: Enthalpy, state: State, stop: Callable[[]
     lightest = float(system.model.mass[system.model.species][enthalpy.free].min())
     # in this time step the limit of the force gives the lightest molecule a momentum of thermal size at kT = one well
     step = scale * np.sqrt(lightest / deepest) / OVERLAPPING
-    return relieve(system.model, enthalpy.engine, state, radius, scale, deepest, step, stop).steps
+    return remove_overlaps(system.model, enthalpy.engine, state, radius, scale, deepest, step, stop).steps
 
 
-def _check_volume(system: System, start: Point, point: Point) -> None:
+def _check_volume(system: System, start: EnthalpyPoint, point: EnthalpyPoint) -> None:
     """Raise SimulationError if the box grows without bound."""
     largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
     if point.state.volume < inf and largest and grown > largest:
@@ -207,18 +204,15 @@ def _check_volume(system: System, start: Point, point: Point) -> None:
         )
 
 
-def _check_charges(system: System, point: Point) -> None:
+def _check_charges(system: System, point: EnthalpyPoint) -> None:
     """Raise SimulationError if opposite charges are on top of each other: the energy then has no lower bound."""
-    pair = checks.pair_in_core(system, point.state, None)
-    if pair is None or not pair.bare:
+    pair = checks.most_overlapping_pair(system, point.state, None)
+    if pair is None or not pair.without_repulsion:
         return
-    a, b = (
-        f"{system.sites.name[site]} of {checks.named(system, system.sites.molecule[site])}"
-        for site in (pair.first, pair.second)
-    )
+    a, b = checks.site_labels(system, pair)
     one, other = system.sites.name[[pair.first, pair.second]]
     raise SimulationError(
         f"the energy has no lower bound: {a} and {b}, of opposite charge, are {pair.distance:.3g} Å apart, and no "
-        "repulsion of their own keeps them apart. Try giving one of these sites sigma_A and epsilon_kJ_mol, or the "
+        "repulsion acts between them. Try giving one of these sites sigma_A and epsilon_kJ_mol, or the "
         f'pair an entry [[forces.pairs]] with sites = ["{one}", "{other}"]'
     )

@@ -1,4 +1,4 @@
-"""Runs of molecules: relief of overlaps, stages of all ensembles, samples."""
+"""Runs of molecules: removal of overlaps, stages of all ensembles, samples."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -12,12 +12,12 @@ from pydantic import Field, PositiveFloat
 from rigidmd.assemble.build import build
 from rigidmd.assemble.stage_flows import integrator_of_stage
 from rigidmd.assemble.user_code.binding import user_errors_explained
-from rigidmd.compile.cache import kept_in_words
-from rigidmd.compile.machine import threads_for
+from rigidmd.compile.cache import describe_cache
+from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, REMOVED, WORK, State, state_of
 from rigidmd.dynamics.momenta import remove_momentum
-from rigidmd.dynamics.observables import Extent, extent_of
+from rigidmd.dynamics.observables import LargestValues, largest_values
 from rigidmd.engines.cpu import Engine
 from rigidmd.engines.observables import Observation, observe
 from rigidmd.engines.samples import COLUMNS, Sample, Samples
@@ -29,7 +29,7 @@ from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.run import checks
-from rigidmd.run.force_errors import accuracy
+from rigidmd.run.force_errors import coulomb_errors
 from rigidmd.run.minimise import minimise
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
@@ -46,7 +46,7 @@ from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
 from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
 from rigidmd.run.simulation import Simulation
-from rigidmd.run.summary import Minimum, minimum_in_words, summarise
+from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.run.user_force_check import check_forces
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
@@ -55,17 +55,19 @@ from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_
 if TYPE_CHECKING:
     import ase
 
+    from rigidmd.engines.external import ExternalEngine
+
 
 Count = Annotated[int, Field(ge=0)]
 
 
 class MolecularResumeData(ResumeData):
-    """What evolves in a run of molecules and is not in its state; dictionaries have the indices of stages."""
+    """Resume data of a run of molecules. Dictionaries have the indices of stages."""
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     stage: Count = 0  # the present one
-    relief: OverlapRemoval | None = None
-    choices: dict[Count, str] = Field(default_factory=dict)  # what was chosen for stages that left it open, and why
+    removal: OverlapRemoval | None = None  # of overlaps, before the first step
+    choices: dict[Count, str] = Field(default_factory=dict)  # of integrator and step, with the reasons
     stable: dict[Count, PositiveFloat] = Field(default_factory=dict)  # the longest stable step, ps
     moves: dict[Count, tuple[Count, Count]] = Field(default_factory=dict)  # of the box, tried and accepted
     minima: dict[Count, Minimum] = Field(default_factory=dict)
@@ -78,11 +80,11 @@ REPLAYED = 20
 class MolecularSimulation(Simulation):
     """A scene of molecules, ready to run. Besides the parameters of `Simulation`:
 
-    forces : forces of your own, besides those of the scene: `rigidmd.Force`, `rigidmd.pair_law`, terms of classes with
-        `rigidmd.compiled_force`, or objects whose method term(system) makes such a term. They are checked at the start:
-        force and torque against differences of the energy, the virial against a stretched box
-    thermostat : a thermostat of your own in place of that of every stage: a NamedTuple of a class with
-        `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
+    forces : user-defined forces, besides the forces of the scene: `rigidmd.Force`, `rigidmd.pair_law`, terms of classes
+        with `rigidmd.compiled_force`, or objects whose method term(system) makes such a term. At the start forces and
+        torques are compared with differences of the energy, and the virial with the effect of a strain of the box
+    thermostat : a user-defined thermostat for every stage: a NamedTuple of a class with `rigidmd.compiled_thermostat`,
+        or an object whose method for_stage(system, k) makes one
     """
 
     time_unit = "ps"
@@ -108,35 +110,34 @@ class MolecularSimulation(Simulation):
             raise SceneError(
                 scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
             )
-        self.threads = threads_for(scene.threads)
+        self.threads = usable_threads(scene.threads)
         self._reset()
 
     def start_from(self, state: State) -> None:
-        """Let runs begin at the given positions and momenta, without relief of overlaps."""
-        begun = state_of(*state[:5])
-        self._built = replace(self._built, state=begun, from_lattice=False)
+        """Let runs begin at the given positions and momenta, without removal of overlaps."""
+        self._built = replace(self._built, state=state_of(*state[:5]), from_lattice=False)
         self._reset()
 
     def take_threads(self, count: int) -> None:
-        """Let runs compute with so many threads. Results do not depend on it."""
+        """Set the number of threads. Results do not depend on it."""
         scene = self._built.scene.model_copy(update={"threads": count})
         self._built = replace(self._built, scene=scene)
-        self.threads = threads_for(count)
+        self.threads = usable_threads(count)
         self._reset()
 
     def atoms(self) -> "ase.Atoms":
-        """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. An observer may call it."""
+        """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. Observers may call it."""
         return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
 
     def start(self) -> OverlapRemoval | None:
-        """Go to the state before the first step, from which `run` starts. Returns the relief of overlaps."""
+        """Go to the state before the first step, from which `run` starts. Returns the removal of overlaps."""
         self._reset()
         with interruptible():
             self._remove_overlaps()
-        return self._resume_data.relief
+        return self._resume_data.removal
 
     def settle(self) -> State:
-        """Go to the state from which time passes, after relief of overlaps and the minimisations that come first."""
+        """Go to the state after removal of overlaps and the minimisations that come first, from which time passes."""
         self.start()
         for k, stage in enumerate(self.scene.stages):
             if not stage.is_minimisation:
@@ -152,11 +153,11 @@ class MolecularSimulation(Simulation):
         self.state = self.system.state.copy()
 
     def _prepare(self) -> None:
-        """Relieve overlaps, and compile the steps or see that another engine computes the same."""
+        """Remove overlaps, and compile the steps, or compare the start with an external engine."""
         if self.scene.engine.is_external:
             from rigidmd.engines.external import external_engine
 
-            other = external_engine(self.system)  # first: one that is not here says so before anything is compiled
+            other = external_engine(self.system)  # first: the error of a missing program comes before compilation
             self._remove_overlaps()
             self._check(other)
         else:
@@ -165,8 +166,8 @@ class MolecularSimulation(Simulation):
         self.engine.forget()
 
     def _remove_overlaps(self) -> None:
-        """Compile the forces, and relieve overlaps of a lattice."""
-        self._announce(f"compiling ({kept_in_words()})")
+        """Compile the forces, and remove overlaps of a lattice."""
+        self._announce(f"compiling ({describe_cache()})")
         with user_errors_explained(self.system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
@@ -174,7 +175,7 @@ class MolecularSimulation(Simulation):
                 self.scene.source, ["the start has no finite energy: sites of different molecules coincide"]
             )
         first = self.scene.stages[0]
-        relief = None
+        removal = None
         if self.system.from_lattice and not first.is_minimisation:
             radius = np.array([m.radius for m in self.system.species])
             temperature = self.scene.start.temperature_K or 0.0
@@ -183,35 +184,35 @@ class MolecularSimulation(Simulation):
             if thermal > 0:
                 scale = self.system.smallest_diameter
                 dt = first.timestep_fs * FEMTOSECOND
-                relief = remove_overlaps(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
-                if relief.excess > 1:
+                removal = remove_overlaps(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
+                if removal.excess > 1:
                     raise SceneError(
                         self.scene.source,
                         [
                             f"the molecules cannot be packed at {self.system.density:.3g} g/cm³ without overlap: after "
-                            f"{relief.steps} steps of relief the first time step would still change a momentum by "
-                            f"{relief.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
+                            f"{removal.steps} steps of overlap removal the first time step would still change a momentum "
+                            f"by {removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
                             "shorten timestep_fs of the first stage"
                         ],
                     )
         check_forces(self.system, self.state)
         self.engine.forget()
-        self._resume_data = MolecularResumeData(relief=relief)
+        self._resume_data = MolecularResumeData(removal=removal)
 
     def _compile(self) -> None:
         """Compile the steps of every stage."""
         with user_errors_explained(self.system):
             for k, stage in enumerate(self.scene.stages):
                 if not (stage.is_auto or stage.is_minimisation):
-                    row = integrator_of_stage(self.system, k)
-                    self.engine.advance(self._begun(row), row, 0.0, 0)
+                    method = integrator_of_stage(self.system, k)
+                    self.engine.advance(self._state_for(method), method, 0.0, 0)
 
-    def _begun(self, row: Scheme | Solver) -> State:
-        """The present state, its arrays as they are, with the variables that a row moves besides."""
-        return self.state._replace(bath=self.engine.variables(self.state, row))
+    def _state_for(self, method: Scheme | Solver) -> State:
+        """The present state, without copies, with the additional variables of an integrator."""
+        return self.state._replace(extra_variables=self.engine.variables(self.state, method))
 
     def _check(self, other: "ExternalEngine") -> None:
-        """Let the other engine of the scene compute the start too, and end it. Raises EngineError where both part."""
+        """Compare the start with that of the external engine, and close it. Raises EngineError if they differ."""
         from rigidmd.engines.comparison import compare_at, describe_comparison
 
         try:
@@ -220,12 +221,11 @@ class MolecularSimulation(Simulation):
             other.close()
         if not all(line.agrees for line in lines):
             title = self.scene.engine.name
-            raise EngineError(
-                f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{describe_comparison(lines, title)}"
-            )
+            table = describe_comparison(lines, title)
+            raise EngineError(f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}")
 
     def _engine_of(self, k: int) -> "Engine | ExternalEngine":
-        """The engine of stage k; rigidmd's own minimises."""
+        """The engine of stage k; minimisations are always by rigidmd."""
         if not self.scene.engine.is_external or self.scene.stages[k].is_minimisation:
             return self.system.engine()
         from rigidmd.engines.external import external_engine
@@ -239,31 +239,31 @@ class MolecularSimulation(Simulation):
         return self._resume_data.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
 
     def _restore(self, kept: Checkpoint) -> None:
-        record = self._resume_data = read_as(MolecularResumeData, kept.told["run"])
-        before = record.scene["stages"]
-        # the scene in the folder has decided what was open before
+        data = self._resume_data = read_as(MolecularResumeData, kept.told["run"])
+        before = data.scene["stages"]
+        # integrators that were chosen stand in the scene of the folder
         decided = [
             then if now.is_auto else plain(chosen)
-            for now, then, chosen in zip(self.scene.stages, before, record.stages, strict=False)
+            for now, then, chosen in zip(self.scene.stages, before, data.stages, strict=False)
         ]
         step = int(kept.arrays["state/step"][NOW])
-        check_same_scene(self._built.scene, record.scene | {"stages": decided or before}, record.inputs, step)
-        for k, (chosen, then) in enumerate(zip(record.stages, before, strict=True)):
-            if k not in record.choices and plain(chosen) != then:
+        check_same_scene(self._built.scene, data.scene | {"stages": decided or before}, data.inputs, step)
+        for k, (chosen, then) in enumerate(zip(data.stages, before, strict=True)):
+            if k not in data.choices and plain(chosen) != then:
                 raise ValueError(f"its stages.{k} is not that of its scene")
-        known = (*record.choices, *record.stable, *record.moves, *record.minima)
-        if record.stage != kept.told["place"]["stretch"] or any(k > record.stage for k in known):
-            raise ValueError(f"it knows of later stages than {record.stage}, or is of another")
-        stages = list(record.stages)
+        known = (*data.choices, *data.stable, *data.moves, *data.minima)
+        if data.stage != kept.told["position"]["segment"] or any(k > data.stage for k in known):
+            raise ValueError(f"it has data of later stages than {data.stage}, or is of another stage")
+        stages = list(data.stages)
         stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
         self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
         self.system = replace(self.system, scene=self.scene)
-        self._warnings.extend(record.notes)
-        row = self._reenter_segment(record.stage).row
-        self.engine = self._engine_of(record.stage)
-        like = self._built.state._replace(bath=self.engine.variables(self._built.state, row))
+        self._warnings.extend(data.notes)
+        method = self._reenter_segment(data.stage).method
+        self.engine = self._engine_of(data.stage)
+        like = self._built.state._replace(extra_variables=self.engine.variables(self._built.state, method))
         self.state = state_from(kept.of("state").arrays, like)
-        moves = any(before.has_barostat or before.is_minimisation for before in stages[: record.stage + 1])
+        moves = any(before.has_barostat or before.is_minimisation for before in stages[: data.stage + 1])
         if not moves and not np.array_equal(self.state.cell, self._built.state.cell):
             raise ValueError("its box is not that of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
@@ -272,7 +272,7 @@ class MolecularSimulation(Simulation):
         stage = self.scene.stages[k]
         step = stage.timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
-            return Segment(stage.scheme, step, 0, act=None if k in self._resume_data.minima else self._minimise)
+            return Segment(stage.scheme, step, 0, action=None if k in self._resume_data.minima else self._minimise)
         return Segment(integrator_of_stage(self.system, k), step, stage.steps)
 
     def _durations(self) -> list[float]:
@@ -283,36 +283,32 @@ class MolecularSimulation(Simulation):
         self._resume_data.stage = k
         if self.scene.stages[k].is_minimisation:
             return self._enter_minimisation(k)
-        if was_open := self.scene.stages[k].is_auto:
+        if was_auto := self.scene.stages[k].is_auto:
             self._choose(k)
         self._estimate(k)
-        # Pilot runs change the neighbour lists. With new ones at every stage the resolved scene repeats the run to the
-        # bit. Those of the start, if nothing has moved since, are what new ones would be.
-        if (
-            k
-            or was_open
-            or self.scene.engine.is_external
-            or (self._resume_data.relief and self._resume_data.relief.steps)
-        ):
+        # Pilot runs change the neighbour lists. With new lists at every stage the resolved scene repeats the run to the
+        # bit. The lists of the start, if nothing has moved since, are what new ones would be.
+        removal = self._resume_data.removal
+        if k or was_auto or self.scene.engine.is_external or (removal and removal.steps):
             self.engine = self._engine_of(k)
-        row, stage = integrator_of_stage(self.system, k), self.scene.stages[k]
-        self.state = self._begun(row)
-        self.state.begin_stretch()
+        method, stage = integrator_of_stage(self.system, k), self.scene.stages[k]
+        self.state = self._state_for(method)
+        self.state.begin_segment()
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
         keeps = self.system.keeps_momentum_in
         if before and keeps(k) and not keeps(before[-1]):
-            self.state.books[REMOVED] -= remove_momentum(self.system.model, self.state.velocity)
-        return Segment(row, stage.timestep_fs * FEMTOSECOND, stage.steps)
+            self.state.energy_ledger[REMOVED] -= remove_momentum(self.system.model, self.state.velocity)
+        return Segment(method, stage.timestep_fs * FEMTOSECOND, stage.steps)
 
     def _enter_minimisation(self, k: int) -> Segment:
         stage = self.scene.stages[k]
         self.engine = self.system.engine()
-        self.state = self._begun(stage.scheme)
-        self.state.begin_stretch()
-        return Segment(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, act=self._minimise)
+        self.state = self._state_for(stage.scheme)
+        self.state.begin_segment()
+        return Segment(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, action=self._minimise)
 
     def _minimise(self, progress: bool | None) -> None:
-        """Minimise as the present stage says, with a warning if it does not converge."""
+        """Run the present stage, a minimisation, with a warning if it does not converge."""
         k = self._resume_data.stage
         stage = self.scene.stages[k]
         with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
@@ -320,14 +316,13 @@ class MolecularSimulation(Simulation):
         self.engine.forget()
         self._resume_data.minima[k] = found
         if not found.converged:
-            self.note(f"stages.{k}: {minimum_in_words(found, stage)}")
+            self.note(f"stages.{k}: {describe_minimum(found, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
         stage = self.scene.stages[k]
-        if not self.scene.watch.stable_step or not is_estimate_cheap(
-            self.system, stage.steps * stage.scheme.force_evaluations
-        ):
+        evaluations = stage.steps * stage.scheme.force_evaluations
+        if not self.scene.watch.stable_step or not is_estimate_cheap(self.system, evaluations):
             return
         found = stiffest_mode(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
         if found is None:
@@ -367,12 +362,12 @@ class MolecularSimulation(Simulation):
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def _is_finite(self) -> bool:
-        state, extent = self.state, self.extent or extent_of(self.state)
-        return all(map(isfinite, [*extent[:4], *state.books.tolist(), *state.bath.tolist()]))
+        state, extent = self.state, self.extent or largest_values(self.state)
+        return all(map(isfinite, [*extent[:4], *state.energy_ledger.tolist(), *state.extra_variables.tolist()]))
 
     @property
-    def extent(self) -> Extent | None:
-        """The extent of the state and its load, if it is known from the last step."""
+    def extent(self) -> LargestValues | None:
+        """Largest values in the state and its load, if they are known from the last step."""
         return self.engine.extent(self.state) if isinstance(self.engine, Engine) else None
 
     def _observe(self, moment: Moment) -> Observation:
@@ -383,14 +378,14 @@ class MolecularSimulation(Simulation):
 
     def sample_of(self, moment: Moment) -> Sample:
         """A line of the log. Its drift is counted from the last sample before its stage."""
-        seen: Observation = moment._seen
-        energy, books = seen.energy / KJ_PER_MOL, self.state.books / KJ_PER_MOL
-        conserved = energy - float(books.sum())
+        seen: Observation = moment._observation
+        energy, ledger = seen.energy / KJ_PER_MOL, self.state.energy_ledger / KJ_PER_MOL
+        conserved = energy - float(ledger.sum())
         volume, stage = self.state.volume, self.scene.stages[moment.stage]
         boxed = volume < np.inf
         a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = seen.pressure_tensor_bar.tolist()
-        # another engine may not tell what its thermostat takes out
+        # an external engine may not report the heat of its thermostat
         known = not stage.is_minimisation and getattr(self.engine, "conserves_energy", True)
         return Sample(
             step=moment.step,
@@ -416,8 +411,8 @@ class MolecularSimulation(Simulation):
             alpha=alpha,
             beta=beta,
             gamma=gamma,
-            heat=float(books[HEAT]),
-            work=float(books[WORK]),
+            heat=float(ledger[HEAT]),
+            work=float(ledger[WORK]),
             pressure_xx=xx,
             pressure_yy=yy,
             pressure_zz=zz,
@@ -435,7 +430,7 @@ class MolecularSimulation(Simulation):
         check = checks.StepCheck(self.system, self.scene.watch)
         self._sampler = Sampler(self, interval, check)
         observers: list[Observer] = [self._sampler]
-        if not self.scene.engine.is_external:  # others look after their own steps
+        if not self.scene.engine.is_external:  # external engines check their steps themselves
             observers.append(StepWatch(self, check))
         files: list[Observer] = []
         if output.trajectory:
@@ -453,36 +448,36 @@ class MolecularSimulation(Simulation):
     def _samples(self) -> Samples:
         return self._sampler.samples
 
-    def _summary(self, samples: Samples, costs: RunTimes) -> dict[str, Any]:
-        record = self._resume_data
-        record.moves[record.stage] = self.engine.moves
+    def _summary(self, samples: Samples, times: RunTimes) -> dict[str, Any]:
+        data = self._resume_data
+        data.moves[data.stage] = self.engine.moves
         return summarise(
-            self.system, samples, self.state, record.relief.steps if record.relief else 0, costs.preparing, costs.wall,
-            costs.computing, self._interrupted, record.choices, record.stable, record.moves, record.minima, self.notes,
+            self.system, samples, self.state, data.removal.steps if data.removal else 0, times, self._interrupted,
+            data.choices, data.stable, data.moves, data.minima, self.notes,
         )  # fmt: skip
 
     def _explain(self, error: SimulationError) -> str:
         stable = self._resume_data.stable.get(self._resume_data.stage)
-        return checks.explain(self.system, error, self._suspects(), self.segment.dt, stable)
+        return checks.explain(self.system, error, self._states_to_search(), self.segment.dt, stable)
 
-    def _suspects(self) -> Iterator[tuple[str, State]]:
-        """States of a run that failed, with the words for their moments: now; the last good one; those between, which
-        are computed again if that is soon done, because after a collapse nothing is where it was."""
+    def _states_to_search(self) -> Iterator[tuple[str, State]]:
+        """States of a run that failed, with words for their times: now; the last good one; states in between, which are
+        computed again if this is cheap, because a collapse has moved everything by now."""
         yield "", self.state
         if (good := self._sampler.last_good) is None:
             return
         yield f"at step {good.step}, ", good.state
-        steps, system, row = int(self.state.step[NOW]) - good.step, self.system, self.segment.row
+        steps, system, method = int(self.state.step[NOW]) - good.step, self.system, self.segment.method
         short = 0 < steps * len(system.model.species) <= REPLAYED * checks.MOVES_PER_CHECK
-        if short and isinstance(self.engine, Engine) and not (self.segment.act or system.python_forces):
+        if short and isinstance(self.engine, Engine) and not (self.segment.action or system.python_forces):
             state = good.state.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
-                state = self.engine.begin(state, row)
-                state.begin_stretch()
+                state = self.engine.begin(state, method)
+                state.begin_segment()
             self.engine.forget()
             for to in sorted({good.step + steps * k // REPLAYED for k in range(1, REPLAYED)} - {good.step}):
                 try:
-                    self.engine.advance(state, row, self.segment.dt, to)
+                    self.engine.advance(state, method, self.segment.dt, to)
                 except SimulationError:
                     return
                 yield f"at step {to}, ", state
@@ -500,7 +495,7 @@ class MolecularSimulation(Simulation):
         return "\n".join([first, *(f"  {note}" for note in system.notes)])
 
     def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes of the introduction and those that were issued as warnings."""
+        """The summary as text, without the notes of the introduction and the warnings that were issued."""
         return summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
@@ -508,14 +503,14 @@ class MolecularSimulation(Simulation):
 
         measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
         """
-        relief = self.start()
+        removal = self.start()
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
         seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state)
         force, molecule = seen.largest_force
         found = {
             "unit": unit,
             "molecules": len(self.system.model.species),
-            "relief_steps": relief.steps if relief else 0,
+            "relief_steps": removal.steps if removal else 0,
             "notes": list(self.system.notes),
             "components": {name: energy / size for name, energy in seen.components.items()},
             "potential": seen.potential / size,
@@ -528,7 +523,7 @@ class MolecularSimulation(Simulation):
             "meaning": describe_quantities(self.system),
         }
         if measure_accuracy:
-            error = accuracy(self.system, self.state)
+            error = coulomb_errors(self.system, self.state)
             found["accuracy"] = {
                 "reference": error.reference,
                 "rms_force_per_A": error.force / size,

@@ -1,10 +1,10 @@
-"""Observers of molecules: samples with their checks and log, the final state, a figure."""
+"""Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state, energy.png."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import atomic_file
 from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
 from rigidmd.engines.cpu import Engine
@@ -16,8 +16,7 @@ from rigidmd.io.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.io.log import Log
 from rigidmd.io.pressure import TENSOR_FILE, TensorFile, tensor_row
 from rigidmd.run import checks
-from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Growing, Observer
+from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from rigidmd.run.results import Results
 
 
-class LogFile(Growing):
+class LogFile(GrowingFile):
     """log.csv: a line for each sample."""
 
     ends = reads_energies = True
@@ -37,10 +36,10 @@ class LogFile(Growing):
         return [LOG]
 
     def begin(self, run: "MolecularSimulation") -> None:
-        self._file = Log(run.path(LOG), self._tensor, own=tuple(run.system.own))
+        self._file = Log(run.path(LOG), self._tensor, user_terms=tuple(run.system.user_terms))
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        self._file = Log(run.path(LOG), self._tensor, count_list(kept.told["kept"]), tuple(run.system.own))
+        self._file = Log(run.path(LOG), self._tensor, count_list(kept.told["kept"]), tuple(run.system.user_terms))
 
     def see(self, moment: Moment) -> None:
         self._file.write(moment.sample)
@@ -50,8 +49,8 @@ class LogFile(Growing):
         results.files.append(run.path(LOG))
 
 
-class PressureTensor(Growing):
-    """pressure_tensor.csv: the pressure tensor at an interval of its own; without a folder in memory."""
+class PressureTensor(GrowingFile):
+    """pressure_tensor.csv: the pressure tensor at its own interval; without a folder in memory."""
 
     once = reads_energies = True
 
@@ -82,7 +81,7 @@ class PressureTensor(Growing):
             results.files.append(run.path(TENSOR_FILE))
 
 
-class Good(NamedTuple):
+class GoodState(NamedTuple):
     """A state that passed all checks."""
 
     step: int
@@ -91,59 +90,57 @@ class Good(NamedTuple):
 
 
 class Sampler(Observer):
-    """Keeps samples, checks each against the limits of the scene, and keeps the last state that was good."""
+    """Keeps samples, checks each against the limits of the scene, and keeps the last state that passed."""
 
     ends = reads_energies = True
 
     def __init__(self, run: "MolecularSimulation", interval: float, check: checks.StepCheck):
         self.interval = interval
-        self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.own))
-        self.last_good: Good | None = None
+        self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.user_terms))
+        self.last_good: GoodState | None = None
         self._run, self._check = run, check
         self._begins: dict[int, int] = {}  # stage -> row of the last sample before it, or of the first
 
     def files(self) -> list[str]:
-        """The file of a failed run."""
         return [LAST_GOOD]
 
     def origin(self, stage: int, conserved: float) -> float:
-        """What was conserved (kJ/mol) when a stage began: that of the last sample before it, else that of its first."""
+        """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else of its first."""
         return self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else conserved
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if the sample or the next step exceeds a limit."""
         run, now, samples = self._run, moment.sample, self.samples
         since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))
         samples.append(now)
         stage = run.scene.stages[now.stage]
         if stage.has_thermostat:
             since = samples.latest(now.time - stage.thermostat_time, since)
-        seen = moment._seen
+        seen = moment._observation
         if not self._check.thermal:
             self._check.rescale(seen.kinetic)
-        if finding := self._check.finding(run.state, seen.load, stage, run.extent):
-            raise finding
-        if finding := checks.sample_finding(run.system, run.scene.watch, samples.row(since), now):
-            raise finding
+        if problem := self._check.failed_check(run.state, seen.load, stage, run.extent):
+            raise problem
+        if problem := checks.check_sample(run.system, run.scene.watch, samples.row(since), now):
+            raise problem
         self._check.rescale(seen.kinetic)
         self._keep(moment.step, moment.time)
 
     def _keep(self, step: int, time: float) -> None:
-        """Keep the present state as the last good one, in the memory of the one before."""
+        """Copy the present state as the last good one, into the arrays of the one before."""
         now, kept = self._run.state, self.last_good and self.last_good.state
         if kept is None or any(there.shape != here.shape for there, here in zip(kept, now, strict=True)):
             kept = now.copy()
         else:
             for there, here in zip(kept, now, strict=True):
                 there[:] = here
-        self.last_good = Good(step, time, kept)
+        self.last_good = GoodState(step, time, kept)
 
     def memory(self) -> Checkpoint:
         return Checkpoint({}, {"samples": self.samples.table()})
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        """Restore them, and what follows from them. The state of the checkpoint is the last good one."""
-        self.samples = samples = Samples(self.samples.stages, self.samples.own, kept.arrays["samples"])
+        """Restore the samples. The state of the checkpoint is the last good one."""
+        self.samples = samples = Samples(self.samples.stages, self.samples.user_terms, kept.arrays["samples"])
         steps, times, stages, conserved, drift = (
             samples[name] for name in ("step", "time", "stage", "conserved", "drift")
         )
@@ -170,7 +167,7 @@ class Sampler(Observer):
 
 
 class StepWatch(Observer):
-    """Checks the next step between samples; this takes no force evaluation."""
+    """Checks the next step between samples, without evaluations of forces."""
 
     ends = True
 
@@ -179,13 +176,12 @@ class StepWatch(Observer):
         self._run, self._check = run, check
 
     def see(self, moment: Moment) -> None:
-        """Raise a `Finding` if the step exceeds a limit."""
         run, engine = self._run, self._run.engine
         if not isinstance(engine, Engine) or engine.load is None:
             return  # no force has been evaluated yet
         stage = run.scene.stages[moment.stage]
-        if finding := self._check.finding(run.state, engine.load, stage, run.extent):
-            raise finding
+        if problem := self._check.failed_check(run.state, engine.load, stage, run.extent):
+            raise problem
 
 
 class FinalState(Observer):
@@ -208,8 +204,7 @@ class EnergyFigure(Observer):
         return [ENERGY]
 
     def end(self, run: "MolecularSimulation", results: "Results") -> None:
-        """Draw it if there are at least two samples."""
         for figure in run_figures(run.system, results.samples, results.summary).values():
-            with whole_file(run.path(ENERGY)) as temporary:
+            with atomic_file(run.path(ENERGY)) as temporary:
                 save_figure(figure, temporary, dpi=150)
             results.files.append(run.path(ENERGY))

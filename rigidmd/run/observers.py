@@ -1,27 +1,76 @@
-"""Observers look at a run between its steps. They read its state and never change it.
+"""Observers are called between the steps of a run. They read its state and never change it.
 
-All have the same methods: `files` it may write, `begin`, `see` a moment, `end`. An observer sees every `interval` of
-time, counted in steps of each stretch, or every `steps` steps, independent of the interval of results. If its `ends` is
-true, it also sees the last moment of every stretch. A time at which a minimisation begins has two states; one with
-`once` sees only the second. No observer depends on the order of observers: data that several of them need belong to the
-moment or the run.
+All have the same methods: `files` (which it may write), `begin`, `see` (a moment), `end`. `see` is called every
+`interval` of time, counted in steps of each segment, or every `steps` steps, independent of the interval of results,
+and with `ends` also at the last moment of every segment. A time at which a minimisation begins has two states: with
+`once` only the second is observed. No observer depends on the order of observers: data that several of them need belong
+to the moment or the run.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidmd.core.state import NOW
+from rigidmd.core.state import NOW, State
 from rigidmd.io.checkpoint import Checkpoint, count_list
 from rigidmd.io.folder import SCENE
 from rigidmd.io.frame import Frame
-from rigidmd.run.moment import Moment
 
 if TYPE_CHECKING:
+    from rigidmd.engines.samples import Sample
+    from rigidmd.run.molecular import MolecularSimulation
     from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
+
+
+class Moment:
+    """The argument of observers: position in the run, state and observation. Its values do not change later.
+
+    step : steps since the start; time : ps, or s for a single body; stage : index of the stage
+    state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in SI units
+    """
+
+    def __init__(self, run: "Simulation", step: int, time: float, stage: int):
+        self._run, self._state = run, run.state
+        self.step = step
+        self.time = time
+        self.stage = stage
+
+    def __repr__(self) -> str:
+        return f"<Moment at time {self.time:g}, step {self.step}, stage {self.stage}>"
+
+    @cached_property
+    def state(self) -> State:
+        """A copy of the state of the run, read-only."""
+        return State(*map(_read_only, self._state.copy()))
+
+    @cached_property
+    def _observation(self) -> Any:
+        """The observation in internal units, evaluated at its first use, for all observers."""
+        return self._run._observe(self)
+
+    @cached_property
+    def sample(self) -> "Sample":
+        """The line of the log; for molecules only."""
+        return cast("MolecularSimulation", self._run).sample_of(self)
+
+    @cached_property
+    def observation(self) -> Any:
+        """The observation: a `Reading` for molecules, in the units of the log; a `Pose` for a body, in SI units."""
+        return getattr(self._observation, "reading", self._observation)
+
+    @property
+    def site_positions(self) -> np.ndarray:
+        """Positions (s, 3) of all sites, lab frame, Å, not wrapped."""
+        return self._run.system.site_positions(self._state)
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
 
 
 def above_zero(interval: float, name: str) -> float:
@@ -37,33 +86,33 @@ class Observer:
     interval: float | None = None  # ps, or s for a single body
     steps: int | None = None
     ends = False
-    once = False  # whether it sees one moment of each time: none before a minimisation
-    draws = False  # whether it only draws: it ends after the others, and its errors are notes
-    reads_energies = False  # whether it always reads forces or energies: the last step then computes them too
+    once = False  # whether it is called once for each time: not before a minimisation
+    draws = False  # whether it only draws: its `end` is called after the others, and its errors are notes
+    reads_energies = False  # whether it reads forces or energies, which the last step then computes too
 
     def files(self) -> list[str]:
-        """Names of all files that it may write."""
+        """Names of all files that may be written."""
         return []
 
     def begin(self, run: "Simulation") -> None:
         """Called before the first step; the folder exists."""
 
     def see(self, moment: Moment) -> None:
-        """Look. Raises SimulationError to stop the run."""
+        """Observe a moment. Raises SimulationError to stop the run."""
 
     def memory(self) -> Checkpoint:
-        """What `resume` needs, for a checkpoint; its files are on the disk as far as they go."""
+        """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it returns."""
         return Checkpoint({}, {})
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        """Called instead of `begin` when a run is resumed: restore what `memory` gave, and check files, unchanged.
+        """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check files without changes.
 
-        The run is refused if it raises KeyError, TypeError, ValueError or OutputError.
+        The run is refused if this raises KeyError, TypeError, ValueError or OutputError.
         """
         self.begin(run)
 
     def cut(self) -> None:
-        """Called when all observers have resumed: cut files off where the checkpoint left them."""
+        """Called when all observers have resumed: cut files to their lengths at the checkpoint."""
 
     def end(self, run: "Simulation", results: "Results") -> None:
         """Called after the last step or an interruption: complete the files."""
@@ -72,7 +121,7 @@ class Observer:
         """Called in any case: close files."""
 
     def failed(self, run: "Simulation") -> str:
-        """Called if the run stops with an error: save results. Returns a sentence that names the file, or nothing."""
+        """Called if the run stops with an error: save results. Returns a sentence that names the file, or an empty one."""
         return ""
 
 
@@ -89,13 +138,12 @@ class Every(Observer):
         self.function(moment)
 
 
-class Growing(Observer):
-    """An observer whose file grows while the run goes; None without a folder."""
+class GrowingFile(Observer):
+    """An observer whose file grows during the run; None without a folder."""
 
     _file: Any = None
 
     def memory(self) -> Checkpoint:
-        """The size of the file."""
         return Checkpoint({"kept": None if self._file is None else self._file.kept}, {})
 
     def cut(self) -> None:
@@ -109,7 +157,7 @@ class Growing(Observer):
 
 
 class SceneFile(Observer):
-    """scene.toml: the scene as it runs, with copies of the files that it reads."""
+    """scene.toml, with copies of the files that the scene reads."""
 
     def __init__(self, names: Iterable[str] = ()):
         self._copies = list(names)
@@ -118,7 +166,7 @@ class SceneFile(Observer):
         return [SCENE, *self._copies]
 
     def begin(self, run: "Simulation") -> None:
-        """Write it. A run writes it again after choosing an integrator for a stage."""
+        """Write scene.toml. It is written again after an integrator has been chosen for a stage."""
         self.resume(run, Checkpoint({}, {}))
         self.cut()
 
@@ -133,7 +181,7 @@ class SceneFile(Observer):
         results.files.append(run.path(SCENE))
 
 
-class Frames(Growing):
+class Frames(GrowingFile):
     """Topology and trajectory; without a folder, frames in memory."""
 
     once = True
@@ -150,7 +198,6 @@ class Frames(Growing):
         return self._names
 
     def begin(self, run: "Simulation") -> None:
-        """Write the topology and open the trajectory."""
         self._run, self._frames = run, []
         if run.folder is not None:
             from rigidmd.io.trajectory_writer import write_topology  # MDAnalysis is slow to import
@@ -159,11 +206,9 @@ class Frames(Growing):
             self._open(None)
 
     def memory(self) -> Checkpoint:
-        """Size of the trajectory, times of its frames."""
         return super().memory()._replace(arrays={"time": np.array([frame.time for frame in self._frames])})
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        """Open the trajectory where the checkpoint left it."""
         time, now = kept.arrays["time"], run.state.time[NOW]
         *_, frames = counts = count_list(kept.told["kept"])
         if time.shape != (frames,) or not ((time >= 0) & (time <= now)).all() or not (np.diff(time) >= 0).all():
@@ -188,7 +233,6 @@ class Frames(Growing):
             self._frames.append(Frame(moment.time, positions, state.cell.copy(), velocities, state.rotation.copy()))
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        """Hand over what was seen."""
         results._frames = self._frames
         if self._file is not None:
             results.files += [run.path(name) for name in self._names]

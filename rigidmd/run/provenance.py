@@ -1,4 +1,4 @@
-"""What a run was computed with and from: versions, the processor, digests of the scene and of its input files."""
+"""Provenance of a run: versions, the processor, digests of the scene and of its input files."""
 
 import hashlib
 import json
@@ -16,12 +16,12 @@ from rigidmd.scene import MolecularScene, Scene
 
 #: Packages that may change the last bits of a result.
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
-#: Keys that change no bit of a run, or are compared otherwise: input files by their contents.
+#: Keys that change no bit of a run, or, as input files, are compared by contents.
 NOT_COMPARED = ("name", "threads", "output.checkpoint_minutes", "output.figures", "output.drawn_as", "watch")
 
 
 def computed_with() -> dict[str, Any]:
-    """All that besides the scene may change the bits of a result, as JSON has it."""
+    """Everything besides the scene that may change the bits of a result, as JSON values."""
     settings = " ".join(f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ)
     return {
         **{f"{package}_version": version(package) for package in PACKAGES},
@@ -35,8 +35,10 @@ def computed_with() -> dict[str, Any]:
 
 
 def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: str) -> dict[str, Any]:
-    """The first part of summary.json: `computed_with`, and what went in. inputs : `input_digests` at the
-    start. engine : what moved the bodies"""
+    """The first part of summary.json: `computed_with`, and the input.
+
+    inputs : `input_digests` at the start; engine : the program that computed the motion
+    """
     molecular = isinstance(scene, MolecularScene)
     return {
         "scene": scene.name,
@@ -51,13 +53,13 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
 
 
 def scene_digest(scene: Scene) -> str:
-    """SHA-256 of all keys of a resolved scene that decide the bits of its run."""
+    """SHA-256 of all keys of a resolved scene that may change the bits of its run."""
     keys = keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))
     return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
 
 
 def input_digests(scene: Scene) -> dict[str, str]:
-    """SHA-256 of each input of a scene, in a file or held, by its dotted key. Raises SceneError."""
+    """SHA-256 of each input of a scene, a file or its contents, by its dotted key. Raises SceneError."""
     try:
         read = {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
     except OSError as error:
@@ -66,13 +68,13 @@ def input_digests(scene: Scene) -> dict[str, str]:
 
 
 def plain(scene: BaseModel) -> dict[str, Any]:
-    """A scene, or a part of one, as JSON has it."""
+    """A scene, or a part of one, as JSON values."""
     return scene.model_dump(mode="json", exclude_none=True)
 
 
-def keys_of(scene: Mapping[str, Any], apart: Iterable[str]) -> dict[str, Any]:
-    """Dotted key -> value of a `plain` scene, without the keys and tables named in `apart`."""
-    left_out = tuple(f"{key}." for key in apart)
+def keys_of(scene: Mapping[str, Any], excluded: Iterable[str]) -> dict[str, Any]:
+    """Dotted key -> value of a `plain` scene, without the keys and tables in `excluded`."""
+    left_out = tuple(f"{key}." for key in excluded)
     return {key: value for key, value in _flat(scene).items() if not f"{key}.".startswith(left_out)}
 
 
@@ -83,7 +85,7 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any], left_out: A
 
 
 def _flat(data: Any, name: str = "") -> dict[str, Any]:
-    """Dotted key -> value of nested tables, without those that are None."""
+    """Dotted key -> value of nested tables, without None."""
     if isinstance(data, Mapping):
         pairs = [(f"{name}.{key}" if name else str(key), value) for key, value in data.items()]
     elif isinstance(data, list) and any(isinstance(value, Mapping) for value in data):

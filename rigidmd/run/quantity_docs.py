@@ -9,28 +9,28 @@ from rigidmd.assemble.electrostatics import NEUTRAL
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.coulomb import ReactionField
-from rigidmd.forces.potentials.truncation import Plain
+from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.units import BAR
 
 
-def meanings(system: System) -> dict[str, str]:
+def describe_quantities(system: System) -> dict[str, str]:
     """Name of an energy component, `virial` or `pressure` -> explanation."""
-    methods = {"reaction_field": _of_reaction_field, "ewald": _of_ewald, "pme": _of_ewald}
+    methods = {"reaction_field": _describe_reaction_field, "ewald": _describe_ewald, "pme": _describe_ewald}
     has = {*system.terms, *system.constants}
     of_charges = methods.get(system.scene.forces.electrostatics, lambda system: {})(system)
     found = {name: text for name, text in of_charges.items() if name in has}
     if system.space.volume < inf:
-        found |= _of_pressure(system)
+        found |= _describe_pressure(system)
     return found
 
 
-def _of_reaction_field(system: System) -> dict[str, str]:
+def _describe_reaction_field(system: System) -> dict[str, str]:
     """Of a reaction field."""
     if system.cutoff == inf or "coulomb" not in system.terms:
         return {}
     name = system.scene.forces.truncation
-    shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).law).shape
-    start = 0.0 if isinstance(shape, Plain) else shape.start
+    shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).potential).truncation
+    start = 0.0 if isinstance(shape, Unmodified) else shape.start
     ends = {"plain": "", "shift": ", less its value at the cut-off", "force_shift": ", less its value and slope there"}
     if name in ends:
         how = ends[name]
@@ -44,7 +44,7 @@ def _of_reaction_field(system: System) -> dict[str, str]:
     }
 
 
-def _of_ewald(system: System) -> dict[str, str]:
+def _describe_ewald(system: System) -> dict[str, str]:
     """Of Ewald sums; they depend on whether the real-space energy is shifted."""
     real, own = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
     if system.scene.forces.ewald_truncation == "plain":
@@ -58,7 +58,7 @@ def _of_ewald(system: System) -> dict[str, str]:
     return {"coulomb_real": f"{real}, less its value at the cut-off", "coulomb_self": own + more}
 
 
-def _of_pressure(system: System) -> dict[str, str]:
+def _describe_pressure(system: System) -> dict[str, str]:
     """Of virial and pressure: which of them includes constant parts."""
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:

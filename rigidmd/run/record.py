@@ -1,4 +1,4 @@
-"""What the folder of a run holds: its scene, its summary, and the columns of its log or motion."""
+"""Reading of the folder of a run: its scene, its summary, and the columns of log.csv or motion.csv."""
 
 import shlex
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.core.state import State
+from rigidmd.core.state import STORED_NAMES, State
 from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.columns import BODY, BODY_COLUMNS
+from rigidmd.engines.samples import BODY, BODY_COLUMNS
 from rigidmd.engines.system import System
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.io.checkpoint import latest
@@ -46,7 +46,6 @@ class Record:
 
     @property
     def is_body(self) -> bool:
-        """Whether it is a single body."""
         return isinstance(self.scene, BodyScene)
 
     @property
@@ -70,7 +69,7 @@ class Record:
 
     @property
     def moving(self) -> np.ndarray:
-        """Which samples (t,) are of motion: none of minimisations, in which no time passes."""
+        """Which samples (t,) are not of minimisations, in which no time passes."""
         stages = getattr(self.scene, "stages", ())
         return np.array(
             [not (stages and stages[k].is_minimisation) for k in self.columns.get("stage", self.time)], bool
@@ -78,12 +77,11 @@ class Record:
 
     @property
     def time_unit(self) -> str:
-        """Of `time`."""
         return "s" if self.is_body else "ps"
 
 
 def read_record(folder: Path) -> Record:
-    """Read the folder of a run, ended or not. Raises OutputError if it is none, or holds nothing to look at."""
+    """Read the folder of a run, ended or not. Raises OutputError if it is no such folder, or has no samples."""
     check_is_run(folder)
     scene = Scene.read(folder / SCENE)
     summary, missing = _summary(folder)
@@ -95,7 +93,7 @@ def read_record(folder: Path) -> Record:
         columns = _log(folder, scene.stages)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(
-            f"{folder}: the run wrote no samples yet; `rigidmd resume {shlex.quote(str(folder))}` goes on with it"
+            f"{folder}: the run has not written samples yet; `rigidmd resume {shlex.quote(str(folder))}` continues it"
         )
     return Record(folder, scene, system, summary, columns, missing)
 
@@ -104,10 +102,10 @@ def _summary(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
     found = read_json(folder / SUMMARY, Summary)
     if found is None:
         return None, [
-            f"This run has not ended: there is no {SUMMARY}. What follows is what it wrote so far; "
-            f"`rigidmd resume {shlex.quote(str(folder))}` goes on with it."
+            f"This run has not ended: there is no {SUMMARY}. These are its results so far; "
+            f"`rigidmd resume {shlex.quote(str(folder))}` continues it."
         ]
-    ended = "This run was interrupted; what follows is what it wrote so far."
+    ended = "This run was interrupted; these are its results so far."
     return found.model_dump(exclude_unset=True), [ended] if found.interrupted else []
 
 
@@ -115,10 +113,10 @@ def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
     """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
     read = read_columns(folder / LOG)
     if read is None:
-        raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
+        raise OutputError(f"{folder / LOG} cannot be read: the file does not exist")
     headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
     if lacking := [name for name in ("time", "stage_name") if name not in headers]:
-        raise OutputError(f"{read.path} is no log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
+        raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
     found = {
         name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
         for name, header in headers.items()
@@ -127,12 +125,12 @@ def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
 
 
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
-    """Index of the stage of each line. Several stages may have one name; their times tell them apart."""
+    """Index of the stage of each row. Stages with the same name are distinguished by their times."""
     found, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
     for k, stage in enumerate(stages[:-1]):
         end += stage.duration
-        own = (names[first:] == stage.label) & (time[first:] <= end + 0.5e-3 * stage.timestep_fs)
-        count = len(own) if own.all() else int(own.argmin())
+        of_stage = (names[first:] == stage.label) & (time[first:] <= end + 0.5e-3 * stage.timestep_fs)
+        count = len(of_stage) if of_stage.all() else int(of_stage.argmin())
         found[first : first + count] = k
         first += count
     return found
@@ -147,7 +145,7 @@ def _columns_of(system: BodySystem) -> list[str]:
 
 
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
-    """Columns of motion.csv; of a run that did not write it, those of its last checkpoint."""
+    """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
     if (found := read_columns(folder / MOTION)) is not None:
         needed = _columns_of(system)
         if lacking := [header for name in needed if (header := BODY_COLUMNS[name].header) not in found.cells]:
@@ -160,9 +158,9 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
         return {}
     for owner in kept.told.get("of", {}):
         part = kept.of(owner).arrays
-        if "t" in part and set(State._fields) <= set(part):
-            states = zip(*(part[name] for name in State._fields), strict=True)
+        if "t" in part and set(STORED_NAMES) <= set(part):
+            states = zip(*(part[name] for name in STORED_NAMES), strict=True)
             snapshots = [Snapshot(t, State(*state)) for t, state in zip(part["t"].tolist(), states, strict=True)]
-            missing.append(f"{MOTION} is written at the end; the motion shown is that of the last checkpoint.")
+            missing.append(f"{MOTION} is written at the end; the motion shown ends at the last checkpoint.")
             return motion(system, snapshots).columns
     return {}

@@ -1,4 +1,4 @@
-"""Reports of a run: summary.json, the summary as text, and energy.png."""
+"""The summary of a run: summary.json, and as text."""
 
 from collections.abc import Container
 from pathlib import Path
@@ -8,7 +8,7 @@ from rigidmd.io.write import write_json
 
 if TYPE_CHECKING:
     pass
-from rigidmd.figures.run import NO_ERROR, signed
+from rigidmd.core.statistics import NO_ERROR, format_signed
 
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
@@ -22,7 +22,7 @@ def write_summary(path: Path, summary: dict) -> None:
 
 
 def summary_text(summary: dict, known: Container[str] = ()) -> str:
-    """The summary as text, without the notes that the reader knows."""
+    """The summary of a run of molecules as text, without the notes in `known`."""
     species = ", ".join(f"{count} {name}" for name, count in summary["species"].items())
     freedom = summary["degrees_of_freedom"]
     lines = [
@@ -51,7 +51,7 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
 
 
 def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
-    """The summary of a single body's run as text, without the notes that the reader knows."""
+    """The summary of a run of a single body as text, without the notes in `known`."""
     lines = [f"\n{body_title(summary)}", *(f"  {name:<16}{value}" for name, value in body_rows(summary))]
     lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
     if summary["interrupted"]:
@@ -60,13 +60,13 @@ def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
 
 
 def body_title(summary: dict) -> str:
-    """Steps and speed of a single body's run."""
+    """Steps and speed of a run of a single body."""
     speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
     return f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"
 
 
 def body_rows(summary: dict) -> list[tuple[str, str]]:
-    """Name and value of what a single body's run found."""
+    """Names and values of the summary of a run of a single body."""
     rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
     if summary["work_J"]:
         rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
@@ -85,8 +85,8 @@ def stage_title(stage: dict) -> str:
     """Steps and speed of a stage, or how its minimisation ended."""
     if found := stage["minimum"]:
         ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
-        relief = f" and {found['relief_steps']} of relief" if found["relief_steps"] else ""
-        return f"{stage['name']}: {ended} after {found['iterations']} iterations{relief}; {stage['computing_s']:.1f} s"
+        removal = f" and {found['relief_steps']} of overlap removal" if found["relief_steps"] else ""
+        return f"{stage['name']}: {ended} after {found['iterations']} iterations{removal}; {stage['computing_s']:.1f} s"
     title = f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs, {stage['duration_ps']:g} ps"
     if stage["steps_per_s"]:
         title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:.3g} ns/day"
@@ -100,7 +100,7 @@ def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
     rows.append(("largest force", f"{found['largest_force_kJ_mol_A']:.2g} kJ/(mol Å){torque}"))
     if found["pressure_bar"] is not None:
         off = found["largest_pressure_deviation_bar"]
-        more = "" if off is None else f", within {off:.2g} bar of the one asked for"
+        more = "" if off is None else f", within {off:.2g} bar of the given pressure"
         rows.append(("pressure", f"{found['pressure_bar']:.4g} bar without the kinetic part{more}"))
     if stage.get("density_g_cm3") is not None:
         rows.append(("density", f"{stage['density_g_cm3']:.4f} g/cm³"))
@@ -110,7 +110,7 @@ def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
 
 
 def stage_rows(stage: dict) -> list[tuple[str, str]]:
-    """Name and value of what a stage found; a row without a name belongs to the one before it."""
+    """Names and values of a stage; a row without a name belongs to the row before it."""
     if stage["minimum"]:
         return _minimum_rows(stage, stage["minimum"])
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
@@ -128,15 +128,15 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
         rows.append(("box", f"{', '.join(edges)} Å"))
     if stage["moves_tried"]:
-        share = stage["moves_accepted"] / stage["moves_tried"]
-        rows.append(("box moves", f"{stage['moves_tried']}, {100 * share:.0f} % accepted"))
+        accepted = stage["moves_accepted"] / stage["moves_tried"]
+        rows.append(("box moves", f"{stage['moves_tried']}, {100 * accepted:.0f} % accepted"))
     if stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
         value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
-        rows.append(("drift", f"{signed(value, error)} kJ/mol/ns per molecule ({what})"))
+        rows.append(("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what})"))
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
-            rows.append(("", f"{signed(value, error)} kT/ns per degree of freedom"))
+            rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
             rows.append(
                 ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in total")
@@ -148,8 +148,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
 
 
 def _with_error(value: float, error: float | None, places: int, unit: str = "") -> str:
-    told = f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
-    return f"{told} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
+    text = f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+    return f"{text} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
 
 
 def _temperatures(stage: dict, ending: str) -> str:

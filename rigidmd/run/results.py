@@ -1,4 +1,4 @@
-"""Results of a run."""
+"""Results of a run: samples, summary, final state, frames; the value that `Simulation.run` returns."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
-from rigidmd.scene.validation import settled
+from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     import ase
@@ -33,7 +33,7 @@ class Results(Displayed):
     summary : values with units in their keys, as in summary.json
     state : the final one, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units
     files : paths of the files written
-    interrupted : whether the run ended early, by a signal or because its time was up (`out_of_time`)
+    interrupted : whether the run ended early, by a signal or at its walltime (`out_of_time`)
     signal : number of the signal, 2 for Ctrl-C, 15 for SIGTERM
     """
 
@@ -46,14 +46,15 @@ class Results(Displayed):
     signal: int | None = None
     out_of_time: bool = False
     _frames: "list[Frame]" = field(default_factory=list)
-    _tensor: np.ndarray | None = None  # (n, 7) lines of the pressure tensor, where no file holds them
+    _tensor: np.ndarray | None = None  # (n, 7) rows of the pressure tensor of a run without files
     _histories: dict[float | None, Any] = field(default_factory=dict)  # kept by rigidmd.analysis, by their start
 
     def __repr__(self) -> str:
-        return f"<Results of {self.system.scene.name}: {self._told}; results[column], .units, .summary, .universe()>"
+        name = self.system.scene.name
+        return f"<Results of {name}: {self._summary_line}; results[column], .units, .summary, .universe()>"
 
     @property
-    def _told(self) -> str:
+    def _summary_line(self) -> str:
         files = f"{len(self.files)} files in {self.files[0].parent}" if self.files else "no files"
         return f"{'interrupted, ' if self.interrupted else ''}{len(self.samples)} samples, {files}"
 
@@ -67,13 +68,13 @@ class Results(Displayed):
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of the samples as an array (n,), in its unit of `units`: results["energy"].
 
-        For a body that turns, results["Q"] holds its rotation matrices (n, 3, 3). Raises KeyError with all names.
+        For a body that rotates, results["Q"] holds its rotation matrices (n, 3, 3). Raises KeyError with all names.
         """
         return self.samples[column]
 
     @property
     def units(self) -> dict[str, str]:
-        """Name -> unit of each column; "1" for numbers, empty for words."""
+        """Name -> unit of each column; "1" for numbers, empty for text."""
         return {name: column.unit for name, column in self.samples.described.items()}
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -93,10 +94,10 @@ class Results(Displayed):
         return pandas.DataFrame({header: self[name] for name, header in written.items()})
 
     def universe(self) -> "MDAnalysis.Universe":
-        """The trajectory as an MDAnalysis Universe: from the files if there are any, else from memory.
+        """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from memory.
 
-        Lengths in Å, times in ps; every frame has its time in the run, even if the file cannot hold it. For a body a
-        second becomes a picosecond. Warns if frames are not evenly spaced. Raises ValueError without a trajectory.
+        Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its time in the run, even if
+        the file format has no times. Warns if frames are not evenly spaced. Raises ValueError without a trajectory.
         """
         from rigidmd.io import trajectory
 
@@ -107,7 +108,7 @@ class Results(Displayed):
             by_name = {path.name: path for path in self.files}
             times = [frame.time for frame in self._frames]
             return trajectory.from_files(
-                self.system, by_name[settled(output.topology)], by_name[output.trajectory], times
+                self.system, by_name[not_none(output.topology)], by_name[output.trajectory], times
             )
         return trajectory.in_memory(self.system, self._frames)
 
@@ -118,8 +119,8 @@ class Results(Displayed):
     @overload
     def atoms(self, frame: str) -> "ase.Atoms | list[ase.Atoms]": ...
     def atoms(self, frame: int | slice | str | None = None) -> "ase.Atoms | list[ase.Atoms]":
-        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory: an index, or a list for a slice
-        or a text like ":" or "::10", as `ase.io.read` has them.
+        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory: one for an index, a list for a
+        slice or a text like ":" or "::10", as in `ase.io.read`.
 
         Atoms are the sites with mass, with the masses of the models, cell, periodicity, `info["time_ps"]` and, where
         frames have velocities, momenta. The final state, and a last frame at its time, is exact, with energy, forces
@@ -134,22 +135,22 @@ class Results(Displayed):
     def rotation(self) -> np.ndarray:
         """The rotation matrices Q, body to lab, at the frames of `universe()` (frames, n, 3, 3).
 
-        Of molecules Q turns the principal axes of `rigidmd models NAME`; of a body its own axes, at all samples. A
-        trajectory.gsd keeps Q; from other files it is rebuilt from the positions of sites, as exactly as these are
-        written, with an arbitrary turn of linear molecules about their axes. Raises ValueError if nothing turns.
+        For molecules Q rotates the principal axes of `rigidmd models NAME`, for a body the body's axes, at all samples.
+        A trajectory.gsd stores Q. With other files it is fitted to the positions of sites, as exact as these, with an
+        arbitrary rotation of linear molecules about their axes. Raises ValueError if nothing rotates.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]
         if len(self.state.rotation) == 0:
-            raise ValueError("nothing turns in this run: it has points only")
+            raise ValueError("nothing rotates in this run: it has points only")
         if not self._frames:
             raise ValueError("this run kept no frames (output.trajectory = false)")
         if self.files:
             path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
             if path.suffix != ".gsd":
-                from rigidmd.run.rigid_fit import Rebuilt
+                from rigidmd.run.rigid_fit import RigidFit
 
-                fit = Rebuilt(cast("System", self.system))
+                fit = RigidFit(cast("System", self.system))
                 return np.array([fit.bodies(frame.positions, None).Q for frame in self.universe().trajectory])
             from rigidmd.io.trajectory import read_rotations
 

@@ -1,4 +1,4 @@
-"""Whether a checkpoint is one of this scene, and the state that it holds."""
+"""Checks of a checkpoint: that it belongs to the scene, and that its state and data are valid."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.core.state_file import LARGEST, are_rotations, is_cell
 from rigidmd.errors import CheckpointError
 from rigidmd.run.provenance import NOT_COMPARED, computed_with, differences, input_digests, keys_of, plain
@@ -18,32 +18,32 @@ T = TypeVar("T")
 
 
 def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int) -> None:
-    """Raise CheckpointError unless a resolved scene goes on with a run of `before` after so many steps.
+    """Raise CheckpointError unless a resolved scene can continue a run of the scene `before` after some steps.
 
-    The last stage of molecules may be longer or shorter than it was, but not shorter than it has been.
+    The last stage of molecules may be longer or shorter than before, but not shorter than it has run.
     """
-    apart = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
+    excluded = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
     if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
-        apart.append(f"stages.{len(scene.stages) - 1}.duration_ps")
+        excluded.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
-            raise CheckpointError(f"{scene.source}: the run in the folder is longer already, {steps} steps")
-    unlike = differences(keys_of(plain(scene), apart), keys_of(before, apart))
-    faults = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
+            raise CheckpointError(f"{scene.source}: the run in the folder is already longer, {steps} steps")
+    unlike = differences(keys_of(plain(scene), excluded), keys_of(before, excluded))
+    changes = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
     found = input_digests(scene)
-    faults += [f"the file of {key} has changed" for key in found if found[key] != inputs.get(key)]
-    if faults:
+    changes += [f"the file of {key} has changed" for key in found if found[key] != inputs.get(key)]
+    if changes:
         raise CheckpointError(
-            f"{scene.source}: is not the scene of the run in the folder: {'; '.join(faults[:8])}. "
+            f"{scene.source}: is not the scene of the run in the folder: {'; '.join(changes[:8])}. "
             "--force begins a new run, -o names another folder"
         )
 
 
-def describe_changes(told: Mapping[str, Any]) -> str | None:
-    """A sentence if the run so far was computed with other versions or on another processor, which may change bits."""
+def describe_changes(before: Mapping[str, Any]) -> str | None:
+    """A sentence if the run so far was computed with other versions or on another processor; None otherwise."""
     now = computed_with()
     changed = [
         f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"
-        for key, (then, here) in differences(told, now, None).items()
+        for key, (then, here) in differences(before, now, None).items()
         if key not in ("python_version", "processor_features")
     ]
     if not changed:
@@ -54,18 +54,18 @@ def describe_changes(told: Mapping[str, Any]) -> str | None:
 
 
 def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True) -> State:
-    """The state in a checkpoint, of a run whose states have arrays like this one. Raises ValueError, KeyError.
+    """The state in a checkpoint of a run whose states have arrays like `like`. Raises ValueError, KeyError.
 
-    exact : whether the method of the run keeps rotations, and does not only approach them
+    exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
-    found = State(*(np.array(arrays[name], order="C") for name in State._fields))
-    for name, array, own in zip(State._fields, found, like, strict=True):
-        if array.dtype != own.dtype or array.shape != own.shape:
-            raise ValueError(f"{name} has the shape {array.shape}, not {own.shape}, or is of another type")
+    found = State(*(np.array(arrays[name], order="C") for name in STORED_NAMES))
+    for name, array, expected in zip(STORED_NAMES, found, like, strict=True):
+        if array.dtype != expected.dtype or array.shape != expected.shape:
+            raise ValueError(f"{name} has the shape {array.shape}, not {expected.shape}, or is of another type")
         if name != "cell" and not (np.abs(array) <= LARGEST).all():
             raise ValueError(f"{name} of its state is not finite")
     if exact and not are_rotations(found.rotation):
-        raise ValueError("its state has rotation matrices that are none")
+        raise ValueError("its state has matrices Q that are not rotations")
     if not is_cell(found.cell) or (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
     if not (0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]):
@@ -74,7 +74,7 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
 
 
 def read_as(kind: type[T], data: Any) -> T:
-    """Data of a checkpoint as a type that pydantic knows. Raises ValueError in one sentence."""
+    """Data of a checkpoint, validated by pydantic as a type. Raises ValueError with one sentence."""
     try:
         return TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
@@ -83,7 +83,7 @@ def read_as(kind: type[T], data: Any) -> T:
 
 
 class ResumeData(BaseModel):
-    """What evolves in a run and is not in its state, besides the scene that it is of."""
+    """The data of a run, besides its state, that a checkpoint needs: what evolves, and the scene."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants")
 
@@ -92,13 +92,13 @@ class ResumeData(BaseModel):
     notes: list[str] = []
 
     def to_json(self, **changes: Any) -> dict[str, Any]:
-        """For a checkpoint, from which `read_as` makes it again."""
+        """JSON values for a checkpoint, which `read_as` reads."""
         return plain(self.model_copy(update=changes))
 
 
 @contextlib.contextmanager
 def as_checkpoint_errors(folder: Path | None) -> Iterator[None]:
-    """Turns whatever does not fit in a checkpoint into a CheckpointError."""
+    """Convert errors of checks and of wrong data into a CheckpointError."""
     try:
         yield
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError) as error:

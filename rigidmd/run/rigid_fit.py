@@ -1,4 +1,4 @@
-"""Rigid bodies from the positions and velocities of sites: fits of rigid templates."""
+"""Fits of rigid molecules to the positions and velocities of sites, such as those in a trajectory."""
 
 from typing import NamedTuple
 
@@ -18,60 +18,62 @@ class Bodies(NamedTuple):
     L: np.ndarray | None
 
 
-class Rebuilt:
-    """Rebuilds rigid bodies from sites: fits of rigid templates, whose axes are those of `rigidmd models NAME`."""
+class RigidFit:
+    """Fits the molecules of a system, with the axes of `rigidmd models NAME`, to frames of sites."""
 
     def __init__(self, system: System):
         self._kinds = kinds_of(system)
         self._templates = [_template(kind.molecule) for kind in self._kinds]
         self._n = len(system.model.species)
-        self._turning = len(system.state.rotation) > 0
+        self._rotates = len(system.state.rotation) > 0
 
     def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
         """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole.
 
-        Q of a linear molecule has an arbitrary turn about its axis.
+        Q of a linear molecule has an arbitrary rotation about its axis.
         """
         centre = np.empty((self._n, 3))
-        Q = np.tile(np.eye(3), (self._n if self._turning else 0, 1, 1))
+        Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
         velocity = None if velocities is None else np.empty((self._n, 3))
         L = None if velocities is None else np.zeros((len(Q), 3))
         for kind, fit in zip(self._kinds, self._templates, strict=True):
-            at, own = sites[kind.sites].astype(float), kind.index
+            at, index = sites[kind.sites].astype(float), kind.index
             middle = at.mean(axis=1)
-            turn = fit.turned(at - middle[:, None])
-            centre[own] = middle - turn @ fit.middle
-            arms = np.einsum("nij,sj->nsi", turn, kind.molecule.positions_body)
-            off = np.abs(at - centre[own][:, None] - arms).max(axis=(1, 2), initial=0.0)
-            if (worst := float(off.max(initial=0.0))) > OFF + OFF_RELATIVE * kind.molecule.radius:
+            rotation = fit.rotations_onto(at - middle[:, None])
+            centre[index] = middle - rotation @ fit.middle
+            arms = np.einsum("nij,sj->nsi", rotation, kind.molecule.positions_body)
+            off = np.abs(at - centre[index][:, None] - arms).max(axis=(1, 2), initial=0.0)
+            if (worst := float(off.max(initial=0.0))) > MAX_DEVIATION + MAX_RELATIVE_DEVIATION * kind.molecule.radius:
                 raise OutputError(
-                    f"a site of molecule {own[off.argmax()] + 1} is {worst:.2g} Å away from where its rigid "
-                    f"{kind.name} has it: the molecules of a trajectory must be whole, and those of this run"
+                    f"a site of molecule {index[off.argmax()] + 1} is {worst:.2g} Å away from its position in the rigid "
+                    f"{kind.name}: the molecules of a trajectory must be whole, and be the molecules of this run"
                 )
-            if self._turning:
-                Q[own] = turn
+            if self._rotates:
+                Q[index] = rotation
             if velocity is not None and L is not None and velocities is not None:
                 v, mass = velocities[kind.sites].astype(float), kind.molecule.masses
                 mean = np.einsum("s,nsi->ni", mass, v) / kind.molecule.mass
-                velocity[own] = mean
-                if self._turning:
+                velocity[index] = mean
+                if self._rotates:
                     lab = np.einsum("s,nsi->ni", mass, np.cross(arms, v - mean[:, None]))
-                    L[own] = np.einsum("nij,ni->nj", turn, lab)
+                    L[index] = np.einsum("nij,ni->nj", rotation, lab)
         return Bodies(centre, Q, velocity, L)
 
 
 class _Template(NamedTuple):
-    """middle (3,) of the sites in the body's frame; their directions: sites (s, r) times `columns` (r, 3) of the body's
-    frame, r the number of dimensions in which they extend."""
+    """The sites of a molecule in its body frame, which extend in r dimensions.
+
+    middle (3,) : mean of the sites; weights (s, r), columns (r, 3) : of the singular value decomposition
+    """
 
     middle: np.ndarray
     weights: np.ndarray
     columns: np.ndarray
 
-    def turned(self, arms: np.ndarray) -> np.ndarray:
-        """Rotations (n, 3, 3) that bring the template to sites (n, s, 3) about their middle."""
+    def rotations_onto(self, arms: np.ndarray) -> np.ndarray:
+        """Rotations (n, 3, 3) of the template onto sites (n, s, 3) about their middle."""
         seen = np.einsum("nsi,sr->nri", arms, self.weights)
-        axes = np.empty((len(arms), 3, 3))  # rows: where the first, second and third of the template's own axes lie
+        axes = np.empty((len(arms), 3, 3))  # rows: directions of the template's axes
         rank = len(self.columns)
         axes[:, 0] = seen[:, 0] if rank else [1.0, 0.0, 0.0]
         axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1)[:, None]
@@ -104,12 +106,12 @@ def _right_handed(rows: np.ndarray) -> np.ndarray:
 
 #: Singular values of a template below this fraction of the largest are zero: it is flat or a line.
 FLAT = 1e-6
-#: Å, and fraction of a molecule's radius, by which a site may lie off the rigid molecule: files are rounded to 0.01 Å.
-OFF, OFF_RELATIVE = 0.03, 0.03
+#: Largest deviation of a site from the rigid molecule, Å, and fraction of the radius: files are rounded to 0.01 Å.
+MAX_DEVIATION, MAX_RELATIVE_DEVIATION = 0.03, 0.03
 
 
 class Kind(NamedTuple):
-    """The molecules of one species: indices (k,) of molecules, and those of their sites (k, s)."""
+    """The molecules of one species: their indices (k,), and the indices (k, s) of their sites."""
 
     molecule: Molecule
     index: np.ndarray
@@ -122,7 +124,7 @@ class Kind(NamedTuple):
 
 
 def kinds_of(system: System) -> list[Kind]:
-    """The species of a system that have molecules, frozen ones apart."""
+    """The species of a system that have molecules, frozen and mobile ones separately."""
     first = np.flatnonzero(np.diff(system.sites.molecule, prepend=-1))
     found = []
     for k, molecule in enumerate(system.species):

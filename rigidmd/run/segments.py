@@ -1,4 +1,4 @@
-"""Stretches of a run: equal steps, where in them a run is, and what they cost."""
+"""Segments of a run: runs of equal steps, the position of a run in them, when observers are called, computing times."""
 
 from collections.abc import Callable, Sequence
 from operator import and_
@@ -9,40 +9,40 @@ from pydantic import Field, NonNegativeInt
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.run.observers import Observer, above_zero
 
-Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class Stretch(NamedTuple):
-    """A stretch of equal steps, or an action that takes no time."""
+class Segment(NamedTuple):
+    """Equal steps (a stage, or the time between two breaks of a body), or an action in which no time passes."""
 
-    row: Scheme | Solver
+    method: Scheme | Solver
     dt: float  # ps, or s for a single body
     steps: int
-    counted: int = 0  # steps before it from which observers count their intervals
-    act: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
+    steps_before: int = 0  # in the same count of the intervals of observers
+    action: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
 
 
-class Agenda:
-    """When observers look at the steps of a stretch. Steps are counted in it; a list has a value for each observer."""
+class ObservationSchedule:
+    """When observers are called in a segment, in which steps are counted; lists have a value for each observer."""
 
-    def __init__(self, observers: Sequence[Observer], stretch: Stretch):
-        self._last = stretch.steps
+    def __init__(self, observers: Sequence[Observer], segment: Segment):
+        self._last = segment.steps
         self._ends = [observer.ends for observer in observers]
         self._reads = [observer.reads_energies for observer in observers]
-        self._regular: list[tuple[int, int, int]] = []  # number of an observer, steps between two looks, steps before
+        self._regular: list[tuple[int, int, int]] = []  # index of an observer, steps between two calls, steps before
         for k, observer in enumerate(observers):
-            if observer.interval is not None:  # may continue from the stretch before
+            if observer.interval is not None:  # may continue from the segment before
                 interval = above_zero(observer.interval, f"the interval of {type(observer).__name__}")
-                self._regular.append((k, max(1, round(interval / stretch.dt)), stretch.counted))
+                self._regular.append((k, max(1, round(interval / segment.dt)), segment.steps_before))
             elif observer.steps:
                 self._regular.append((k, observer.steps, 0))
 
-    def next_look(self, done: int) -> int:
-        """Steps at the next look after so many."""
+    def next_observation(self, done: int) -> int:
+        """Number of steps at which the next observer is called, after `done` steps."""
         return min([self._last, *(done + every - (before + done) % every for _, every, before in self._regular)])
 
     def due(self, done: int) -> list[bool]:
-        """Who looks after so many steps."""
+        """Which observers are called after `done` steps."""
         due = self._ends.copy() if done == self._last else [False] * len(self._ends)
         for k, every, before in self._regular:
             if (before + done) % every == 0:
@@ -50,23 +50,23 @@ class Agenda:
         return due
 
     def reads_energies(self, due: list[bool]) -> bool:
-        """Whether one of those who look reads energies."""
+        """Whether one of the observers that are due reads energies."""
         return any(map(and_, self._reads, due))
 
 
-class Place(NamedTuple):
-    """Where in its stretches a run is."""
+class RunPosition(NamedTuple):
+    """The position of a run in its segments."""
 
-    stretch: NonNegativeInt = 0
-    first: NonNegativeInt = 0  # steps before the stretch
-    time: Seconds = 0.0  # of the stretches before, ps or s
-    computing: tuple[Seconds, ...] = ()  # seconds of the stretches before
-    seconds: Seconds = 0.0  # of computing in this one
+    segment: NonNegativeInt = 0
+    first: NonNegativeInt = 0  # steps before the segment
+    time: NonNegative = 0.0  # at the start of the segment, ps or s
+    computing: tuple[NonNegative, ...] = ()  # seconds, of the segments before
+    seconds: NonNegative = 0.0  # of computing in this segment
 
 
-class Costs(NamedTuple):
-    """Times of a run, in seconds."""
+class RunTimes(NamedTuple):
+    """Wall times of a run, in seconds."""
 
-    preparing: float  # compiling, relief of overlaps
-    wall: float  # stretches with observers and output
-    computing: Sequence[float]  # the steps of each stretch
+    preparing: float  # compiling, removal of overlaps
+    wall: float  # segments with observers and output
+    computing: Sequence[float]  # the steps of each segment

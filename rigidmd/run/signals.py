@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 
 @contextlib.contextmanager
-def handled(handler: Callable[[int], None], *numbers: int) -> Iterator[None]:
+def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[None]:
     """Within it these signals call a function with their number."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -22,13 +22,13 @@ def handled(handler: Callable[[int], None], *numbers: int) -> Iterator[None]:
             signal.signal(number, earlier)
 
 
-def ending_signals() -> list[int]:
+def stop_signals() -> list[int]:
     """The signals that end runs: Ctrl-C, and SIGTERM unless the program has its own way to end."""
     return [signal.SIGINT, *([signal.SIGTERM] if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else [])]
 
 
 #: Seconds until Ctrl-C is tried again that came where Python ignores exceptions.
-AGAIN = 0.05
+RETRY_DELAY = 0.05
 
 
 @contextlib.contextmanager
@@ -37,8 +37,8 @@ def interruptible() -> Iterator[None]:
 
     Raises KeyboardInterrupt, at the end if it did not before.
     """
-    has_own_way = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-    if has_own_way or threading.current_thread() is not threading.main_thread():
+    has_handler = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    if has_handler or threading.current_thread() is not threading.main_thread():
         yield
         return
     pressed, again, ignored = False, [], sys.unraisablehook
@@ -52,12 +52,12 @@ def interruptible() -> Iterator[None]:
         if unraisable.exc_type is not KeyboardInterrupt:
             ignored(unraisable)
             return
-        again.append(threading.Timer(AGAIN, _thread.interrupt_main))
+        again.append(threading.Timer(RETRY_DELAY, _thread.interrupt_main))
         again[-1].start()
 
     sys.unraisablehook = try_again
     try:
-        with handled(interrupt, signal.SIGINT):
+        with signal_handler(interrupt, signal.SIGINT):
             try:
                 yield
             finally:

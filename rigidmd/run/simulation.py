@@ -1,4 +1,4 @@
-"""The one loop of runs, for molecules and single bodies. All steps between two looks of observers are compiled."""
+"""The loop of all runs, of molecules and single bodies: steps are compiled, observers are called between them."""
 
 import contextlib
 import os
@@ -18,8 +18,8 @@ import numpy as np
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.integrators import SCHEMES
-from rigidmd.core.process import ONE_AT_A_TIME
-from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.process import PROCESS_LOCK
+from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.protocol import Engine, Halted
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SimulationError
@@ -37,16 +37,15 @@ from rigidmd.io.folder import (
     never_began,
 )
 from rigidmd.io.progress import Spot, announce, is_shown, progress_of
-from rigidmd.run.checkpoints import PIECE, Keeper, checked_walltime
-from rigidmd.run.moment import Moment
-from rigidmd.run.observers import Observer
+from rigidmd.run.checkpoints import SEGMENT_SECONDS, CheckpointSchedule, checked_walltime
+from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
 from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.report import write_summary
 from rigidmd.run.results import Results
-from rigidmd.run.resume import changed_since, fitting, read_as
-from rigidmd.run.segments import Agenda, Costs, Place, Stretch
-from rigidmd.run.signals import ending_signals, handled, interruptible
+from rigidmd.run.resume import as_checkpoint_errors, describe_changes, read_as
+from rigidmd.run.segments import ObservationSchedule, RunPosition, RunTimes, Segment
+from rigidmd.run.signals import interruptible, signal_handler, stop_signals
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
@@ -62,10 +61,10 @@ else:
     Base = ABC
 
 
-def _named(own: Sequence[Observer], of_user: Sequence[Observer]) -> dict[str, Observer]:
-    """Observers by the names under which a checkpoint keeps what they remember: class, and number in its class."""
+def _observers_by_name(default: Sequence[Observer], user: Sequence[Observer]) -> dict[str, Observer]:
+    """Observers by the names under which a checkpoint has their data: class, and number in its class."""
     found: dict[str, Observer] = {}
-    for start, observers in (("", own), (USER, of_user)):
+    for start, observers in (("", default), (USER, user)):
         count: Counter[str] = Counter()
         for observer in observers:
             kind = type(observer).__name__
@@ -74,7 +73,7 @@ def _named(own: Sequence[Observer], of_user: Sequence[Observer]) -> dict[str, Ob
     return found
 
 
-#: Begins the names of the user's observers.
+#: Prefix of the names of user observers.
 USER = "user-"
 
 
@@ -94,14 +93,13 @@ class Simulation(Displayed, Base):
     scene : the scene
     folder : folder for the files; None writes nothing and keeps the frames in memory
     force : replace an earlier run in that folder
-    observers : your own, called between steps: `Every`, `LivePlot`, any `Observer`
-    say : called with a sentence before something that takes a moment (compiling, relieving). Default: it is shown where
-        progress is
+    observers : user-defined, called between steps: `Every`, `LivePlot`, any `Observer`
+    say : called with a sentence before something slow (compiling, pilot runs). Default: printed with the progress
     warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's `warnings`
-    resume : go on from the last checkpoint in the folder, to the same bits; begin if the folder is empty or absent
-    walltime : seconds from now after which the run has to have ended; it stops shortly before, with a checkpoint
-    forces : for molecules, forces of your own: see `MolecularSimulation`
-    thermostat : for molecules, a thermostat of your own
+    resume : continue from the last checkpoint in the folder, to the same bits; begin if the folder is empty or absent
+    walltime : seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
+    forces : for molecules, user-defined forces: see `MolecularSimulation`
+    thermostat : for molecules, a user-defined thermostat
     applied : for a single body, forces from Python functions: see `BodySimulation`
     """
 
@@ -146,52 +144,52 @@ class Simulation(Displayed, Base):
         self.folder = None if folder is None else Path(folder).absolute()  # a callback may change the directory
         self._force = force
         self._observers = [observers] if isinstance(observers, Observer) else list(observers)
-        if strange := [one for one in self._observers if not isinstance(one, Observer)]:
+        if wrong := [value for value in self._observers if not isinstance(value, Observer)]:
             raise TypeError(
-                f"{strange[0]!r:.60} is no observer; of a function make one: rigidmd.Every(interval, function)"
+                f"{wrong[0]!r:.60} is not an observer; rigidmd.Every(interval, function) makes one of a function"
             )
-        self._own_say = say
+        self._user_say = say
         self._progress: bool | None = None
         self._spot = Spot()
         self._warn = warn
         self._warnings: list[str] = []
-        self._issued: list[str] = []  # those of this process
+        self._issued: list[str] = []  # by this process
         self._interrupted = False
         self._failed_before: list[Observer] = []
         self._error: Exception | None = None  # of an observer
         self._signal: int | None = None
         self._resume = resume
         self._deadline = None if walltime is None else clock.monotonic() + checked_walltime(walltime)
-        self._keeper = Keeper(None, False, None)  # before a run
-        self._process: int | None = None  # that runs it
+        self._checkpoints = CheckpointSchedule(None, False, None)  # replaced at the start of a run
+        self._process: int | None = None  # its number, during a run
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self._told}>"
+        return f"<{type(self).__name__} {self._summary_line}>"
 
     def path(self, file: str) -> Path:
-        """A file in the folder of the run. Raises ValueError if it has none."""
+        """Path of a file in the folder of the run. Raises ValueError without a folder."""
         if self.folder is None:
             raise ValueError(f"this run has no folder for {file}")
         return self.folder / file
 
     @property
-    def _told(self) -> str:
+    def _summary_line(self) -> str:
         where = "results stay in memory" if self.folder is None else f"writes to {self.folder}"
         return f"{self.introduction().splitlines()[0]}; {where}"
 
     def run(self, progress: bool | None = None) -> Results:
-        """Run all stretches. Raises OutputError before anything is computed, SimulationError if a run has to stop,
+        """Run all segments. Raises OutputError (before anything is computed), SimulationError if the run has to stop,
         CheckpointError if it cannot be resumed.
 
-        progress : show progress: a bar on a terminal or in a notebook, elsewhere a line every 30 s on standard error;
-            default: only in notebooks
+        progress : whether to show progress: as a bar on a terminal or in a notebook, elsewhere as a line every 30 s on
+            standard error; default: only in notebooks
         """
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
         if self._process is not None:
-            raise RuntimeError("this simulation is running already; its own observers cannot run it again")
+            raise RuntimeError("this simulation is running already; its observers cannot run it again")
         with contextlib.ExitStack() as stack:
             kept, stays = None, False
             self._progress, self._spot, self._process = progress, Spot(), os.getpid()
@@ -200,43 +198,43 @@ class Simulation(Displayed, Base):
                 stack.callback(self._if_not_forked, (lock := FolderLock(self.folder)).release)
                 lock.take()
                 if self._resume:
-                    kept, stays = self._kept()
+                    kept, stays = self._read_checkpoint()
                 if not stays:
                     check_folder(self.folder, self._force, inputs)
             self._interrupted, self._signal, self._out_of_time = False, None, False
             self._failed_before, self._error = [], None
             scene = cast(MolecularScene | BodyScene, self.scene)
-            self._keeper = Keeper(self.folder, scene.output.checkpoint_minutes, self._deadline)
+            self._checkpoints = CheckpointSchedule(self.folder, scene.output.checkpoint_minutes, self._deadline)
             if hasattr(signal, "SIGUSR1"):
-                stack.enter_context(handled(self.ask_for_checkpoint, signal.SIGUSR1))
+                stack.enter_context(signal_handler(self.ask_for_checkpoint, signal.SIGUSR1))
             self._warnings.clear()
             self._issued.clear()
             self._inputs = input_digests(self.scene)
             self._reset()
             began = clock.perf_counter()
-            place, changed = None, None
+            position, changed = None, None
             if kept is not None:
-                with fitting(self.folder):
-                    self._recall(kept)
-                    place = self._place_of(kept)
-                    changed = changed_since(kept.told["with"])
-            named = _named(self._own_observers(), self._observers)
+                with as_checkpoint_errors(self.folder):
+                    self._restore(kept)
+                    position = self._checked_position(kept)
+                    changed = describe_changes(kept.told["with"])
+            named = _observers_by_name(self._default_observers(), self._observers)
             observers = list(named.values())
             names = [name for observer in observers for name in observer.files()]
-            names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self._keeper.keeps else [])]
+            names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self._checkpoints.writes else [])]
             if self.folder is not None:
                 if stays:
                     check_names(self.folder, names)
                 else:
                     check_folder(self.folder, self._force, inputs, names)
             if kept is None:
-                with interruptible(), ONE_AT_A_TIME:  # of several runs one compiles, and the others read what it made
+                with interruptible(), PROCESS_LOCK:  # of several runs one compiles, and the others read its cache
                     self._prepare()
             prepared = clock.perf_counter() - began
             for observer in observers:
                 stack.push(partial(self._close, observer))
-            if kept is not None:  # first all that may refuse it, then the first change of a file
-                with fitting(self.folder):
+            if kept is not None:  # all checks come before the first change of a file
+                with as_checkpoint_errors(self.folder):
                     for name, observer in named.items():
                         if name.startswith(USER) and name not in kept.told["of"]:
                             observer.begin(self)
@@ -244,13 +242,13 @@ class Simulation(Displayed, Base):
                             observer.resume(self, kept.of(name))
                 if changed is not None:
                     self.note(changed)
-                self._say(f"continuing from step {self.state.step[NOW]}")
+                self._announce(f"continuing from step {self.state.step[NOW]}")
             if self.folder is not None:
                 if stays:
                     continue_folder(self.folder, names)
                 else:
                     make_folder(self.folder, self._force, names, inputs, lock)
-            stack.enter_context(handled(self._stop_at_next_look, *ending_signals()))
+            stack.enter_context(signal_handler(self._stop_at_next_observation, *stop_signals()))
             for observer in observers:
                 if kept is None:
                     observer.begin(self)
@@ -258,12 +256,12 @@ class Simulation(Displayed, Base):
                     observer.cut()
             try:
                 began = clock.perf_counter()
-                computing = self._run_stretches(named, progress, place)
-                return self._finished(observers, Costs(prepared, clock.perf_counter() - began, computing))
+                computing = self._run_segments(named, progress, position)
+                return self._finish(observers, RunTimes(prepared, clock.perf_counter() - began, computing))
             except (SimulationError, OutputError) as error:
                 self._check_process()
                 raise self._failed(error, observers) from None
-            except Exception as error:  # of a force, or of an observer, after which all files are complete
+            except Exception as error:  # of a user force, or of an observer, after which all files are complete
                 if error is not self._error and os.getpid() == self._process:
                     for observer in observers:
                         with contextlib.suppress(Exception):  # the first error is the one to report
@@ -271,34 +269,32 @@ class Simulation(Displayed, Base):
                 raise
 
     def _if_not_forked(self, function: Callable[[], object]) -> None:
-        """Call a function unless this is a forked process: files, their buffers and locks are those of the first."""
+        """Call a function unless this is a forked process: files and locks belong to the process that was forked."""
         if os.getpid() == self._process:
             function()
 
     def _close(self, observer: Observer, kind: Any, error: BaseException | None, trace: Any) -> None:
-        """Close the files of an observer; an error before is the one to report."""
+        """Close the files of an observer; of two errors the earlier one is reported."""
         with contextlib.suppress(*([] if error is None else [OutputError])):
             self._if_not_forked(observer.close)
 
     def _check_process(self) -> None:
         if os.getpid() != self._process:
-            raise OutputError(
-                "a forked process cannot continue the run: its files are those of the process that began it"
-            )
+            raise OutputError("a forked process cannot continue the run: the files belong to the process that began it")
 
-    def _finished(self, observers: list[Observer], costs: Costs) -> Results:
+    def _finish(self, observers: list[Observer], times: RunTimes) -> Results:
         """The results, with all files written. Raises OutputError."""
         results = Results(self.system, self.state, self._samples())
         results.interrupted, results.signal = self._interrupted, self._signal
         results.out_of_time = self._out_of_time
-        results.summary = provenance(self.scene, self.threads, self._inputs, self.made_by) | self._summary(
-            results.samples, costs
+        results.summary = provenance(self.scene, self.threads, self._inputs, self.engine_version) | self._summary(
+            results.samples, times
         )
         noted = len(self._warnings)
         for draws in (False, True):  # results first, pictures after
             for observer in observers:
                 if observer.draws == draws:
-                    self._let(observer, observer.end, self, results)
+                    self._call_observer(observer, observer.end, self, results)
             files = [*results.files, *([self.path(SUMMARY)] if self.folder is not None else [])]
             results.summary["notes"] += self._warnings[noted:]
             noted = len(self._warnings)
@@ -315,9 +311,9 @@ class Simulation(Displayed, Base):
     system: "System | BodySystem"
     engine: Engine
     threads: int
-    stretch: Stretch  # the present one
+    segment: Segment  # the present one
     time_unit = ""
-    made_by = "rigidmd"  # what moves the bodies
+    engine_version = "rigidmd"
 
     @abstractmethod
     def introduction(self) -> str:
@@ -337,44 +333,44 @@ class Simulation(Displayed, Base):
 
     @abstractmethod
     def _durations(self) -> list[float]:
-        """Durations of the stretches, ps or s; 0 of those without steps."""
+        """Durations of the segments, ps or s; 0 without steps."""
 
     @abstractmethod
-    def _enter(self, k: int) -> Stretch:
-        """Prepare stretch k and return it."""
+    def _enter_segment(self, k: int) -> Segment:
+        """Prepare segment k and return it."""
 
     @abstractmethod
-    def _reenter(self, k: int) -> Stretch:
-        """Return stretch k again, in which the run goes on."""
+    def _reenter_segment(self, k: int) -> Segment:
+        """Return segment k, in which the run is resumed."""
 
     @abstractmethod
-    def _memory(self) -> dict[str, Any]:
-        """What `_recall` needs besides the state and the engine's memory, as JSON has it."""
+    def _resume_json(self) -> dict[str, Any]:
+        """The data that `_restore` needs besides the state and the engine's memory, as JSON values."""
 
     @abstractmethod
-    def _recall(self, kept: Checkpoint) -> None:
-        """Return to a checkpoint, in place of `_prepare`. Raises CheckpointError if it is of another scene, and
-        ValueError if it is none that a run writes."""
+    def _restore(self, kept: Checkpoint) -> None:
+        """Return to a checkpoint, instead of `_prepare`. Raises CheckpointError if it is of another scene, ValueError if
+        no run can have written it."""
 
-    def _place_of(self, kept: Checkpoint) -> Place:
-        """The place of a checkpoint. What follows from the scene and the state must be so. Raises ValueError."""
-        place, state = read_as(Place, kept.told["place"]), self.state
-        if place.stretch >= len(self._durations()) or len(place.computing) != place.stretch:
-            raise ValueError(f"it is of stage {place.stretch} of {len(self._durations())}")
+    def _checked_position(self, kept: Checkpoint) -> RunPosition:
+        """The position of a checkpoint, compared with the scene and the state. Raises ValueError."""
+        position, state = read_as(RunPosition, kept.told["position"]), self.state
+        if position.segment >= len(self._durations()) or len(position.computing) != position.segment:
+            raise ValueError(f"it is of stage {position.segment} of {len(self._durations())}")
         first, time = 0, 0.0
-        for k in range(place.stretch):
-            before = self._reenter(k)
+        for k in range(position.segment):
+            before = self._reenter_segment(k)
             first, time = first + before.steps, time + before.steps * before.dt
-        stretch = self._reenter(place.stretch)
+        segment = self._reenter_segment(position.segment)
         step, done = state.step.tolist(), int(state.step[NOW]) - first
-        if place.first != first or step[ORIGIN] != first or not 0 <= done <= stretch.steps:
-            raise ValueError(f"step {step[NOW]} is not in a stage of {stretch.steps} steps after {place.first}")
+        if position.first != first or step[ORIGIN] != first or not 0 <= done <= segment.steps:
+            raise ValueError(f"step {step[NOW]} is not in a stage of {segment.steps} steps after {position.first}")
         now, origin = state.time.tolist()
-        if not (isclose(origin, time, abs_tol=1e-6 * stretch.dt) and place.time == time):
+        if not (isclose(origin, time, abs_tol=1e-6 * segment.dt) and position.time == time):
             raise ValueError(f"its stage began at {origin:g} {self.time_unit}, not at {time:g} {self.time_unit}")
-        if now != origin + done * stretch.dt:
+        if now != origin + done * segment.dt:
             raise ValueError(f"step {step[NOW]} is not at {now:g} {self.time_unit}")
-        return place
+        return position
 
     def _is_replaced(self, moment: Moment) -> bool:
         """Whether the present moment is followed by another one of the same time."""
@@ -385,11 +381,11 @@ class Simulation(Displayed, Base):
         return self.state.is_finite
 
     @abstractmethod
-    def _look(self, moment: Moment) -> Any:
-        """The observation at a moment, in internal units; observers see its `reading` if it has one."""
+    def _observe(self, moment: Moment) -> Any:
+        """The observation at a moment, in internal units; observers get its `reading` if it has one."""
 
     @abstractmethod
-    def _own_observers(self) -> list[Observer]:
+    def _default_observers(self) -> list[Observer]:
         """The observers that sample, check and write."""
 
     @abstractmethod
@@ -397,7 +393,7 @@ class Simulation(Displayed, Base):
         """The samples of the run."""
 
     @abstractmethod
-    def _summary(self, samples: Any, costs: Costs) -> dict[str, Any]:
+    def _summary(self, samples: Any, times: RunTimes) -> dict[str, Any]:
         """The summary."""
 
     @abstractmethod
@@ -408,10 +404,10 @@ class Simulation(Displayed, Base):
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""
 
-    def _say(self, sentence: str) -> None:
-        """Announce something that takes a moment."""
-        if self._own_say is not None:
-            self._own_say(sentence)
+    def _announce(self, sentence: str) -> None:
+        """Print a sentence before something slow."""
+        if self._user_say is not None:
+            self._user_say(sentence)
         elif is_shown(self._progress):
             announce(sentence, self._spot)
 
@@ -430,123 +426,129 @@ class Simulation(Displayed, Base):
     def _failed(self, error: SimulationError | OutputError, observers: list[Observer]) -> RigidMDError:
         """The error with its step, time and explanation."""
         time, origin = self.state.time
-        step = int(self.state.step[ORIGIN]) + round((time - origin) / self.stretch.dt)
+        step = int(self.state.step[ORIGIN]) + round((time - origin) / self.segment.dt)
         where = f"stopped at step {step} ({time:g} {self.time_unit}): "
         if isinstance(error, OutputError):
-            return OutputError(f"{where}{error}{self._last_chance()}")
+            return OutputError(f"{where}{error}{self._describe_resume()}")
         saved = "".join(observer.failed(self) for observer in observers)
         return SimulationError(f"{where}{self._explain(error)}{saved}")
 
-    def _last_chance(self) -> str:
-        """What a run that could not write can be resumed from."""
+    def _describe_resume(self) -> str:
+        """How to resume a run that could not write, if it has a checkpoint."""
         kept = [name for name in (CHECKPOINT, PREVIOUS) if self.folder is not None and self.path(name).is_file()]
-        return f". Make room and go on from the last checkpoint: rigidmd resume {self.folder}" if kept else ""
+        return f". Free disk space and resume from the last checkpoint: rigidmd resume {self.folder}" if kept else ""
 
-    def _kept(self) -> tuple[Checkpoint | None, bool]:
-        """The checkpoint to go on from, None if the run has to begin, and whether the files of the folder stay."""
+    def _read_checkpoint(self) -> tuple[Checkpoint | None, bool]:
+        """The checkpoint to resume from, None if the run has to begin, and whether the files of the folder stay."""
         folder = cast(Path, self.folder)
         if is_empty(folder) or never_began(folder):
-            self._say(f"{folder} holds no run yet: beginning it")
+            self._announce(f"{folder} holds no run yet: beginning it")
             return None, not is_empty(folder)
-        kept, faults = latest(folder)
-        for fault in faults:
-            self._warn(f"{fault}. The checkpoint before it is used")
+        kept, problems = latest(folder)
+        for problem in problems:
+            self._warn(f"{problem}. The checkpoint before it is used")
         return kept, True
 
-    def _checkpoint(self, observers: Mapping[str, Observer], place: Place) -> None:
-        """Write a checkpoint of a place, if the run keeps any and arrays can hold all that there is."""
-        if not self._keeper.keeps or self._error is not None or (memory := self.engine.memory()) is None:
-            return  # a run that resumes after an error calls the observer again
+    def _checkpoint(self, observers: Mapping[str, Observer], position: RunPosition) -> None:
+        """Write a checkpoint of a position, if the run has checkpoints and its engine can give its memory as arrays."""
+        if not self._checkpoints.writes or self._error is not None or (memory := self.engine.memory()) is None:
+            return  # after an error a run that resumes calls the observer again
         of, arrays = {}, {}
         for owner, observer in observers.items():
-            of[owner], own = observer.memory()
-            arrays |= {f"{owner}/{name}": array for name, array in own.items()}
-        arrays |= {f"state/{name}": array for name, array in self.state._asdict().items()}
+            of[owner], kept = observer.memory()
+            arrays |= {f"{owner}/{name}": array for name, array in kept.items()}
+        arrays |= {f"state/{name}": array for name, array in zip(STORED_NAMES, self.state, strict=True)}
         arrays |= {f"engine/{name}": array for name, array in memory.items()}
-        told = {"with": computed_with(), "place": place._asdict(), "run": self._memory(), "of": of}
-        self._keeper.keep(Checkpoint(told, arrays), (place.stretch, int(self.state.step[NOW]), place.seconds > 0))
+        told = {"with": computed_with(), "position": position._asdict(), "run": self._resume_json(), "of": of}
+        self._checkpoints.write_once(
+            Checkpoint(told, arrays), (position.segment, int(self.state.step[NOW]), position.seconds > 0)
+        )
 
-    def _run_stretches(
-        self, named: Mapping[str, Observer], progress: bool | None, begun: Place | None = None
+    def _run_segments(
+        self, named: Mapping[str, Observer], progress: bool | None, begun: RunPosition | None = None
     ) -> Sequence[float]:
-        """Advance through all stretches, from the place of a checkpoint on; seconds of computing in each."""
-        place, observers = begun or Place(), list(named.values())
+        """Advance through all segments, or from the position of a checkpoint on; seconds of computing in each."""
+        position, observers = begun or RunPosition(), list(named.values())
         durations = self._durations()
-        self.stretch = Stretch(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first stretch
+        self.segment = Segment(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first segment
         whole = sum(durations)
         with progress_of(whole, self.time_unit, progress if whole > 0 else False, self._spot) as bar:
-            for k in range(place.stretch, len(durations)):
-                if resumed := begun is not None and k == begun.stretch:
-                    self.stretch = stretch = self._reenter(k)
-                    done = int(self.state.step[NOW]) - place.first
-                    bar.skip(place.time + done * stretch.dt)
+            for k in range(position.segment, len(durations)):
+                if resumed := begun is not None and k == begun.segment:
+                    self.segment = segment = self._reenter_segment(k)
+                    done = int(self.state.step[NOW]) - position.first
+                    bar.skip(position.time + done * segment.dt)
                 else:
-                    self.stretch = stretch = self._enter(k)
-                    place = place._replace(stretch=k, first=int(self.state.step[NOW]), seconds=0.0)
+                    self.segment = segment = self._enter_segment(k)
+                    position = position._replace(segment=k, first=int(self.state.step[NOW]), seconds=0.0)
                     done = 0
                 if k == 0 and not resumed:
-                    self._show(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
-                    self._checkpoint(named, place)
-                agenda = Agenda(observers, stretch)
-                if stretch.act is not None:
+                    self._notify(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
+                    self._checkpoint(named, position)
+                agenda = ObservationSchedule(observers, segment)
+                if segment.action is not None:
                     began = clock.perf_counter()
-                    stretch.act(progress)
-                    place = place._replace(seconds=clock.perf_counter() - began)
+                    segment.action(progress)
+                    position = position._replace(seconds=clock.perf_counter() - began)
                     due = [observer.interval is not None or observer.ends for observer in observers]
-                    self._show(observers, Moment(self, place.first, place.time, k), due)
+                    self._notify(observers, Moment(self, position.first, position.time, k), due)
                 shown, pace = None, inf
                 bar.unpause()
-                while done < stretch.steps and not self._interrupted:
-                    to = agenda.next_look(done)
+                while done < segment.steps and not self._interrupted:
+                    to = agenda.next_observation(done)
                     if pace > 0:
-                        to = min(to, done + max(1, int(PIECE / pace)))  # the first step alone: it may take long
+                        to = min(
+                            to, done + max(1, int(SEGMENT_SECONDS / pace))
+                        )  # the first step alone, as it may be slow
                     before, shown = shown, agenda.due(to)
                     looked = agenda.reads_energies(shown)
                     began = clock.perf_counter()
                     try:
-                        self.engine.advance(self.state, stretch.row, stretch.dt, place.first + to, looked)
+                        self.engine.advance(self.state, segment.method, segment.dt, position.first + to, looked)
                     except Halted:
                         shown = before
                         break
                     seconds = clock.perf_counter() - began
                     pace = seconds / (to - done)
-                    place = place._replace(seconds=place.seconds + seconds)
+                    position = position._replace(seconds=position.seconds + seconds)
                     if not self._is_finite():
                         raise NotFiniteError(self.state)
-                    advance, done = stretch.dt * (to - done), to
-                    self._show(observers, self._moment(place, done), shown)
+                    advance, done = segment.dt * (to - done), to
+                    self._notify(observers, self._moment(position, done), shown)
                     bar.update(advance)
-                    if not self._must_end() and done < stretch.steps and self._keeper.is_due:
-                        self._checkpoint(named, place)
-                if not (stretch.act is not None and self._interrupted):
-                    self._checkpoint(named, place)
-                if done < stretch.steps and shown is not None:  # looks that a run without a stop does not have
+                    if not self._must_end() and done < segment.steps and self._checkpoints.is_due:
+                        self._checkpoint(named, position)
+                if not (segment.action is not None and self._interrupted):
+                    self._checkpoint(named, position)
+                if done < segment.steps and shown is not None:  # only a run that stops here calls these observers
                     due = [observer.ends and not seen for observer, seen in zip(observers, shown, strict=True)]
-                    self._show(observers, self._moment(place, done), due)
-                place = place._replace(time=place.time + done * stretch.dt, computing=(*place.computing, place.seconds))
+                    self._notify(observers, self._moment(position, done), due)
+                position = position._replace(
+                    time=position.time + done * segment.dt, computing=(*position.computing, position.seconds)
+                )
                 if self._interrupted:
                     break
-        return place.computing
+        return position.computing
 
-    def _moment(self, place: Place, done: int) -> Moment:
-        """The moment after so many steps of the present stretch."""
-        return Moment(self, place.first + done, place.time + done * self.stretch.dt, place.stretch)
+    def _moment(self, position: RunPosition, done: int) -> Moment:
+        """The moment after `done` steps of the present segment."""
+        return Moment(self, position.first + done, position.time + done * self.segment.dt, position.segment)
 
-    def _show(self, observers: list[Observer], moment: Moment, due: list[bool]) -> None:
+    def _notify(self, observers: list[Observer], moment: Moment, due: list[bool]) -> None:
         for observer, now in zip(observers, due, strict=True):
             if now and not (observer.once and self._is_replaced(moment)):
-                self._let(observer, observer.see, moment)
+                self._call_observer(observer, observer.see, moment)
         self._check_process()
 
-    def _let(self, observer: Observer, act: Callable[..., None], *given: Any) -> None:
-        """Let an observer act, unless it has failed before. Its error ends the run, which raises it when all files are
-        complete; an error of a picture is noted and ends nothing. Raises errors of this package but at the end."""
+    def _call_observer(self, observer: Observer, method: Callable[..., None], *arguments: Any) -> None:
+        """Call a method of an observer, unless the observer has failed before. Its error ends the run, which raises it
+        when all files are complete; an error of a figure becomes a note. `see` may raise the errors of this package."""
         if observer in self._failed_before:
             return
         try:
-            act(*given)
+            method(*arguments)
         except Exception as error:  # a user's observer may raise anything
-            if isinstance(error, RigidMDError) and act == observer.see:
+            if isinstance(error, RigidMDError) and method == observer.see:
                 raise
             self._failed_before.append(observer)
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -557,28 +559,28 @@ class Simulation(Displayed, Base):
             self._interrupted, self._error = True, self._error or error
 
     def _must_end(self) -> bool:
-        """Whether the run has been asked to end, or its time is up."""
-        if not self._interrupted and self._keeper.time_is_up:
+        """Whether the run has to end, by a signal or because its time is up."""
+        if not self._interrupted and self._checkpoints.time_is_up:
             self._interrupted = self._out_of_time = True
         return self._interrupted
 
     def ask_for_checkpoint(self, number: int | None = None) -> None:
-        """Write a checkpoint at the next look. number : of the signal that asks for it"""
-        self._keeper.asked = True
+        """Write a checkpoint at the next observation. number : of the signal that requests it"""
+        self._checkpoints.requested = True
 
-    def _stop_at_next_look(self, number: int) -> None:
-        """End the run at the next look with everything saved; a second Ctrl-C ends it at once."""
+    def _stop_at_next_observation(self, number: int) -> None:
+        """End the run at the next observation, with all files; a second Ctrl-C ends it at once."""
         if self._interrupted and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.stop(number)
 
     def stop(self, number: int | None = None) -> None:
-        """End the run at its next look, with everything saved. number : of the signal that asks for it
+        """End the run at its next observation, with all files. Observers and other threads may call it.
 
-        An observer may call it, and any thread.
+        number : of the signal that requests it
         """
         self._signal = self._signal or number
         self._interrupted = True
 
     def take_threads(self, count: int) -> None:
-        """Let runs compute with so many threads. Results do not depend on it; a single body always takes one."""
+        """Set the number of threads. Results do not depend on it; a single body always has one."""

@@ -1,69 +1,79 @@
-"""The summary of a run: one dictionary with units in its keys."""
+"""The summary of a run, of molecules or of a single body: one dictionary with units in its keys, and its notes."""
 
 from collections import Counter
 from collections.abc import Sequence
 from math import isnan, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.drift import OF_ENERGY, slope
-from rigidmd.core.state import TAKEN, State
-from rigidmd.core.statistics import mean, with_error
+from rigidmd.core.state import REMOVED, State
+from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean, slope
+from rigidmd.engines.body_motion import Motion
+from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Sample, Samples
 from rigidmd.engines.system import System
-from rigidmd.run.minimum import Minimum, minimum_figures
-from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
+from rigidmd.run.segments import RunTimes
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
-#: Figures of a stage that a minimisation does not have.
-OF_MOTION = (
+#: Keys of a stage that are None for a minimisation.
+MOTION_KEYS = (
     "integrator", "timestep_fs", "steps_per_s", "ns_per_day", "temperature_K", "temperature_error_K",
     "temperature_translation_K", "temperature_rotation_K", "temperature_translation_unbiased_K",
     "temperature_rotation_unbiased_K", "pressure_error_bar", "drift_kJ_mol_ns_per_molecule",
     "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
     "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
 )  # fmt: skip
-#: Notes on the second half of a stage, of LEAST samples and where an effect exceeds SURE standard errors: drift of the
-#: conserved energy (kT/ns per degree of freedom) that has added up to ADDED kT per degree of freedom; error of the
-#: temperatures from the step, and difference of those of translation and rotation, as fractions.
-DRIFTS, ADDED, HEATS, DIFFER, SURE, LEAST = 0.1, 1e-3, 0.01, 0.01, 4.0, 20
-#: Largest fraction of the translational temperature in a common drift of all molecules without a note; where the total
-#: momentum is thermal, its largest kinetic energy in kT, which one run in two million exceeds.
-SHOWS, THERMAL = 1e-4, 16.0
+#: The second half of a stage has notes if it has so many samples, on effects larger than so many standard errors.
+MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
+#: Drift of the conserved energy per degree of freedom, kT/ns, and its sum over the time, kT.
+DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
+#: Error of the temperature by the step, and difference of T_trans and T_rot, as fractions.
+HEATING_LIMIT, DIFFERENCE_LIMIT = 0.01, 0.01
+#: Largest fraction of T_trans in a common drift of all molecules without a note. Where the total momentum is thermal:
+#: its largest kinetic energy in kT, which one run in two million exceeds.
+COMMON_DRIFT_LIMIT, THERMAL_LIMIT = 1e-4, 16.0
 MOTIONS = ("translation", "rotation")
-#: Growth of the estimated error of Coulomb forces that is told.
-COARSER = 1.5
+#: Growth of the estimated error of Coulomb forces that has a note.
+ERROR_GROWTH_LIMIT = 1.5
+#: Larger relative errors of the energy of a body have a note: the motion is then wrong.
+LARGE_ENERGY_ERROR = 1e-3
+
+
+class Minimum(NamedTuple):
+    """The result of a minimisation; u, Å, ps."""
+
+    converged: bool
+    ended_by: str  # reason for its end if it has not converged, else empty
+    iterations: int
+    overlap_steps: int  # of steepest descent that removed overlaps before the iterations
+    energy_before: float  # potential energy at the start
+    energy_after: float  # at the end
+    force: float  # largest force on a molecule that is not frozen
+    torque: float  # largest torque about a principal axis
+    pressure: tuple[float, ...] | None  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
+    deviation: float | None  # largest deviation from the pressure asked for; None if the cell does not relax
 
 
 def summarise(
-    system: System,
-    samples: Samples,
-    state: State,
-    relief_steps: int,
-    preparing: float,
-    wall: float,
-    computing: Sequence[float],
-    interrupted: bool,
-    choices: dict[int, str],
-    stable: dict[int, float],
-    moves: dict[int, tuple[int, int]],
-    minima: dict[int, Minimum],
+    system: System, samples: Samples, state: State, overlap_steps: int, times: RunTimes, interrupted: bool,
+    choices: dict[int, str], stable: dict[int, float], moves: dict[int, tuple[int, int]], minima: dict[int, Minimum],
     warnings: list[str],
-) -> dict:
-    """The summary of a run but for what it was computed with; times in s: preparing (compiling, relief), wall (stages
-    with output), computing (steps).
+) -> dict:  # fmt: skip
+    """The summary of a run of molecules, without its `provenance`. Dictionaries have the indices of stages.
 
-    choices : choice and reason for stages that left their integrator open
-    stable : the longest stable step (ps) of stages, as estimated at their start
-    moves : of stages with a box that moves, how many moves were tried and accepted
-    minima : results of the stages that are minimisations
+    overlap_steps : of the removal of overlaps; choices : choice and reason where the integrator was open
+    stable : the longest stable step (ps), as estimated at the start of the stage
+    moves : trial moves of the box, tried and accepted; minima : results of minimisations
     """
     scene = system.scene
     last = samples.row(-1)
     stages = [
         (
-            _stage(system, samples, k, computing[k], moves.get(k, (0, 0)))
+            _stage(system, samples, k, times.computing[k], moves.get(k, (0, 0)))
             if k not in minima
-            else _minimised(system, samples, k, computing[k], minima[k])
+            else _minimised(system, samples, k, times.computing[k], minima[k])
         )
         | {
             "choice": _choice(system, samples.of_stage(k), k, choices.get(k)),
@@ -83,45 +93,53 @@ def summarise(
         "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
-        "relief_steps": relief_steps,
-        "preparing_s": preparing,
-        "wall_s": wall,
+        "relief_steps": overlap_steps,
+        "preparing_s": times.preparing,
+        "wall_s": times.wall,
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
         "momentum_u_A_ps": last.momentum,
         "momentum_relative": _relative_momentum(system, state, last.momentum),
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
         "own_forces": dict(system.user_terms),
-        "momentum_removed": _removed(system, state),
+        "momentum_removed": _momentum_removed(system, state),
         "stages": stages,
         "notes": [
             *system.notes,
-            *_drifting(system, state, last),
-            *outgrown_sums(system, state),
-            *(doubt for k in range(len(computing)) if k not in minima for doubt in _doubts(system, samples, k)),
+            *_common_drift_notes(system, state, last),
+            *ewald_error_notes(system, state),
+            *(
+                n
+                for k in range(len(times.computing))
+                if k not in minima
+                for n in _notes_on_averages(system, samples, k)
+            ),
             *warnings,
         ],
     }
 
 
 def _choice(system: System, samples: Samples, k: int, text: str | None) -> str | None:
-    """The choice for a stage; one for an error of the energy with the error that the stage has."""
+    """The text of the choice for a stage; where it was for an error of the energy, also the error that was reached."""
     thermal = BOLTZMANN / KJ_PER_MOL * (mean(samples["temperature"])[0] or 0.0) * system.freedom_in(k).total
-    if text is None or OF_ENERGY not in text or len(samples) < 2 or thermal == 0:
+    if text is None or ENERGY_ERROR not in text or len(samples) < 2 or thermal == 0:
         return text
     rms, time = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal, samples["time"]
     return f"{text}. In the {time[-1] - time[0]:.4g} ps that ran it was {rms:.1e}"
 
 
-def _removed(system: System, state: State) -> dict | None:
-    """Energy removed with the total momentum in the whole run; None without such removals."""
+def _momentum_removed(system: System, state: State) -> dict | None:
+    """Energy removed with the total momentum in the whole run; None if none is removed."""
     if system.removes_momentum_every is None:
         return None
-    return {"interval_ps": system.removes_momentum_every, "energy_kJ_mol": -float(state.books[TAKEN]) / KJ_PER_MOL}
+    return {
+        "interval_ps": system.removes_momentum_every,
+        "energy_kJ_mol": -float(state.energy_ledger[REMOVED]) / KJ_PER_MOL,
+    }
 
 
-def _drifting(system: System, state: State, last: Sample) -> list[str]:
-    """A note if the molecules drift together: with a momentum that is conserved, whose degrees of freedom are not
-    counted, and shows in the temperatures; or with one that is not, and exceeds what is thermal."""
+def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]:
+    """A note if the molecules drift together: if a conserved momentum, whose degrees of freedom are not counted, shows in
+    the temperatures, or if one that is not conserved exceeds a thermal one."""
     if not system.freedom.translation or not last.temperature_translation > 0:
         return []
     mass = system.model.mass[system.model.species]
@@ -129,26 +147,26 @@ def _drifting(system: System, state: State, last: Sample) -> list[str]:
     together = f"the molecules drift together with |P| = {momentum:.3g} u Å/ps"
     energy = momentum**2 / (2 * float(mass.sum()) * BOLTZMANN)  # K
     if not system.keeps_momentum_in(last.stage):
-        if energy <= THERMAL * last.temperature_translation:
+        if energy <= THERMAL_LIMIT * last.temperature_translation:
             return []
         usual = sqrt(3 * float(mass.sum()) * BOLTZMANN * last.temperature_translation)
         return [f"{together}, where thermal motion has {usual:.3g}: the thermostat has not stopped it yet; run longer"]
     gain = 2 * energy / system.freedom.translation
-    if gain <= SHOWS * last.temperature_translation:
+    if gain <= COMMON_DRIFT_LIMIT * last.temperature_translation:
         return []
     return [
         f"{together}, which adds {gain:.2g} K to T_trans; run.remove_momentum_interval_ps removes the total momentum"
     ]
 
 
-def outgrown_sums(system: System, state: State) -> list[str]:
-    """A note if the box has grown or shrunk until waves or grid of the start no longer give the accuracy asked for."""
+def ewald_error_notes(system: System, state: State) -> list[str]:
+    """A note if the box has grown or shrunk until the k-vectors or grid of the start miss the accuracy of the scene."""
     if system.force_error is None or not any(stage.changes_box for stage in system.scene.stages):
         return []
     from rigidmd.run.force_errors import estimated_error  # SciPy is for such runs only
 
     now = estimated_error(system, state.cell)
-    if now <= COARSER * system.force_error:
+    if now <= ERROR_GROWTH_LIMIT * system.force_error:
         return []
     before, after = (f"{error / COULOMB:.2g}" for error in (system.force_error, now))
     return [
@@ -157,22 +175,22 @@ def outgrown_sums(system: System, state: State) -> list[str]:
     ]
 
 
-def _doubts(system: System, samples: Samples, k: int) -> list[str]:
-    """What shows that the averages of stage k are wrong, in its second half: energy that drifts, temperatures that the
-    step changes or that differ.
+def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
+    """Notes on signs in the second half of stage k that its averages are wrong: energy that drifts, temperatures that
+    are changed by the step or that differ.
 
-    A thermostat hides the energy that a long step adds: it takes it out again, faster from some motions than from
-    others, and by the temperatures at the steps, which are not those of the ensemble.
+    A thermostat hides the energy that a long step adds: it removes this energy, faster from some motions than from
+    others, and by the temperatures at the steps, which are not the temperatures of the ensemble.
     """
-    own = samples.of_stage(k)
-    half = len(own) // 2
-    if len(own) - half < LEAST:
+    of_stage = samples.of_stage(k)
+    half = len(of_stage) // 2
+    if len(of_stage) - half < MIN_SAMPLES:
         return []
-    time, drift, whole = (own[name][half:] for name in ("time", "drift", "temperature"))
+    time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
     found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
-    limit = max(DRIFTS / 1000, ADDED / (time[-1] - time[0])) * thermal  # kJ/mol/ps
-    if thermal > 0 and abs(line.value) > limit + SURE * line.error:
+    limit = max(DRIFT_LIMIT / 1000, DRIFT_SUM_LIMIT / (time[-1] - time[0])) * thermal  # kJ/mol/ps
+    if thermal > 0 and abs(line.value) > limit + STANDARD_ERRORS * line.error:
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
         smooth = "" if system.scene.forces.truncation == "smooth_switch" else " or truncation = 'smooth_switch'"
         hides = "; the thermostat hides this and leaves temperatures wrong" if stage.has_thermostat else ""
@@ -183,28 +201,28 @@ def _doubts(system: System, samples: Samples, k: int) -> list[str]:
         )
     if not stage.has_thermostat:
         return found
-    moving, turning = pair = [own[f"temperature_{motion}"][half:] for motion in MOTIONS]
-    unbiased, corrected = [own[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS], ""
+    moving, rotating = pair = [of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS]
+    unbiased, corrected = [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS], ""
     if any(np.isfinite(values).all() for values in unbiased):
-        (moving, turning), corrected = unbiased, " without the error of the step"
+        (moving, rotating), corrected = unbiased, " without the error of the step"
         both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
         right = sum((values * count for values, count in both if count), np.zeros(len(whole))) / freedom.total
-        heat, doubt = mean(right - whole)
-        if heat is not None and doubt is not None and abs(heat) > max(HEATS * level, SURE * doubt):
+        heat, error = mean(right - whole)
+        if heat is not None and error is not None and abs(heat) > max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
             parts = [f"{name} {v.mean():.4g}" for name, v in zip(("T_trans", "T_rot"), pair, strict=True) if v[0] > 0]
-            shorter = stage.timestep_fs * sqrt(HEATS * level / 2 / abs(heat))
+            shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heat))
             found.append(
                 f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules {abs(heat):.2g} K too "
                 f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is "
-                f"{with_error(float(right.mean()), mean(right)[1])} K; at the steps it is {level:.4g} K, "
-                f"{', '.join(parts)}, by which the thermostat goes. Try timestep_fs = {shorter:.1g}, or integrator = "
+                f"{format_with_error(float(right.mean()), mean(right)[1])} K; at the steps it is {level:.4g} K, "
+                f"{', '.join(parts)}, which the thermostat controls. Try timestep_fs = {shorter:.1g}, or integrator = "
                 "'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
             )
-    apart, error = mean(moving - turning)
-    if apart is not None and error is not None and abs(apart) > max(DIFFER * level, SURE * error):
+    gap, error = mean(moving - rotating)
+    if gap is not None and error is not None and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error):
         found.append(
-            f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {turning.mean():.4g} K"
-            f"{corrected}, {abs(apart):.2g} ± {error:.1g} K apart, which sampling does not explain: timestep_fs is too "
+            f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {rotating.mean():.4g} K"
+            f"{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K that sampling does not explain: timestep_fs is too "
             "long, or translation and rotation exchange energy too slowly for this stage. Try a shorter step, or run "
             "longer before means are taken"
         )
@@ -220,16 +238,16 @@ def _relative_momentum(system: System, state: State, momentum: float) -> float:
 
 def _stage(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
     """Values of one stage. Its drift is counted from the last sample before it."""
-    own, before = samples.of_stage(k), samples.of_stage(k - 1)
-    first = before.row(-1) if len(before) else own.row(0)
+    of_stage, before = samples.of_stage(k), samples.of_stage(k - 1)
+    first = before.row(-1) if len(before) else of_stage.row(0)
     stage = system.scene.stages[k]
     n = len(system.model.species)
-    steps = own.row(-1).step - first.step
+    steps = of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
-    time, drift = own["time"], own["drift"]
+    time, drift = of_stage["time"], of_stage["drift"]
     line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
-    mean_t, error_t = mean(own["temperature"])
-    spread = float(own["kinetic"].std())
+    mean_t, error_t = mean(of_stage["temperature"])
+    spread = float(of_stage["kinetic"].std())
     per_molecule = line.value * 1000 / n
     thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom_in(k).total
     per_kt = line.value * 1000 / thermal if thermal > 0 else None
@@ -246,34 +264,34 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
         "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
         "temperature_K": mean_t,
         "temperature_error_K": error_t,
-        "temperature_translation_K": mean(own["temperature_translation"])[0],
-        "temperature_rotation_K": mean(own["temperature_rotation"])[0],
-        "temperature_translation_unbiased_K": mean(own["temperature_translation_unbiased"])[0],
-        "temperature_rotation_unbiased_K": mean(own["temperature_rotation_unbiased"])[0],
-        "potential_kJ_mol_per_molecule": float(np.mean(own["potential"])) / n,
-        "pressure_bar": mean(own["pressure_bar"])[0],
-        "pressure_error_bar": mean(own["pressure_bar"])[1],
-        **(_of_box(own) if stage.has_barostat else {}),
+        "temperature_translation_K": mean(of_stage["temperature_translation"])[0],
+        "temperature_rotation_K": mean(of_stage["temperature_rotation"])[0],
+        "temperature_translation_unbiased_K": mean(of_stage["temperature_translation_unbiased"])[0],
+        "temperature_rotation_unbiased_K": mean(of_stage["temperature_rotation_unbiased"])[0],
+        "potential_kJ_mol_per_molecule": float(np.mean(of_stage["potential"])) / n,
+        "pressure_bar": mean(of_stage["pressure_bar"])[0],
+        "pressure_error_bar": mean(of_stage["pressure_bar"])[1],
+        **(_box_means(of_stage) if stage.has_barostat else {}),
         "moves_tried": moves[0],
         "moves_accepted": moves[1],
-        "drift_kJ_mol_ns_per_molecule": _known(per_molecule),
-        "drift_error_kJ_mol_ns_per_molecule": _known(line.error * 1000 / n),
-        "drift_kT_ns_per_degree_of_freedom": per_kt and _known(per_kt),
-        "drift_error_kT_ns_per_degree_of_freedom": error_kt and _known(error_kt),
-        "drift_over_kinetic_std": _known(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread)
+        "drift_kJ_mol_ns_per_molecule": _finite_or_none(per_molecule),
+        "drift_error_kJ_mol_ns_per_molecule": _finite_or_none(line.error * 1000 / n),
+        "drift_kT_ns_per_degree_of_freedom": per_kt and _finite_or_none(per_kt),
+        "drift_error_kT_ns_per_degree_of_freedom": error_kt and _finite_or_none(error_kt),
+        "drift_over_kinetic_std": _finite_or_none(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread)
         if spread
         else None,
-        "energy_rms_kJ_mol_per_molecule": _known(line.rms / n),
+        "energy_rms_kJ_mol_per_molecule": _finite_or_none(line.rms / n),
         "minimum": None,
     }
 
 
 def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
-    """Figures of a minimisation, at its end; None for those of OF_MOTION."""
+    """Values of a minimisation, at its end; None for MOTION_KEYS."""
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
-    own = samples.of_stage(k)
-    end = Samples(samples.stages, samples.user_terms, own.table()[-1:])
-    return dict.fromkeys(OF_MOTION) | {
+    of_stage = samples.of_stage(k)
+    end = Samples(samples.stages, samples.user_terms, of_stage.table()[-1:])
+    return dict.fromkeys(MOTION_KEYS) | {
         "name": stage.label,
         "ensemble": stage.ensemble,
         "steps": 0,
@@ -281,21 +299,103 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
         "computing_s": computing,
         "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
         "pressure_bar": figures["pressure_bar"],
-        **(_of_box(end) if stage.changes_box else {}),
+        **(_box_means(end) if stage.changes_box else {}),
         "moves_tried": 0,
         "moves_accepted": 0,
         "minimum": figures,
     }
 
 
-def _of_box(own: Samples) -> dict:
-    """Means of what a barostat changes, with their errors."""
+def _box_means(of_stage: Samples) -> dict:
+    """Means of density and edges of the box, with their errors."""
     found = {}
     for name, key in (("density", "density{}_g_cm3"), ("a", "a{}_A"), ("b", "b{}_A"), ("c", "c{}_A")):
-        value, error = mean(own[name])
+        value, error = mean(of_stage[name])
         found |= {key.format(""): value, key.format("_error"): error}
     return found
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return None if isnan(value) else float(value)
+
+
+def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
+    """The values of a minimum with units in their keys. Pressures are without the kinetic part; None without a box."""
+    pressure = None if found.pressure is None else np.array(found.pressure) / BAR
+    return {
+        "converged": found.converged,
+        "ended_by": found.ended_by or None,
+        "iterations": found.iterations,
+        "relief_steps": found.overlap_steps,
+        "energy_before_kJ_mol_per_molecule": found.energy_before / KJ_PER_MOL / molecules,
+        "energy_after_kJ_mol_per_molecule": found.energy_after / KJ_PER_MOL / molecules,
+        "largest_force_kJ_mol_A": found.force / KJ_PER_MOL,
+        "largest_torque_kJ_mol": found.torque / KJ_PER_MOL,
+        "pressure_bar": float(pressure[:3].mean()) if pressure is not None else None,
+        "pressure_tensor_bar": pressure.tolist() if pressure is not None else None,
+        "largest_pressure_deviation_bar": None if found.deviation is None else found.deviation / BAR,
+    }
+
+
+def describe_minimum(found: Minimum, stage: Stage) -> str:
+    """A warning for a minimisation that has not converged, with the largest force, torque and deviation."""
+    parts = [
+        ("force", found.force / KJ_PER_MOL, stage.force_limit_kJ_mol_A, "kJ/(mol Å)"),
+        ("torque", found.torque / KJ_PER_MOL, stage.torque_limit_kJ_mol, "kJ/mol"),
+    ]
+    if found.deviation is not None:
+        parts.append(("deviation of the pressure", found.deviation / BAR, stage.pressure_limit_bar, "bar"))
+    reached = ", ".join(f"{what} {value:.3g} (limit {limit:g}) {unit}" for what, value, limit, unit in parts)
+    return (
+        f"the minimisation has not converged after {found.iterations} iterations ({found.ended_by}): largest {reached}"
+    )
+
+
+def summarise_body(system: BodySystem, motion: Motion, planned: int, times: RunTimes, interrupted: bool) -> dict:
+    """The summary of a run of a single body, without its `provenance`. planned : steps of a run that ends in time"""
+    run, computing = system.scene.run, sum(times.computing)
+    end = float(motion["time"][-1])
+    steps = round(end / run.timestep_s) if interrupted else planned
+    return {
+        "interrupted": interrupted,
+        "kind": system.kind,
+        "pinned": not system.translates,
+        "degrees_of_freedom": system.degrees_of_freedom,
+        "mass_kg": system.mass,
+        "inertia_kg_m2": system.inertia.tolist(),
+        "integrator": run.integrator,
+        "formulation": getattr(system.method, "formulation", None),
+        "timestep_s": run.timestep_s,
+        "steps": steps,
+        "duration_s": end,
+        "samples": len(motion["time"]),
+        "preparing_s": times.preparing,
+        "wall_s": times.wall,
+        "computing_s": computing,
+        "steps_per_s": steps / computing if computing > 0 else None,
+        "energy_start_J": float(motion["energy"][0]),
+        "energy_end_J": float(motion["energy"][-1]),
+        "work_J": float(motion["work"][-1]),
+        "largest_relative_error": {name: float(np.abs(motion[f"{name}_error"]).max()) for name in motion.invariants},
+        "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.rotates else None,
+        "theta_range_deg": np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist()
+        if system.rotates
+        else None,
+        "trajectory_A_per_m": system.scale,
+        "notes": _body_notes(system, motion),
+    }
+
+
+def _body_notes(system: BodySystem, motion: Motion) -> list[str]:
+    notes = system.notes
+    if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
+        notes.append(
+            f"the energy is wrong by {error:.1e} of the largest kinetic energy: timestep_s is too long for this motion"
+        )
+    if system.rotates:
+        speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
+        if (speed[1:] * np.diff(motion["time"])).max(initial=0.0) > np.pi:
+            notes.append(
+                "the body rotates by more than 180° between samples; shorten output.interval_s to follow its angles"
+            )
+    return notes

@@ -8,11 +8,11 @@ from typing import cast
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.run.results import Results
-from rigidmd.run.signals import ending_signals, handled
+from rigidmd.run.signals import signal_handler, stop_signals
 from rigidmd.run.simulation import Simulation
 
 #: Seconds between two looks at who has asked to stop.
-TICK = 0.2
+POLL_INTERVAL = 0.2
 
 
 def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> list[Results | None]:
@@ -61,14 +61,14 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
             one.ask_for_checkpoint(number)
 
     with contextlib.ExitStack() as stack:
-        stack.enter_context(handled(stop, *ending_signals()))
+        stack.enter_context(signal_handler(stop, *stop_signals()))
         if hasattr(signal, "SIGUSR1"):
-            stack.enter_context(handled(ask_for_checkpoints, signal.SIGUSR1))
+            stack.enter_context(signal_handler(ask_for_checkpoints, signal.SIGUSR1))
         pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
         futures = [pool.submit(run, one) for one in simulations]
         running = set(futures)
         while running:
-            _, running = wait(running, TICK)
+            _, running = wait(running, POLL_INTERVAL)
             if asked:
                 stop_all()  # again and again: one that was just beginning did not hear it
     _raise_first([future.exception() for future in futures])

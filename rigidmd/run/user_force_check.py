@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 #: How far molecules are moved, in diameters of the smallest; a force is right if either step says so. Two, because a
 #: pair that crosses a cut-off at which the energy jumps spoils a difference.
-STEPS = (1e-4, 1e-5)
+STEP_FRACTIONS = (1e-4, 1e-5)
 #: A difference may be off by this much of the largest force, torque or virial of the term.
-WITHIN = 1e-4
+TOLERANCE = 1e-4
 #: Components of a strain that leave a lower triangular; the six that a box may have.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
 #: Rounding of an energy, in parts of its size.
@@ -30,7 +30,7 @@ ROUNDING = 1e-13
 def check_forces(system: "System", state: State) -> None:
     """Compare the user's own forces with their energies. Raises SceneError with the numbers of those that are wrong."""
     faults = []
-    for name in system.own:
+    for name in system.user_terms:
         engine = system.engine_of({name: system.terms[name]}, "double")
         energy = partial(_energy, engine, name)
         load, tallies = engine.evaluate(state)
@@ -39,8 +39,8 @@ def check_forces(system: "System", state: State) -> None:
             faults.append(f"{name}: its energy at the start is {tally.energy}")
             continue
         noise = ROUNDING * max(abs(tally.energy), np.abs(load.force).sum() * system.smallest_diameter)
-        found = _of_molecules(system, state, name, load, energy, noise)
-        found = found or _of_box(system, state, name, tally.virial, energy, noise)
+        found = _check_molecules(system, state, name, load, energy, noise)
+        found = found or _check_virial(system, state, name, tally.virial, energy, noise)
         faults += [found] if found else []
     if faults:
         raise SceneError(system.scene.source, faults)
@@ -50,7 +50,7 @@ def _energy(engine: Engine, name: str, state: State) -> float:
     return engine.evaluate(state)[1][name].energy
 
 
-def _of_molecules(
+def _check_molecules(
     system: "System", state: State, name: str, load: Load, energy: Callable[[State], float], noise: float
 ) -> str:
     """What is wrong with forces and torques on the two molecules with the largest and one with a middling one; empty if
@@ -72,11 +72,11 @@ def _of_molecules(
                 continue
             along /= np.linalg.norm(along)
             said, seen = float(acting[m] @ along), []
-            for share in STEPS:
+            for share in STEP_FRACTIONS:
                 step = share * (system.smallest_diameter if kind == "force" else 1.0)
                 sides = [energy(_moved(state, kind, m, sign * step * along)) for sign in (1, -1)]
                 seen.append((sides[1] - sides[0]) / (2 * step))
-                if abs(seen[-1] - said) <= WITHIN * size.max() + noise / step:
+                if abs(seen[-1] - said) <= TOLERANCE * size.max() + noise / step:
                     break
             else:
                 where = "the lab's axes" if kind == "force" else "the axes of its body"
@@ -98,11 +98,11 @@ def _moved(state: State, kind: str, m: int, by: np.ndarray) -> State:
     return moved
 
 
-def _of_box(
+def _check_virial(
     system: "System", state: State, name: str, virial: np.ndarray, energy: Callable[[State], float], noise: float
 ) -> str:
     """What is wrong with the virial, where there is a box to stretch; empty if nothing is."""
-    if state.volume == inf or name in system.tied_to_places:
+    if state.volume == inf or name in system.position_dependent:
         return ""
     size = max(float(np.abs(virial).sum()), noise)
     for i, j in COMPONENTS:
@@ -110,7 +110,7 @@ def _of_box(
         for step in (1e-5, 1e-6, 1e-7):
             ends = [energy(_strained(state, i, j, sign * step)) for sign in (1, -1)]
             seen.append((ends[1] - ends[0]) / (2 * step))
-            if abs(seen[-1] - said) <= WITHIN * max(size, abs(seen[-1])) + noise / step:
+            if abs(seen[-1] - said) <= TOLERANCE * max(size, abs(seen[-1])) + noise / step:
                 break
         else:
             break

@@ -34,11 +34,11 @@ from support import (
     blocks_of,
     call,
     call_blocks,
+    compute_site_positions,
     end_of_row,
-    farthest,
+    largest_displacement,
     no_load,
     packed,
-    place_sites,
 )
 
 from rigidmd import Scene, Simulation
@@ -47,7 +47,7 @@ STEP = 2e-3  # ps
 STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step
 SECONDS = 0.5  # for each measurement
 TIMES = 10  # that a kernel is called at once
-MESH = ("scale", "spread", "convolve", "back", "pull")  # tasks in blocks
+MESH = ("scale", "spread", "convolve", "back", "forces")  # tasks in blocks
 ENDINGS = ("shift", "switch", "smooth_switch")
 
 
@@ -68,7 +68,7 @@ def run_once(code, name, content, times):
 @njit
 def entries_that_matter(pairs):
     """Entries of the rows' shells that can hold a site inside the cut-off."""
-    found, moved = 0, farthest(pairs)
+    found, moved = 0, largest_displacement(pairs)
     clusters, per_cluster = pairs.clusters, len(pairs.row) * 4 // len(pairs.clusters.origin)
     for block in range(len(pairs.needed)):
         first = 0
@@ -94,9 +94,9 @@ def useful_pairs(term: PairWorkspace, state: State) -> int:
     """Pairs of sites of different molecules inside the cut-off."""
     edges, group = state.cell.diagonal(), term.pairs.group
     position = np.empty((len(group), 3))
-    place_sites(term.sites, state, position)
+    compute_site_positions(term.sites, state, position)
     tree = cKDTree(np.mod(position, edges) % edges, boxsize=edges)
-    found = tree.query_pairs(term.law.cutoff, output_type="ndarray")
+    found = tree.query_pairs(term.potential.cutoff, output_type="ndarray")
     return int((group[found[:, 0]] != group[found[:, 1]]).sum())
 
 
@@ -126,7 +126,7 @@ def measure(job: dict) -> list[dict]:
     for name, term in engine.workspaces.items():
         if isinstance(term, PairWorkspace):
             every = STEPS / max(1, builds_of(term) - builds[name])
-            found.append(common | {"kernel": f"{name}, {type(term.arranged).__name__}"} | of_pairs(term, state, every))
+            found.append(common | {"kernel": f"{name}, {type(term.slot_potential).__name__}"} | of_pairs(term, state, every))
         elif hasattr(term, "mesh"):
             found.append(common | {"kernel": name, "mesh": of_mesh(term)})
     return found
@@ -141,7 +141,7 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
     """Times of the kernels of a law between pairs, whose list is built anew every so many steps."""
     load = no_load(state)
     pairs, blocks = term.pairs, len(term.pairs.needed)
-    code, lists, content = term.code, term.list_code, (term.arranged, pairs, term.sums)
+    code, lists, content = term.code, term.list_code, (term.slot_potential, pairs, term.sums)
     placed, on_sites = (pairs, term.sites, state), (term.sites, state, load, term.forces_in_slots)
     lanes, useful = lanes_of(term), useful_pairs(term, state)
     forces = milliseconds(run_blocks, code, "forces", content, blocks)

@@ -293,7 +293,7 @@ def describe(work: Workload, folder: Path) -> Start:
     }
     potentials["RF without self"] = potentials["RF"] - own
     if work.pme:  # LAMMPS sums over k with the pairs inside molecules, and takes none of them out
-        alpha = build(Scene.from_dict(work.scene(), folder)).terms["coulomb_real"].law.alpha
+        alpha = build(Scene.from_dict(work.scene(), folder)).terms["coulomb_real"].potential.alpha
         inside = intramolecular_energy(species.charges * COULOMB_CHARGE, species.positions_body, alpha)
         potentials["DSF"] = potentials["RF"] - inside / KJ_PER_MOL
         sites["alpha"] = np.array(alpha)

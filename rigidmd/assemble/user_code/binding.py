@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
-from rigidmd.assemble.user_code.pair_potential import PairPotentialError, PairLaw, check_cutoff, pair_law
+from rigidmd.assemble.user_code.pair_potential import PairLaw, PairPotentialError, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.state import State
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
@@ -46,7 +46,7 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
         try:
             found.append(_custom(scene, entry, f"forces.custom.{k}"))
         except SceneError as error:
-            faults += [(entry.module, f"forces.custom.{k}: {fault}") for fault in error.faults]
+            faults += [(entry.module, f"forces.custom.{k}: {fault}") for fault in error.errors]
         except ValueError as error:
             faults.append((None, f"forces.custom.{k}: {error}"))
     if faults:  # of a file once
@@ -122,7 +122,7 @@ def user_terms(system: "System") -> UserTerms:
             if not isinstance(term, PairForces):
                 found.moves[:] |= changes_momentum(term)
         except (PairPotentialError, SceneError) as error:
-            faults += [f"{name}: {fault}" for fault in error.faults]
+            faults += [f"{name}: {fault}" for fault in error.errors]
             continue
         except (ValueError, UserForceError) as error:
             faults.append(f"{name}: {error}")
@@ -171,7 +171,7 @@ def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTupl
         except (Exception, SystemExit) as error:  # whatever a stranger's code raises
             raise ValueError(f"term(system) raised {describe_error(error)}") from error
     if isinstance(made, PairForces):  # of a law that is not a `PairLaw`
-        check_cutoff(made.law.cutoff, system)  # type: ignore[attr-defined]  # every law has a cut-off
+        check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every law has a cut-off
     if not (isinstance(made, PairForces) or type(made) in FORCES):
         raise ValueError(
             f"{made!r:.80} is no force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "

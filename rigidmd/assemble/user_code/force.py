@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError, describe_error
-from rigidmd.forces.fields.python_forces import PythonForcesWorkspace, PythonForces
+from rigidmd.forces.fields.python_forces import PythonForces, PythonForcesWorkspace
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:

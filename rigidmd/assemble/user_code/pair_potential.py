@@ -9,13 +9,20 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
-from rigidmd.forces.neighbors.sites import groups, sites_of
-from rigidmd.forces.potentials.custom import OwnLaw, tail_of
-from rigidmd.forces.potentials.formulas import DISTANCE, Formula, FormulaError, of_function, of_table, of_text
+from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
+from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
+from rigidmd.forces.potentials.formulas import (
+    DISTANCE,
+    Formula,
+    FormulaError,
+    formula_of_function,
+    formula_of_table,
+    formula_of_text,
+)
 from rigidmd.forces.potentials.lennard_jones import Tail
-from rigidmd.forces.potentials.truncation import NAMES, Name, ending, shape_of
-from rigidmd.scene.forces import MINIMUM_TOLERANCE, short_cutoff_note, default_switch_start
-from rigidmd.scene.models import Molecule, sites_named, gather_per_molecule
+from rigidmd.forces.potentials.truncation import TRUNCATIONS, TruncationName, truncation_of, truncation_terms
+from rigidmd.scene.forces import MINIMUM_TOLERANCE, default_switch_start, short_cutoff_note
+from rigidmd.scene.models import Molecule, gather_per_molecule, sites_named
 from rigidmd.scene.validation import did_you_mean
 
 if TYPE_CHECKING:
@@ -33,9 +40,9 @@ Columns = tuple[Sequence[float], Sequence[float]]
 class PairPotentialError(ValueError):
     """What is wrong with a pair law in a scene, as sentences."""
 
-    def __init__(self, *faults: str):
-        self.faults = list(faults)
-        super().__init__("; ".join(faults))
+    def __init__(self, *errors: str):
+        self.errors = list(errors)
+        super().__init__("; ".join(errors))
 
 
 @dataclass(frozen=True)
@@ -49,21 +56,21 @@ class PairLaw:
     sites: tuple[str, ...]
     pairs: Mapping[tuple[str, str], Parameters]
     mixing: Mapping[str, Rule]
-    truncation: Name | None
+    truncation: TruncationName | None
     cutoff_A: float | None
     switch_start_A: float | None
     name: str
-    of_function: Formula | None = field(default=None, repr=False)
+    formula_of_function: Formula | None = field(default=None, repr=False)
 
     def formula(self, cutoff: float) -> Formula:
         """The formula that it is compiled from. Raises LawError."""
         try:
             if self.table is not None:
-                return of_table(*self.table, cutoff)
+                return formula_of_table(*self.table, cutoff)
             if isinstance(self.energy, str):
-                return of_text(self.energy, self.constants)
-            assert self.of_function is not None  # a law has a text, a function or a table
-            return self.of_function
+                return formula_of_text(self.energy, self.constants)
+            assert self.formula_of_function is not None  # a law has a text, a function or a table
+            return self.formula_of_function
         except FormulaError as error:
             raise PairPotentialError(str(error)) from None
 
@@ -72,7 +79,7 @@ class PairLaw:
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
-        name: Name = self.truncation or forces.truncation
+        name: TruncationName = self.truncation or forces.truncation
         given = self.switch_start_A or (forces.switch_start_A if cutoff == system.cutoff else None)
         if self.switch_start_A is not None and "switch" not in name:
             raise PairPotentialError(f"switch_start_A would do nothing with truncation = {name!r}")
@@ -89,7 +96,7 @@ class PairLaw:
         sites = sites_of(index, offsets, system.model.inverse_inertia)
         numbers_of = [[kinds.number[entry] for entry in of if entry is not None] for of in kinds.of_species]
         kind = gather_per_molecule([np.array(own, int) for own in numbers_of], index)
-        shape = shape_of(name, cutoff, start)
+        shape = truncation_of(name, cutoff, start)
         count = len(kinds.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
         ends, acts = np.zeros((4, count, count)), np.zeros((count, count))
@@ -99,12 +106,12 @@ class PairLaw:
         for i, j, of_pair in kinds.pairs(faults):
             try:
                 numbers[:, i, j], radial = formula.numbers(of_pair), formula.radial(of_pair)
-                ends[:, i, j] = ending(name, shape, radial)
+                ends[:, i, j] = truncation_terms(name, shape, radial)
                 values = [] if cutoff == inf else [*radial(cutoff), *radial(0.9 * cutoff)]
                 if forces.tail_correction and formula.shared:
                     raise FormulaError("a table ends, and says nothing for forces.tail_correction")
                 if forces.tail_correction:
-                    part, pairs = tail_of(radial, ends[:, i, j], shape), float(members[i] * members[j])
+                    part, pairs = tail_of_pair(radial, ends[:, i, j], shape), float(members[i] * members[j])
                     pairs *= 1.0 if i == j else 2.0
                     beyond = Tail(beyond[0] + pairs * part[0], beyond[1] + pairs * part[1])
                 if not np.isfinite([*values, *numbers[:, i, j], *ends[:, i, j]]).all():
@@ -121,7 +128,7 @@ class PairLaw:
         if not acts.any():
             raise PairPotentialError("no pair of sites of the scene has parameters")
         first = np.argwhere(acts)[0]
-        law = OwnLaw(
+        law = CustomPotential(
             cutoff,
             shape,
             formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])),
@@ -133,7 +140,7 @@ class PairLaw:
         )
         frozen = (system.model.inverse_mass == 0)[index]
         return BoundPotential(
-            pair_forces(law, sites, groups(sites, frozen)),
+            pair_forces(law, sites, exclusion_groups(sites, frozen)),
             formula,
             beyond if forces.tail_correction else None,
             [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else [],
@@ -294,7 +301,7 @@ def pair_law(
     sites: Sequence[str] = (),
     pairs: Mapping[tuple[str, str], Any] | None = None,
     mixing: Mapping[str, Rule] | None = None,
-    truncation: Name | None = None,
+    truncation: TruncationName | None = None,
     cutoff_A: float | None = None,
     switch_start_A: float | None = None,
     name: str = "",
@@ -321,8 +328,8 @@ def pair_law(
     """
     if (energy is None) == (table is None):
         raise ValueError("a pair law needs an energy or a table")
-    if truncation is not None and truncation not in NAMES:
-        raise ValueError(f"truncation is {truncation!r}{did_you_mean(truncation, NAMES) or ''}; there are {', '.join(NAMES)}")
+    if truncation is not None and truncation not in TRUNCATIONS:
+        raise ValueError(f"truncation is {truncation!r}{did_you_mean(truncation, TRUNCATIONS) or ''}; there are {', '.join(TRUNCATIONS)}")
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
@@ -363,7 +370,7 @@ def pair_law(
         if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value > 0):
             raise ValueError(f"{key} is {value!r}, must be a number above 0")
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
-    formula = of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
+    formula = formula_of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
     return PairLaw(
         energy, table, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
         switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,

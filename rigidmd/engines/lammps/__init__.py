@@ -1,1 +1,1 @@
-"""The engine LAMMPS: runs on it, and files for it."""
+"""The engine that runs LAMMPS, and the export of files for LAMMPS."""

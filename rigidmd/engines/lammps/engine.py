@@ -18,7 +18,7 @@ from typing import IO, NamedTuple, cast
 import numpy as np
 
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
-from rigidmd.dynamics.step_loop import Model
+from rigidmd.dynamics.model import Model
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files as files
@@ -71,7 +71,7 @@ class LammpsEngine(ExternalEngine):
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         super().__init__(system, stage)
         self._styles = files.pair_styles(self._view)
-        self._movers = files.movers(self._view, stage)
+        self._fixes = files.fixes(self._view, stage)
         self._bodies = RigidBodies(system)
         self._process = Process(command(ranks))
         date, there = self._process.say(f'print "{FIGURES} $(version) $(extract_setting(world_size))"')
@@ -136,14 +136,14 @@ class LammpsEngine(ExternalEngine):
             f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
             *energies,
             "compute virial all pressure NULL pair kspace",
-            f"thermo_style custom step pe {'elong' if view.is_periodic_coulomb else ''} {columns} c_virial[*]",
-            *self._movers,
+            f"thermo_style custom step pe {'elong' if view.has_ewald_sum else ''} {columns} c_virial[*]",
+            *self._fixes,
             "run 0",
         )
         self._heat_offset = 0.0
         given = state.copy()
         self._receive(given)
-        self._heat_offset = float(state.books[HEAT] - given.books[HEAT])
+        self._heat_offset = float(state.energy_ledger[HEAT] - given.energy_ledger[HEAT])
         self._known_state = state.copy()
 
     def _receive(self, state: State) -> None:
@@ -152,7 +152,7 @@ class LammpsEngine(ExternalEngine):
         Raises NotFiniteError, SimulationError or EngineError.
         """
         view = self._view
-        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.is_periodic_coulomb else [])
+        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.has_ewald_sum else [])
         asked = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
         figures = self._process.say(
             f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
@@ -176,7 +176,7 @@ class LammpsEngine(ExternalEngine):
             put_in = 0.0
         else:
             put_in = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
-        state.books[HEAT] = self._heat_offset + put_in
+        state.energy_ledger[HEAT] = self._heat_offset + put_in
 
     def _virial(self, pressure: list[float], volume: float, position: np.ndarray, force: np.ndarray) -> np.ndarray:
         """The virial of molecules (3, 3), its symmetric part, from that of sites as a pressure xx yy zz xy xz yz."""
@@ -191,7 +191,7 @@ class LammpsEngine(ExternalEngine):
         view, found = self._view, {}
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # of LAMMPS' own constant
         names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
-        if view.is_periodic_coulomb:
+        if view.has_ewald_sum:
             alpha = not_none(view.system.scene.forces.ewald_alpha_per_A)
             even = background(float(charge.sum()) ** 2, alpha).strength / volume
             own = self_energy(charge, alpha)

@@ -12,9 +12,9 @@ from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula, table
-from rigidmd.engines.force_field import Portrait, strange
+from rigidmd.engines.force_field import ForceFieldView, unsupported_terms
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.forces.potentials.truncation import Plain
+from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, COULOMB, ENERGY_UNITS
 
@@ -55,23 +55,23 @@ class PairStyle(NamedTuple):
     modify: str = ""
 
 
-def faults(portrait: Portrait) -> list[str]:
+def unsupported_features(view: ForceFieldView) -> list[str]:
     """What of a scene LAMMPS cannot do, in words; empty if it can do all."""
-    scene = portrait.system.scene
-    found = [f"{what} is left to rigidmd" for what in strange(portrait.system)]
-    if portrait.has_waves and scene.forces.ewald_truncation == "shift":
+    scene = view.system.scene
+    found = [f"{what} is left to rigidmd" for what in unsupported_terms(view.system)]
+    if view.has_ewald_sum and scene.forces.ewald_truncation == "shift":
         found.append("forces.ewald_truncation = 'shift': LAMMPS has no shift of the real-space energy; take 'plain'")
     if scene.run.remove_momentum_interval_ps:
         found.append("run.remove_momentum_interval_ps: LAMMPS takes no momentum out of rigid bodies; leave it out")
     for k, stage in enumerate(scene.stages):
-        found += [f"stages.{k}.{fault}" for fault in _stage_faults(stage)]
-    mixed = portrait.is_body.any() and (~portrait.is_body & ~portrait.frozen).any()
+        found += [f"stages.{k}.{fault}" for fault in _unsupported_in_stage(stage)]
+    mixed = view.is_body.any() and (~view.is_body & ~view.frozen).any()
     if mixed and any(stage.has_barostat for stage in scene.stages):
         found.append("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them")
     return found
 
 
-def _stage_faults(stage: Stage) -> list[str]:
+def _unsupported_in_stage(stage: Stage) -> list[str]:
     if stage.is_minimisation:
         return []  # rigidmd itself minimises
     found, allowed = [], ("velocity_verlet",)
@@ -94,19 +94,19 @@ def _stage_faults(stage: Stage) -> list[str]:
     return found
 
 
-def write_data(path: Path, portrait: Portrait, state: State) -> None:
+def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     """The data file: box, masses, atoms with images, velocities. Site k of the system is atom k + 1."""
-    system = portrait.system
+    system = view.system
     position, velocity = system.site_positions(state), system.site_velocities(state)
     image = np.zeros(position.shape, int)
     lines = [
         f"{system.scene.name}, written by rigidmd",
         "",
         f"{len(position)} atoms",
-        f"{len(portrait.kinds)} atom types",
+        f"{len(view.kinds)} atom types",
         "",
     ]
-    if portrait.boxed:
+    if view.is_periodic:
         image = np.floor(position @ np.linalg.inv(state.cell)).astype(int)
         position = position - image @ state.cell
         low, high = np.zeros(3), state.cell.diagonal()
@@ -116,10 +116,10 @@ def write_data(path: Path, portrait: Portrait, state: State) -> None:
     else:
         lines += _bounds(position.min(axis=0) - 1, position.max(axis=0) + 1)
     lines += ["", "Masses", ""]
-    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(portrait.kinds)]
+    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(view.kinds)]
     lines += ["", "Atoms # full", ""]
-    charge = portrait.charge
-    rows = zip(system.sites.molecule + 1, portrait.kind + 1, charge, position, image, strict=True)
+    charge = view.charge
+    rows = zip(system.sites.molecule + 1, view.kind + 1, charge, position, image, strict=True)
     lines += [
         f"{i} {m} {k} {_n(q)} {_n(x)} {_n(y)} {_n(z)} {nx} {ny} {nz}"
         for i, (m, k, q, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1)
@@ -139,11 +139,11 @@ def _bounds(low: np.ndarray, high: np.ndarray) -> list[str]:
     return [f"{_n(a)} {_n(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
 
 
-def settings(portrait: Portrait, data: str = DATA) -> list[str]:
+def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     """Commands up to the system with its forces, without anything that moves it."""
-    system, forces = portrait.system, portrait.system.scene.forces
-    boundary = "p p p" if portrait.boxed else "s s s"
-    styles = pair_styles(portrait)
+    system, forces = view.system, view.system.scene.forces
+    boundary = "p p p" if view.is_periodic else "s s s"
+    styles = pair_styles(view)
     names = " ".join(f"{style.name} {style.arguments}" for style in styles) or f"zero {_cutoff(system.cutoff):g}"
     lines = ["units real", "atom_style full", f"boundary {boundary}"]
     lines += [f"pair_style {'hybrid/overlay ' if styles else ''}{names}", f"read_data {data}"]
@@ -151,33 +151,33 @@ def settings(portrait: Portrait, data: str = DATA) -> list[str]:
         which = called(styles, n)
         lines += [f"pair_coeff {i + 1} {j + 1} {which} {text}" for (i, j), text in style.coefficients.items()]
     touched = {pair for style in styles for pair in style.coefficients}
-    pairs = [(i, j) for i in range(len(portrait.kinds)) for j in range(i, len(portrait.kinds))]
+    pairs = [(i, j) for i in range(len(view.kinds)) for j in range(i, len(view.kinds))]
     if styles:
         lines += [f"pair_coeff {i + 1} {j + 1} none" for i, j in pairs if (i, j) not in touched]
     else:
         lines += ["pair_coeff * *"]
     lines += [style.modify for style in styles if style.modify]
-    if portrait.has_waves:
+    if view.has_ewald_sum:
         way = "pppm" if forces.electrostatics == "pme" else "ewald"
         lines += [
-            f"kspace_style {way} {accuracy(portrait):.3g}",
+            f"kspace_style {way} {accuracy(view):.3g}",
             f"kspace_modify gewald {_n(forces.ewald_alpha_per_A)}",
         ]
-    lines += [f"neighbor 2.0 {'bin' if portrait.boxed else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
+    lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
     lines += ["neigh_modify exclude molecule/intra all"]
-    points = ~portrait.is_body & ~portrait.frozen
-    for name, chosen in ((BODIES, portrait.is_body), (POINTS, points), (FROZEN, portrait.frozen)):
+    points = ~view.is_body & ~view.frozen
+    for name, chosen in ((BODIES, view.is_body), (POINTS, points), (FROZEN, view.frozen)):
         if chosen.any():
             lines += [f"group {name} molecule {_ranges(np.flatnonzero(chosen) + 1)}"]
-    if portrait.frozen.any():
+    if view.frozen.any():
         lines += [f"neigh_modify exclude group {FROZEN} {FROZEN}"]
     return lines
 
 
-def accuracy(portrait: Portrait) -> float:
+def accuracy(view: ForceFieldView) -> float:
     """rms error of the force on a site that the Ewald sum of the scene has, in units of LAMMPS' accuracy: of the force
     between two charges e at 1 Å."""
-    return float(portrait.system.force_error or 0.0) / COULOMB
+    return float(view.system.force_error or 0.0) / COULOMB
 
 
 def _cutoff(cutoff: float) -> float:
@@ -195,38 +195,38 @@ def _ranges(numbers: Iterable[int]) -> str:
     return " ".join(str(a) if a == b else f"{a}:{b}" for a, b in found)
 
 
-def pair_styles(portrait: Portrait) -> list[PairStyle]:
+def pair_styles(view: ForceFieldView) -> list[PairStyle]:
     """The pair styles that together are the pair laws of a system."""
-    return [style for style in (_lennard_jones(portrait), _coulomb(portrait)) if style is not None]
+    return [style for style in (_lennard_jones(view), _coulomb(view)) if style is not None]
 
 
-def _lennard_jones(portrait: Portrait) -> PairStyle | None:
-    law = portrait.lennard_jones
-    if law is None or not portrait.epsilon.any():
+def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
+    law = view.lennard_jones
+    if law is None or not view.epsilon.any():
         return None
-    name = STYLES[portrait.truncation] if law.cutoff < inf else "lj/cut"
-    pairs = [(i, j) for i, j in np.argwhere(portrait.epsilon > 0) if i <= j]
+    name = STYLES[view.truncation] if law.cutoff < inf else "lj/cut"
+    pairs = [(i, j) for i, j in np.argwhere(view.epsilon > 0) if i <= j]
     cutoff = _n(_cutoff(law.cutoff))
     if name == "table":
         formulas = {}
         for i, j in pairs:
-            six = float(portrait.sigma[i, j]) ** 6
-            c6 = 4 * float(portrait.epsilon[i, j]) * six
+            six = float(view.sigma[i, j]) ** 6
+            c6 = 4 * float(view.epsilon[i, j]) * six
             formulas[(i, j)] = lennard_jones_formula(law, c6 * six, c6, KCAL)
         return _tables("lj", formulas, cutoff)
     arguments = cutoff
-    if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.shape, Plain):
-        arguments = f"{_n(law.shape.start)} {cutoff}"
-    coefficients = {(i, j): f"{_n(portrait.epsilon[i, j] / KCAL)} {_n(portrait.sigma[i, j])}" for i, j in pairs}
-    shifts = f"pair_modify pair {name} shift yes" if portrait.truncation == "shift" and law.cutoff < inf else ""
+    if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.truncation, Unmodified):
+        arguments = f"{_n(law.truncation.start)} {cutoff}"
+    coefficients = {(i, j): f"{_n(view.epsilon[i, j] / KCAL)} {_n(view.sigma[i, j])}" for i, j in pairs}
+    shifts = f"pair_modify pair {name} shift yes" if view.truncation == "shift" and law.cutoff < inf else ""
     return PairStyle(name, arguments, coefficients, modify=shifts)
 
 
-def _coulomb(portrait: Portrait) -> PairStyle | None:
-    law = portrait.coulomb
+def _coulomb(view: ForceFieldView) -> PairStyle | None:
+    law = view.coulomb
     if law is None:
         return None
-    charge = [kind.charge for kind in portrait.kinds]
+    charge = [kind.charge for kind in view.kinds]
     charged = [k for k, q in enumerate(charge) if q != 0]
     pairs = [(i, j) for i in charged for j in charged if i <= j]
     cutoff = _n(_cutoff(law.cutoff))
@@ -253,10 +253,10 @@ def called(styles: list[PairStyle], n: int) -> str:
     return names[n] if names.count(names[n]) == 1 else f"{names[n]} {names[: n + 1].count(names[n])}"
 
 
-def write_tables(path: Path, portrait: Portrait) -> bool:
+def write_tables(path: Path, view: ForceFieldView) -> bool:
     """The tables of laws that LAMMPS has no style for; whether there are any."""
     parts = []
-    for style in pair_styles(portrait):
+    for style in pair_styles(view):
         for pair, formula in style.formulas.items():
             name, cutoff = style.coefficients[pair].split()[1:]
             if f"\n{name}\n" not in "".join(parts):
@@ -266,33 +266,33 @@ def write_tables(path: Path, portrait: Portrait) -> bool:
     return bool(parts)
 
 
-def movers(portrait: Portrait, k: int) -> list[str]:
+def fixes(view: ForceFieldView, k: int) -> list[str]:
     """The fixes of stage k, from which its motion follows."""
-    stage = portrait.system.scene.stages[k]
-    seed = (portrait.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
+    stage = view.system.scene.stages[k]
+    seed = (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
     lines = []
-    if portrait.is_body.any():
-        lines.append(f"fix {BODIES} {BODIES} {_of_bodies(portrait, stage, seed)}")
-    if (~portrait.is_body & ~portrait.frozen).any():
-        lines += _of_points(portrait, stage, seed, alone=not portrait.is_body.any())
+    if view.is_body.any():
+        lines.append(f"fix {BODIES} {BODIES} {_of_bodies(view, stage, seed)}")
+    if (~view.is_body & ~view.frozen).any():
+        lines += _of_points(view, stage, seed, alone=not view.is_body.any())
     return lines
 
 
-def _of_bodies(portrait: Portrait, stage: Stage, seed: int) -> str:
+def _of_bodies(view: ForceFieldView, stage: Stage, seed: int) -> str:
     if stage.is_minimisation or stage.ensemble == "nve":
         return "rigid/nve/small molecule"
     if stage.thermostat_kind == "langevin":
         return f"rigid/small molecule langevin {_langevin(stage, seed)}"
     if stage.ensemble == "nph":
-        return f"rigid/nph/small molecule {_box(portrait, stage)}"
+        return f"rigid/nph/small molecule {_box(view, stage)}"
     links = f"tparam {stage.nose_hoover_links} 1 5"
     if stage.ensemble == "npt":
-        box = _box(portrait, stage)
+        box = _box(view, stage)
         return f"rigid/npt/small molecule {_chain(stage)} {box} {links} pchain {stage.nose_hoover_links}"
     return f"rigid/nvt/small molecule {_chain(stage)} {links}"
 
 
-def _of_points(portrait: Portrait, stage: Stage, seed: int, alone: bool) -> list[str]:
+def _of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> list[str]:
     if stage.is_minimisation or stage.ensemble == "nve":
         return [f"fix {POINTS} {POINTS} nve"]
     if stage.thermostat_kind == "langevin":
@@ -303,7 +303,7 @@ def _of_points(portrait: Portrait, stage: Stage, seed: int, alone: bool) -> list
     if stage.has_barostat:
         kind = "npt" if stage.has_thermostat else "nph"
         bath = f"{_chain(stage)} " if stage.has_thermostat else ""
-        return [f"fix {POINTS} {POINTS} {kind} {bath}{_box(portrait, stage)}"]
+        return [f"fix {POINTS} {POINTS} {kind} {bath}{_box(view, stage)}"]
     return [f"fix {POINTS} {POINTS} nvt {_chain(stage)} tchain {stage.nose_hoover_links}"]
 
 
@@ -318,9 +318,9 @@ def _langevin(stage: Stage, seed: int) -> str:
     return f"{_n(first)} {_n(last)} {_n(1e3 / stage.frictions[0])} {seed}"
 
 
-def _box(portrait: Portrait, stage: Stage) -> str:
+def _box(view: ForceFieldView, stage: Stage) -> str:
     """Pressures, atm, less that of the tail correction, which the forces lack; and damping time, fs."""
-    tail, volume = portrait.system.tail, portrait.system.state.volume
+    tail, volume = view.system.tail, view.system.state.volume
     beyond = 0.0 if tail is None else tail.pressure(volume)
     first, last = ([(bar * BAR - beyond) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
     damping = 1e3 * stage.barostat_time
@@ -330,10 +330,10 @@ def _box(portrait: Portrait, stage: Stage) -> str:
     return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
 
 
-def _thermo(portrait: Portrait) -> list[str]:
+def _thermo(view: ForceFieldView) -> list[str]:
     """Columns of the log."""
     columns = "step time temp pe ke etotal press vol density"
-    constant = portrait.system.constants.get("coulomb_intramolecular")
+    constant = view.system.constants.get("coulomb_intramolecular")
     if constant is None:
         return [f"thermo_style custom {columns}"]
     return [
@@ -343,16 +343,16 @@ def _thermo(portrait: Portrait) -> list[str]:
     ]
 
 
-def input_script(portrait: Portrait) -> str:
+def input_script(view: ForceFieldView) -> str:
     """The whole run: settings, and every stage that is not a minimisation."""
-    system, output = portrait.system, portrait.system.scene.output
+    system, output = view.system, view.system.scene.output
     lines = [
         f"# {in_comment(system.scene.in_short)}",
         "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps",
         "",
         f"include {SETTINGS}",
         "",
-        *_thermo(portrait),
+        *_thermo(view),
         "thermo_modify format float %.10g flush yes",
     ]
     for k, stage in enumerate(system.scene.stages):
@@ -360,7 +360,7 @@ def input_script(portrait: Portrait) -> str:
             continue
         every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
         frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
-        fixes = movers(portrait, k)
+        fixes = fixes(view, k)
         lines += [
             "",
             f"# {in_comment(stage.label)}: {stage.duration:g} ps",
@@ -376,10 +376,10 @@ def input_script(portrait: Portrait) -> str:
     return "\n".join([*lines, "", "write_data final.lammps", ""])
 
 
-def write_lammps(folder: Path, portrait: Portrait, state: State) -> list[str]:
+def write_lammps(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     """All files of a run in a folder. Returns their names. Raises OutputError."""
-    write_data(folder / DATA, portrait, state)
-    for name, text in ((SETTINGS, "\n".join([*settings(portrait), ""])), (INPUT, input_script(portrait))):
+    write_data(folder / DATA, view, state)
+    for name, text in ((SETTINGS, "\n".join([*settings(view), ""])), (INPUT, input_script(view))):
         write_text(folder / name, text)
-    tables = [TABLES] if write_tables(folder / TABLES, portrait) else []
+    tables = [TABLES] if write_tables(folder / TABLES, view) else []
     return [INPUT, SETTINGS, DATA, *tables]

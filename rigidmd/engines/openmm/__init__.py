@@ -1,1 +1,1 @@
-"""The engine OpenMM: runs on it, and files for it."""
+"""The engine that runs OpenMM, and the export of files for OpenMM."""

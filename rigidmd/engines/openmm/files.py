@@ -1,16 +1,19 @@
-"""A folder with which OpenMM runs a system by itself: system, integrators and state as XML, and a script."""
+"""Export to OpenMM: a folder with system, integrators and state as XML, and a script that runs the stages."""
 
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidmd.core.files import whole_file, write_text
+from rigidmd.core.files import atomic_file, write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
-from rigidmd.engines.force_field import Portrait
-from rigidmd.engines.openmm import system as parts
-from rigidmd.engines.openmm.engine import Held, held
-from rigidmd.engines.openmm.stages import KICK, MOVES, TOLERANCES, integrator_of, movers
+from rigidmd.engines.force_field import ForceFieldView
+from rigidmd.engines.openmm.engine import ParticleModel, particle_model
+from rigidmd.engines.openmm.stages import KICK, MOVES, TOLERANCES, extra_forces, integrator_of
+from rigidmd.engines.openmm.system import (
+    NM,
+    library,
+)
 
 if TYPE_CHECKING:
     from openmm.app import Topology
@@ -83,13 +86,13 @@ with open("final.xml", "w") as file:
 '''
 
 
-def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
-    """Write the folder for a system that begins at a state; the names of its files. Raises EngineError if OpenMM is not
-    here, and OutputError."""
-    mm = parts.library()
-    holds = held(portrait)
-    position, velocity = (values * parts.NM for values in holds.positions(state))
-    made = holds.made(state, apart=False)
+def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
+    """Write the folder for a system that begins at a state, and return the names of its files. Raises OutputError, and
+    EngineError if OpenMM is not installed."""
+    mm = library()
+    model = particle_model(view)
+    position, velocity = (values * NM for values in model.positions(state))
+    made = model.made(state, separate=False)
     context = mm.Context(made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
     context.setPositions(position)
     context.setVelocities(velocity)
@@ -98,15 +101,15 @@ def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
         STATE: mm.XmlSerializer.serialize(context.getState(positions=True, velocities=True)),
     }
     rows = []
-    scene = portrait.system.scene
+    scene = view.system.scene
     for k, stage in enumerate(scene.stages):
         if stage.is_minimisation:
             continue
         number = f"_{len(rows) + 1}" if rows else ""
         file = f"integrator{number}.xml"
-        text[file] = mm.XmlSerializer.serialize(integrator_of(portrait, k, TOLERANCES["mixed"]))
+        text[file] = mm.XmlSerializer.serialize(integrator_of(view, k, TOLERANCES["mixed"]))
         others = []
-        for n, other in enumerate(movers(portrait, k)):
+        for n, other in enumerate(extra_forces(view, k)):
             others.append(f"besides{number}_{n + 1}.xml")
             text[others[-1]] = mm.XmlSerializer.serialize(other)
         every, frame = (
@@ -119,19 +122,19 @@ def write_openmm(folder: Path, portrait: Portrait, state: State) -> list[str]:
     text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda found: values[found[1]], TEXT)
     for name, content in text.items():
         write_text(folder / name, content)
-    with whole_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        _write_pdb(file, _topology(holds), position)
+    with atomic_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        _write_pdb(file, _topology(model), position)
     return [*text, TOPOLOGY]
 
 
-def _topology(holds: Held) -> "Topology":
-    """Names of all particles; mass points that are no sites are called P1, P2, ..."""
+def _topology(model: ParticleModel) -> "Topology":
+    """Names of all particles. Mass points without a site are called P1, P2, ..."""
     from openmm import app
 
-    made, system = app.Topology(), holds.drawn.system
+    made, system = app.Topology(), model.view.system
     chain = made.addChain()
     index = system.model.species
-    count = [*holds.particles.first, len(holds.particles.mass)]
+    count = [*model.particles.first, len(model.particles.mass)]
     for n, k in enumerate(index):
         m = system.species[k]
         residue = made.addResidue(str(m.residue_names[0]), chain)
@@ -146,4 +149,4 @@ def _topology(holds: Held) -> "Topology":
 def _write_pdb(file, topology: "Topology", position) -> None:
     from openmm import Vec3, app
 
-    app.PDBFile.writeFile(topology, [Vec3(*row) for row in (position / parts.NM).tolist()], file)  # Å
+    app.PDBFile.writeFile(topology, [Vec3(*row) for row in (position / NM).tolist()], file)  # Å

@@ -3,49 +3,57 @@
 from math import pi
 from typing import Any
 
-from rigidmd.engines.force_field import Portrait
-from rigidmd.engines.openmm import system as parts
+from rigidmd.engines.force_field import ForceFieldView
+from rigidmd.engines.openmm.system import (
+    COULOMB_PAIRS,
+    LENNARD_JONES,
+    RECIPROCAL,
+    STEP_COULOMB,
+    STEP_LENNARD_JONES,
+    TAIL,
+    library,
+)
 from rigidmd.scene.stage import Stage
 
-#: Variables of the integrator for velocity Verlet: part of a kick, and whether positions move.
+#: Variables of the velocity Verlet integrator: fraction of a kick, and whether positions move.
 KICK, MOVES = "kick", "moves"
-#: One more than the largest seed of random numbers; OpenMM chooses one itself for 0.
+#: One more than the largest seed. OpenMM chooses a seed itself for 0.
 SEEDS = 2**31 - 1
-#: Steps between removals of the total momentum that never come.
+#: Interval, in steps, of a removal of momentum that never happens.
 NEVER = 2**31 - 1
-#: Relative tolerance of kept distances where they are computed in double precision, mixed and single.
+#: Relative tolerance of constrained distances by precision.
 TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 
 
 def tolerance(platform: str, properties: dict[str, str]) -> float:
-    """Of kept distances, relative. The platforms Reference and CPU keep them in double precision."""
+    """Relative tolerance of constrained distances. The platforms Reference and CPU use double precision."""
     return TOLERANCES[properties.get("Precision", "double")]
 
 
-def integrator_of(portrait: Portrait, k: int, kept_to: float) -> Any:
-    """The integrator of stage k: of a minimisation that which conserves the energy."""
-    mm, stage = parts.library(), portrait.system.scene.stages[k]
+def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> Any:
+    """The integrator of stage k. A minimisation gets velocity Verlet."""
+    mm, stage = library(), view.system.scene.stages[k]
     dt = stage.timestep_fs * 1e-3
     if stage.thermostat_kind == "langevin":
         made = mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)
-        made.setRandomNumberSeed(_seed(portrait, k))
+        made.setRandomNumberSeed(_seed(view, k))
     elif stage.thermostat_kind == "nose_hoover":
-        # a chain's frequency is that of its mass, 2 pi over the period of a scene
+        # OpenMM has the angular frequency of a chain, a scene its period
         made = mm.NoseHooverIntegrator(
             stage.temperatures[0], 2 * pi / stage.thermostat_time, dt, stage.nose_hoover_links
         )
     else:
         made = velocity_verlet(mm, dt)
-    made.setConstraintTolerance(kept_to)
-    made.setIntegrationForceGroups(integration_groups(portrait, stage))
+    made.setConstraintTolerance(distance_tolerance)
+    made.setIntegrationForceGroups(integration_groups(view, stage))
     return made
 
 
 def velocity_verlet(mm, dt: float) -> Any:
-    """Velocity Verlet with kept distances, to be stepped by `step`.
+    """Velocity Verlet with constrained distances, to be stepped by `step`.
 
-    As leapfrog steps with half a kick at either end: the same positions and velocities (RATTLE; Andersen 1983, J.
-    Comput. Phys. 52, 24), but no forces are needed within a step, where OpenMM has not yet put virtual sites in place.
+    Leapfrog steps with half a kick at either end give the same positions and velocities (RATTLE; Andersen 1983, J.
+    Comput. Phys. 52, 24) without forces within a step, where OpenMM has not yet computed the virtual sites.
     """
     made = mm.CustomIntegrator(dt)
     made.addGlobalVariable(KICK, 1.0)
@@ -65,7 +73,7 @@ def velocity_verlet(mm, dt: float) -> Any:
 
 
 def step(integrator: Any, steps: int) -> None:
-    """Take some steps, of which velocity Verlet begins and ends with half a kick."""
+    """Take steps. Velocity Verlet begins and ends with half a kick."""
     if not hasattr(integrator, "setGlobalVariableByName"):
         integrator.step(steps)
         return
@@ -75,27 +83,28 @@ def step(integrator: Any, steps: int) -> None:
         integrator.step(count)
 
 
-def integration_groups(portrait: Portrait, stage: Stage) -> set[int]:
-    """Groups of forces that move a stage: those that exert any, and what a barostat needs besides."""
-    groups = {parts.LENNARD_JONES, parts.COULOMB_PAIRS, parts.RECIPROCAL}
+def integration_groups(view: ForceFieldView, stage: Stage) -> set[int]:
+    """The force groups that move a stage: those with forces, and energies that a barostat needs in addition."""
+    groups = {LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL}
     if stage.has_barostat:
-        # it compares energies: with those that are continuous the pressure is that of the forces
-        groups |= {parts.STEP_LENNARD_JONES, parts.STEP_COULOMB, parts.TAIL}
+        # it compares energies; the pressure agrees with the forces if energies are continuous
+        groups |= {STEP_LENNARD_JONES, STEP_COULOMB, TAIL}
     return groups
 
 
-def movers(portrait: Portrait, k: int) -> list:
-    """What of stage k is not a matter of its integrator: a barostat; that a thermostat counts no total momentum."""
-    mm, stage, system = parts.library(), portrait.system.scene.stages[k], portrait.system
+def extra_forces(view: ForceFieldView, k: int) -> list:
+    """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum that makes OpenMM
+    subtract the degrees of freedom of the total momentum."""
+    mm, stage, system = library(), view.system.scene.stages[k], view.system
     found = []
-    if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int((~portrait.frozen).sum()):
+    if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int((~view.frozen).sum()):
         found.append(mm.CMMotionRemover(NEVER))
     if stage.has_barostat:
         barostat = mm.MonteCarloBarostat(stage.pressures[0][0], stage.temperatures[0], stage.moves_every)
-        barostat.setRandomNumberSeed(_seed(portrait, k) % (SEEDS - 1) + 1)
+        barostat.setRandomNumberSeed(_seed(view, k) % (SEEDS - 1) + 1)
         found.append(barostat)
     return found
 
 
-def _seed(portrait: Portrait, k: int) -> int:
-    return (portrait.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
+def _seed(view: ForceFieldView, k: int) -> int:
+    return (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1

@@ -17,12 +17,12 @@ from rigidmd.engines.mass_points import MassPoints, mass_points
 from rigidmd.engines.rigid_bodies import Points
 from rigidmd.engines.system import charges_in
 from rigidmd.errors import EngineError
-from rigidmd.forces.ewald.errors import mesh_for, real_error
+from rigidmd.forces.ewald.errors import pme_grid_for, real_error
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.forces.potentials.truncation import Plain, Switched
+from rigidmd.forces.potentials.truncation import Switched, Unmodified
 from rigidmd.scene.models import gather_per_molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import COULOMB, KJ_PER_MOL
@@ -54,7 +54,7 @@ def unsupported_features(view: ForceFieldView) -> list[str]:
     """What of a scene OpenMM cannot do, in words; empty if it can do all."""
     system, forces = view.system, view.system.scene.forces
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
-    if view.is_periodic_coulomb and grid_for(view, PME_ORDER) is None:
+    if view.has_ewald_sum and grid_for(view, PME_ORDER) is None:
         found.append(
             f"forces.electrostatics = {forces.electrostatics!r}: no grid for OpenMM's splines, of order {PME_ORDER}, "
             "has the accuracy asked for; ask for less"
@@ -82,7 +82,7 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
     charges = charges_in(system.species, counts)
     beyond = real_error(charges, law.alpha, law.cutoff, system.space.volume)
     error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - beyond**2, 0.0))
-    found = mesh_for(charges, law.alpha, cell_of(system.space), error, order)
+    found = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
     return None if found is None else found[0]
 
 
@@ -151,7 +151,7 @@ def layout(view: ForceFieldView) -> Layout:
         mass.append(own)
     count = np.array([len(own) for own in mass])[species]
     first = np.cumsum(count) - count
-    sites = system.own_sites
+    sites = system.sites_per_molecule
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),
@@ -189,7 +189,7 @@ def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, apa
         for i, j, distance in body.distances:
             made.addConstraint(where[i], where[j], distance * NM)
         for site, place in body.virtual_sites.items():
-            made.setVirtualSite(int(a) + site, _virtual(mm, where, place.weight.tolist(), place.cross))
+            made.setVirtualSite(int(a) + site, _openmm_virtual_site(mm, where, place.weight.tolist(), place.cross))
     excluded = particles.excluded(view)
     for force, group in _forces(mm, view, particles, apart):
         force.setForceGroup(group)
@@ -203,7 +203,7 @@ def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, apa
     return made
 
 
-def _virtual(mm: Any, points: list[int], weight: list[float], cross: float):
+def _openmm_virtual_site(mm: Any, points: list[int], weight: list[float], cross: float):
     """The virtual site at the sum of weight times point."""
     if len(points) == 2:
         return mm.TwoParticleAverageSite(*points, *weight)
@@ -218,18 +218,18 @@ def _virtual(mm: Any, points: list[int], weight: list[float], cross: float):
 def _forces(mm: Any, view: ForceFieldView, particles: Layout, apart: bool) -> list[tuple]:
     """Forces and their groups."""
     found, law, coulomb = [], view.lennard_jones, view.coulomb
-    plain = _plain_lennard_jones(view)
-    own_charges = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)
-    together = plain is not None and own_charges and not apart
+    plain = _builtin_lennard_jones(view)
+    has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)
+    together = plain is not None and has_charge_force and not apart
     if law is not None and view.epsilon.any():
         if plain is None:
-            found.append((_own_lennard_jones(mm, view, particles), LENNARD_JONES))
+            found.append((_custom_lennard_jones(mm, view, particles), LENNARD_JONES))
         elif not together:
             force = _nonbonded(mm, view, particles, law.cutoff, np.zeros_like(view.charge), plain)
             found.append((force, LENNARD_JONES))
-        if view.is_periodic and isinstance(law.shape, Plain) and view.truncation == "plain":
-            found.append((_own_lennard_jones(mm, view, particles, step=True), STEP_LENNARD_JONES))
-    if coulomb is not None and own_charges:
+        if view.is_periodic and isinstance(law.truncation, Unmodified) and view.truncation == "plain":
+            found.append((_custom_lennard_jones(mm, view, particles, step=True), STEP_LENNARD_JONES))
+    if coulomb is not None and has_charge_force:
         force = _nonbonded(mm, view, particles, coulomb.cutoff, view.charge, plain if together else None)
         found.append((force, COULOMB_PAIRS))
         if isinstance(coulomb, ScreenedCoulomb):
@@ -237,27 +237,27 @@ def _forces(mm: Any, view: ForceFieldView, particles: Layout, apart: bool) -> li
             force.setPMEParameters(float(coulomb.alpha) / NM, *(grid_for(view, PME_ORDER) or ()))
             force.setReciprocalSpaceForceGroup(RECIPROCAL)
             height = f"{-float(erfc(coulomb.alpha * coulomb.cutoff)) / coulomb.cutoff!r}"
-            found.append((_between_charges(mm, view, particles, height), STEP_COULOMB))
+            found.append((_custom_coulomb(mm, view, particles, height), STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
-        found.append((_between_charges(mm, view, particles, coulomb_formula(coulomb, 1.0)), COULOMB_PAIRS))
+        found.append((_custom_coulomb(mm, view, particles, coulomb_formula(coulomb, 1.0)), COULOMB_PAIRS))
         if view.is_periodic and not isinstance(coulomb, DampedShiftedForce) and view.truncation == "plain":
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
-            found.append((_between_charges(mm, view, particles, height), STEP_COULOMB))
+            found.append((_custom_coulomb(mm, view, particles, height), STEP_COULOMB))
     if (tail := view.system.tail) is not None:
         energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
         found.append((mm.CustomVolumeForce(f"{energy!r}/v"), TAIL))
     return found
 
 
-def _plain_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
+def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
     """sigma and epsilon of kinds where OpenMM's own law is that of the scene; None where it is not."""
     law = view.lennard_jones
     if law is None or not (law.cutoff == inf or view.truncation in ("plain", "switch")):
         return None
-    return _mixed_by_lorentz_berthelot(view)
+    return _lorentz_berthelot(view)
 
 
-def _mixed_by_lorentz_berthelot(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
+def _lorentz_berthelot(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
     """sigma and epsilon of kinds if those between kinds follow from them, else None."""
     sigma, epsilon = view.sigma.diagonal(), view.epsilon.diagonal()
     deep = view.epsilon > 0
@@ -287,9 +287,9 @@ def _nonbonded(
         sigma, epsilon = lennard_jones
         rows[particles.site, 1] = sigma[view.kind] * NM
         rows[particles.site, 2] = epsilon[view.kind] / KJ_PER_MOL
-        if (law := view.lennard_jones) and isinstance(law.shape, Switched):
+        if (law := view.lennard_jones) and isinstance(law.truncation, Switched):
             force.setUseSwitchingFunction(True)
-            force.setSwitchingDistance(float(law.shape.start) * NM)
+            force.setSwitchingDistance(float(law.truncation.start) * NM)
     for row in rows.tolist():
         force.addParticle(*row)
     return force
@@ -319,7 +319,7 @@ def _custom(
     return force
 
 
-def _own_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: bool = False):
+def _custom_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: bool = False):
     """The law as a formula, or the step that it makes at the cut-off; linear in c12 and c6, which tables of kinds give.
 
     Kind 0 of the tables is that of points that are no sites.
@@ -346,7 +346,7 @@ def _own_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: b
     return force
 
 
-def _between_charges(mm: Any, view: ForceFieldView, particles: Layout, formula: str):
+def _custom_coulomb(mm: Any, view: ForceFieldView, particles: Layout, formula: str):
     """q q times a formula of unit strength; charges are in units where q q/r is in kJ/mol."""
     law = view.coulomb
     assert law is not None

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements, kernel
-from rigidmd.core.state import ASK, OK, State
+from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, State
 from rigidmd.forces.terms import Setup, add_forces, power
-from rigidmd.mechanics.time_functions import Course, value
-from rigidmd.mechanics.translation import along
+from rigidmd.mechanics.time_functions import TimeFunction, value
+from rigidmd.mechanics.translation import body_component
 
 
 class SteadyForce(NamedTuple):
@@ -19,50 +19,50 @@ class SteadyForce(NamedTuple):
     point: np.ndarray  # (3,) body, from the centre of mass, or from the pivot of a pinned body
 
 
-class Drive(NamedTuple):
+class TimeDependentForce(NamedTuple):
     """A force at a point of the body and a torque, given functions of time, along the lab's or the body's axes."""
 
-    force: Course
-    torque: Course
+    force: TimeFunction
+    torque: TimeFunction
     point: np.ndarray  # (3,) body
     follows_body: bool  # force and torque are given along the body's axes
 
-    def workspace(self, setup: Setup) -> "Driving":
+    def workspace(self, setup: Setup) -> "TimeDependentForceWorkspace":
         """Room for its present values."""
-        return Driving(*self, np.zeros(3), np.zeros(3))
+        return TimeDependentForceWorkspace(*self, np.zeros(3), np.zeros(3))
 
 
-class Driving(NamedTuple):
-    """Workspace of a `Drive`."""
+class TimeDependentForceWorkspace(NamedTuple):
+    """Workspace of a `TimeDependentForce`."""
 
-    force: Course
-    torque: Course
+    force: TimeFunction
+    torque: TimeFunction
     point: np.ndarray
     follows_body: bool
     force_lab: np.ndarray  # (3,) as last evaluated
     torque_body: np.ndarray  # (3,) as last evaluated, including that of the force
 
-    drives = True
+    time_dependent = True
 
 
-class Told(NamedTuple):
+class PythonForce(NamedTuple):
     """Force and torque from a Python function, which the engine holds."""
 
-    def workspace(self, setup: Setup) -> "Asked":
+    def workspace(self, setup: Setup) -> "PythonForceWorkspace":
         """Room for the values."""
-        return Asked(np.zeros(1, np.int64), np.zeros(3), np.zeros(3))
+        return PythonForceWorkspace(np.zeros(1, np.int64), np.zeros(3), np.zeros(3))
 
 
-class Asked(NamedTuple):
-    """Workspace of a `Told`; it asks for new values whenever positions have changed."""
+class PythonForceWorkspace(NamedTuple):
+    """Workspace of a `PythonForce`; it asks for new values whenever positions have changed."""
 
     fresh: np.ndarray  # (1,) 1 if the values are those of the present moment
     force_lab: np.ndarray  # (3,)
     torque_body: np.ndarray  # (3,)
 
-    drives = True
+    time_dependent = True
 
-    def answer(self, function: Callable[[float, State], tuple], state: State) -> None:
+    def update(self, function: Callable[[float, State], tuple], state: State) -> None:
         """Call a function of (time, state) for a force (3,) in the lab frame and a torque (3,) in the body frame."""
         self.force_lab[:], self.torque_body[:] = function(float(state.time[0]), state)
         self.fresh[0] = 1
@@ -107,16 +107,16 @@ def steady_energies(term, position, rotation):
 @kernel(inline=True)
 def add_torque(point, rotation, force_lab, torque_body):
     """Add point x Q^T F to a torque (3,), all in the body frame."""
-    a = along(rotation, force_lab, 0)
-    b = along(rotation, force_lab, 1)
-    c = along(rotation, force_lab, 2)
+    a = body_component(rotation, force_lab, 0)
+    b = body_component(rotation, force_lab, 1)
+    c = body_component(rotation, force_lab, 2)
     torque_body[0] += point[1] * c - point[2] * b
     torque_body[1] += point[2] * a - point[0] * c
     torque_body[2] += point[0] * b - point[1] * a
 
 
-@implements(add_forces, Driving)
-def _add_drive(term, state, load, tally):
+@implements(add_forces, TimeDependentForceWorkspace)
+def _add_time_dependent_force(term, state, load, tally):
     now = state.time[0]
     force = (value(term.force, now, 0), value(term.force, now, 1), value(term.force, now, 2))
     torque = (value(term.torque, now, 0), value(term.torque, now, 1), value(term.torque, now, 2))
@@ -129,21 +129,21 @@ def _add_drive(term, state, load, tally):
             if term.follows_body:
                 term.force_lab[k] = q[k, 0] * force[0] + q[k, 1] * force[1] + q[k, 2] * force[2]
             else:
-                term.torque_body[k] = along(q, torque, k)
+                term.torque_body[k] = body_component(q, torque, k)
         add_torque(term.point, q, term.force_lab, term.torque_body)
-    return hand_over(term, load)
+    return add_to_load(term, load)
 
 
-@implements(add_forces, Asked)
-def _add_told(term, state, load, tally):
+@implements(add_forces, PythonForceWorkspace)
+def _add_python_force(term, state, load, tally):
     if term.fresh[0] == 0:
-        return ASK
+        return NEEDS_PYTHON_FORCES
     term.fresh[0] = 0
-    return hand_over(term, load)
+    return add_to_load(term, load)
 
 
 @kernel(inline=True)
-def hand_over(term, load):
+def add_to_load(term, load):
     """Add a term's present force and torque to the load of the body."""
     for k in range(len(load.force)):
         for i in range(3):
@@ -154,7 +154,7 @@ def hand_over(term, load):
     return OK
 
 
-@implements(power, (Driving, Asked))
+@implements(power, (TimeDependentForceWorkspace, PythonForceWorkspace))
 def _drive_power(term, state, velocity, omega):
     total = 0.0
     for k in range(3):

@@ -9,59 +9,59 @@ from math import sqrt
 from typing import NamedTuple
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.mechanics.free_rotor import sine_and_versine, turned
-from rigidmd.mechanics.time_functions import Course, value
+from rigidmd.mechanics.free_rotor import rotate_vector, sine_and_versine
+from rigidmd.mechanics.time_functions import TimeFunction, value
 
 
-class Inertial(NamedTuple):
+class InertialFrame(NamedTuple):
     """Axes that do not rotate."""
 
     rate: float = 0.0
 
 
-class Turning(NamedTuple):
+class RotatingFrame(NamedTuple):
     """Axes that rotate. The flow is exact for a constant rate, and for one that changes linearly about a fixed axis.
 
     Otherwise each drift is of order 2 and symmetric: compositions of symmetric steps keep their order, other schemes
     fall to order 2.
     """
 
-    angular_velocity: Course  # along the frame's own axes
+    angular_velocity: TimeFunction  # along the frame's own axes
 
 
-def follow(frame, state, time, h):
+def rotate_with_frame(frame, state, time, h):
     """Rotate the state of a single body from the frame's axes at `time` to those at time + h, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(follow, inline=True)
-def _follow(frame, state, time, h):
-    if is_a(frame, Inertial):
+@implements(rotate_with_frame, inline=True)
+def _rotate_with_frame(frame, state, time, h):
+    if is_a(frame, InertialFrame):
         return lambda frame, state, time, h: None
 
-    def turn_back(frame, state, time, h):
+    def rotate_back(frame, state, time, h):
         middle = time + 0.5 * h
         x = -h * value(frame.angular_velocity, middle, 0)
         y = -h * value(frame.angular_velocity, middle, 1)
         z = -h * value(frame.angular_velocity, middle, 2)
         if len(state.position):
-            turn_vector(state.position[0], x, y, z)
-            turn_vector(state.velocity[0], x, y, z)
+            rotate_in_place(state.position[0], x, y, z)
+            rotate_in_place(state.velocity[0], x, y, z)
         for k in range(len(state.rotation)):
             for column in range(3):
-                turn_vector(state.rotation[k, :, column], x, y, z)
+                rotate_in_place(state.rotation[k, :, column], x, y, z)
 
-    return turn_back
+    return rotate_back
 
 
 @kernel(inline=True)
-def turn_vector(vector, x, y, z):
+def rotate_in_place(vector, x, y, z):
     """Rotate a vector (3,) by the rotation vector (x, y, z), in place (Rodrigues)."""
     angle = sqrt(x * x + y * y + z * z)
     if angle == 0.0:
         return
     s, versine = sine_and_versine(angle)
-    vector[0], vector[1], vector[2] = turned(
+    vector[0], vector[1], vector[2] = rotate_vector(
         vector[0], vector[1], vector[2], x / angle, y / angle, z / angle, s, versine
     )
 
@@ -73,7 +73,7 @@ def frame_rate(frame, time):
 
 @implements(frame_rate, inline=True)
 def _frame_rate(frame, time):
-    if is_a(frame, Inertial):
+    if is_a(frame, InertialFrame):
         return lambda frame, time: (0.0, 0.0, 0.0)
 
     def rate(frame, time):

@@ -14,10 +14,10 @@ from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import WORK
 from rigidmd.forces.body.frame import frame_rate
 from rigidmd.mechanics.free_rotor import NoRotor, moments
-from rigidmd.mechanics.translation import Pinned, along, inertial_mass
+from rigidmd.mechanics.translation import NoTranslation, body_component, inertial_mass
 
-MOST_TRIALS = 100  # values of |v|; about six are needed
-SAME_SIZE = 1e-14  # relative error of |v|
+MAX_ITERATIONS = 100  # values of |v|; about six are needed
+SPEED_TOLERANCE = 1e-14  # relative error of |v|
 
 
 class NoResistance(NamedTuple):
@@ -40,17 +40,17 @@ class Resistance(NamedTuple):
     rotation_quadratic: np.ndarray  # (3,)
 
 
-def push(resistance, flight, rotor, frame, state, load, h):
+def kick_with_resistance(resistance, flight, rotor, frame, state, load, h):
     """Change the momenta of a single body by a load and resistance for a time h at fixed positions, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(push, inline=True)
-def _push(resistance, flight, rotor, frame, state, load, h):
-    flies, turns = not is_a(flight, Pinned), not is_a(rotor, NoRotor)
+@implements(kick_with_resistance, inline=True)
+def _kick_with_resistance(resistance, flight, rotor, frame, state, load, h):
+    flies, turns = not is_a(flight, NoTranslation), not is_a(rotor, NoRotor)
     if is_a(resistance, NoResistance):
 
-        def push_freely(resistance, flight, rotor, frame, state, load, h):
+        def kick_freely(resistance, flight, rotor, frame, state, load, h):
             for m in range(len(load.force)):
                 for k in range(3):
                     state.velocity[m, k] += h / flight.mass * load.force[m, k]
@@ -59,19 +59,19 @@ def _push(resistance, flight, rotor, frame, state, load, h):
                     if moments(rotor, state.time[0], k)[0] > 0:  # an axis without inertia has no momentum
                         state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
 
-        return push_freely
+        return kick_freely
 
-    def push_against(resistance, flight, rotor, frame, state, load, h):
+    def kick_against_resistance(resistance, flight, rotor, frame, state, load, h):
         if flies:
-            push_flight(resistance, flight, rotor, frame, state, load, h)
+            kick_translation(resistance, flight, rotor, frame, state, load, h)
         if turns:
-            push_spin(resistance, rotor, frame, state, load, h)
+            kick_rotation(resistance, rotor, frame, state, load, h)
 
-    return push_against
+    return kick_against_resistance
 
 
 @kernel
-def push_spin(resistance, rotor, frame, state, load, h):
+def kick_rotation(resistance, rotor, frame, state, load, h):
     """Change L by torque and resistance; |w| is its value at the middle of the kick."""
     W = frame_rate(frame, state.time[0])
     q = state.rotation[0]
@@ -80,23 +80,25 @@ def push_spin(resistance, rotor, frame, state, load, h):
     i1, h1 = moments(rotor, state.time[0], 1)
     i2, h2 = moments(rotor, state.time[0], 2)
     inverse, carried = (i0, i1, i2), (h0, h1, h2)
-    dragged = (along(q, W, 0), along(q, W, 1), along(q, W, 2))
+    dragged = (body_component(q, W, 0), body_component(q, W, 1), body_component(q, W, 2))
     before = ((L[0] - h0) * i0 - dragged[0], (L[1] - h1) * i1 - dragged[1], (L[2] - h2) * i2 - dragged[2])
     torque = load.torque_body[0]
     pushes = (i0 * torque[0], i1 * torque[1], i2 * torque[2])
     dry, linear, quadratic = resistance.rotation_dry, resistance.rotation_linear, resistance.rotation_quadratic
     dries = (i0 * dry[0], i1 * dry[1], i2 * dry[2])
-    size = middle_size(before, pushes, dries, inverse, linear, quadratic, h)
+    size = midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h)
     for k in range(3):
         if inverse[k] > 0.0:
             rate = inverse[k] * (linear[k] + quadratic[k] * size)
-            after, turned = pushed(before[k], pushes[k], dries[k], rate, h)
+            after, turned = resisted_motion(before[k], pushes[k], dries[k], rate, h)
             L[k] = (after + dragged[k]) / inverse[k] + carried[k]
-            state.books[WORK] += (0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned) / inverse[k]
+            state.energy_ledger[WORK] += (
+                0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned
+            ) / inverse[k]
 
 
 @kernel
-def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
+def midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h):
     """|v| at the middle of a kick, consistent with the resistance that this |v| causes; all per unit inertia.
 
     The computed |v| minus the assumed |v| changes sign between 0 and the largest |v| that the push can produce; regula
@@ -108,15 +110,15 @@ def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
     for k in range(3):
         high += (abs(before[k]) + 0.5 * h * abs(pushes[k])) ** 2
     high = sqrt(high)
-    above = size_found(before, pushes, dries, inverse, linear, quadratic, h, low)
-    below = size_found(before, pushes, dries, inverse, linear, quadratic, h, high) - high
+    above = speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, low)
+    below = speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, high) - high
     if not above > 0.0 or not below < 0.0:
         return low if not above > 0.0 else high
     side = 0
-    for _ in range(MOST_TRIALS):
+    for _ in range(MAX_ITERATIONS):
         size = (low * below - high * above) / (below - above)
-        found = size_found(before, pushes, dries, inverse, linear, quadratic, h, size) - size
-        if abs(found) <= SAME_SIZE * size or high - low <= SAME_SIZE * high:
+        found = speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, size) - size
+        if abs(found) <= SPEED_TOLERANCE * size or high - low <= SPEED_TOLERANCE * high:
             return size
         if found > 0.0:
             low, above = size, found
@@ -130,27 +132,27 @@ def middle_size(before, pushes, dries, inverse, linear, quadratic, h):
 
 
 @kernel
-def size_found(before, pushes, dries, inverse, linear, quadratic, h, size):
+def speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, size):
     """|v| after half of h, with the resistance of an assumed |v| = size."""
     squares = 0.0
     for k in range(3):
         if inverse[k] > 0.0:
             rate = inverse[k] * (linear[k] + quadratic[k] * size)
-            middle, _ = pushed(before[k], pushes[k], dries[k], rate, 0.5 * abs(h))
+            middle, _ = resisted_motion(before[k], pushes[k], dries[k], rate, 0.5 * abs(h))
             squares += middle * middle
     return sqrt(squares)
 
 
-def push_flight(resistance, flight, rotor, frame, state, load, h):
-    """Change the velocity (or impulse over mass) by force and resistance; |v| is treated like |w| in `push_spin`."""
+def kick_translation(resistance, flight, rotor, frame, state, load, h):
+    """Change the velocity (or impulse over mass) by force and resistance; |v| is treated like |w| in `kick_rotation`."""
     raise TypeError("compiled code only")
 
 
-@implements(push_flight)
-def _push_flight(resistance, flight, rotor, frame, state, load, h):
+@implements(kick_translation)
+def _kick_translation(resistance, flight, rotor, frame, state, load, h):
     turns = not is_a(rotor, NoRotor)
 
-    def push_flight(resistance, flight, rotor, frame, state, load, h):
+    def kick_translation(resistance, flight, rotor, frame, state, load, h):
         W = frame_rate(frame, state.time[0])
         x = state.position[0]
         V = state.velocity[0]
@@ -160,21 +162,25 @@ def _push_flight(resistance, flight, rotor, frame, state, load, h):
         inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
         if turns:
             q = state.rotation[0]
-            share = (flight.mass * inverse[0], flight.mass * inverse[1], flight.mass * inverse[2])
+            velocity_per_momentum = (flight.mass * inverse[0], flight.mass * inverse[1], flight.mass * inverse[2])
             before = (
-                share[0] * along(q, V, 0) - along(q, wind, 0),
-                share[1] * along(q, V, 1) - along(q, wind, 1),
-                share[2] * along(q, V, 2) - along(q, wind, 2),
+                velocity_per_momentum[0] * body_component(q, V, 0) - body_component(q, wind, 0),
+                velocity_per_momentum[1] * body_component(q, V, 1) - body_component(q, wind, 1),
+                velocity_per_momentum[2] * body_component(q, V, 2) - body_component(q, wind, 2),
             )
-            pulls = (along(q, F, 0) * inverse[0], along(q, F, 1) * inverse[1], along(q, F, 2) * inverse[2])
+            pulls = (
+                body_component(q, F, 0) * inverse[0],
+                body_component(q, F, 1) * inverse[1],
+                body_component(q, F, 2) * inverse[2],
+            )
         else:
             before = (V[0] - wind[0], V[1] - wind[1], V[2] - wind[2])
             pulls = (F[0] * inverse[0], F[1] * inverse[1], F[2] * inverse[2])
         linear, quadratic = resistance.linear, resistance.quadratic
-        size = middle_size(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
+        size = midpoint_speed(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
         for k in range(3):
-            after, flown = pushed(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
-            state.books[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
+            after, flown = resisted_motion(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
+            state.energy_ledger[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
             gain = (after - before[k]) * mass[k] / flight.mass
             if turns:
                 for i in range(3):  # along axis k only, so that components along the other axes do not change
@@ -182,11 +188,11 @@ def _push_flight(resistance, flight, rotor, frame, state, load, h):
             else:
                 V[k] += gain
 
-    return push_flight
+    return kick_translation
 
 
 @kernel
-def pushed(speed, push, dry, linear, h):
+def resisted_motion(speed, kick_with_resistance, dry, linear, h):
     """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0.
 
     Dry friction brings the motion to rest in a finite time, and holds it at rest unless the push is stronger.
@@ -194,30 +200,30 @@ def pushed(speed, push, dry, linear, h):
     s = abs(speed)
     sign = copysign(1.0, speed)
     if s == 0.0:
-        if abs(push) <= dry:
+        if abs(kick_with_resistance) <= dry:
             return 0.0, 0.0
-        sign = copysign(1.0, push)
-    net = sign * push - dry
+        sign = copysign(1.0, kick_with_resistance)
+    net = sign * kick_with_resistance - dry
     if net < 0.0:
         rest = log1p(linear * s / -net) / linear if linear > 0.0 else s / -net
         if rest <= h:  # it stops, and the push may then reverse the motion
-            back = max(0.0, abs(push) - dry) if sign * push < 0.0 else 0.0
-            there = eased(linear, rest)
-            after, way = run_up(0.0, back, linear, h - rest)
+            back = max(0.0, abs(kick_with_resistance) - dry) if sign * kick_with_resistance < 0.0 else 0.0
+            there = drag_integrals(linear, rest)
+            after, way = linear_drag_motion(0.0, back, linear, h - rest)
             return -sign * after, sign * (s * there[0] + net * there[1] - way)
-    after, way = run_up(s, net, linear, h)
+    after, way = linear_drag_motion(s, net, linear, h)
     return sign * after, sign * way
 
 
 @kernel(inline=True)
-def run_up(s, net, linear, h):
+def linear_drag_motion(s, net, linear, h):
     """(s, integral of s) after a time h of s' = net - linear s."""
-    first, second = eased(linear, h)
+    first, second = drag_integrals(linear, h)
     return s * exp(-linear * h) + net * first, s * first + net * second
 
 
 @kernel(inline=True)
-def eased(linear, h):
+def drag_integrals(linear, h):
     """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h; h and h²/2 without resistance."""
     x = linear * h
     if x < 1e-2:  # a series avoids the difference of nearly equal numbers
@@ -229,13 +235,13 @@ def eased(linear, h):
     return first, (h - first) / linear
 
 
-def braking(resistance, state, load, velocity, omega):
+def add_resistance(resistance, state, load, velocity, omega):
     """Add resistance to a load, and return its power; velocity (lab), angular velocity (body) relative to the frame."""
     raise TypeError("compiled code only")
 
 
-@implements(braking)
-def _braking(resistance, state, load, velocity, omega):
+@implements(add_resistance)
+def _add_resistance(resistance, state, load, velocity, omega):
     if is_a(resistance, NoResistance):
         return lambda resistance, state, load, velocity, omega: 0.0
 
@@ -244,7 +250,7 @@ def _braking(resistance, state, load, velocity, omega):
         for m in range(len(load.force)):
             size = sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
             for k in range(3):
-                v = along(state.rotation[m], velocity, k) if len(state.rotation) else velocity[k]
+                v = body_component(state.rotation[m], velocity, k) if len(state.rotation) else velocity[k]
                 f = -(resistance.linear[k] + resistance.quadratic[k] * size) * v
                 power += f * v
                 if len(state.rotation):

@@ -9,7 +9,7 @@ from scipy.special import erf
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces import terms
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, load_from_sites, place_sites
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, compute_site_positions, load_from_sites
 from rigidmd.forces.neighbors.space import volume_of
 from rigidmd.forces.terms import Setup
 
@@ -63,16 +63,16 @@ def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | C
 
 @implements(terms.add_forces, SurfaceWorkspace)
 def _add_surface_dipole(term, state, load, tally):
-    place_sites(term.sites, state, term.position)
-    share = term.strength / volume_of(state.cell)
+    compute_site_positions(term.sites, state, term.position)
+    per_dipole_square = term.strength / volume_of(state.cell)
     energy = 0.0
     for k in range(3):
         dipole = 0.0
         for i in range(len(term.charge)):
             dipole += term.charge[i] * term.position[i, k]
         for i in range(len(term.charge)):
-            term.site_force[i, k] = -2 * share * term.charge[i] * dipole
-        energy += share * dipole * dipole
+            term.site_force[i, k] = -2 * per_dipole_square * term.charge[i] * dipole
+        energy += per_dipole_square * dipole * dipole
     if tally is not None:
         # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to 1/V
         for k in (0, 1, 5, 9):

@@ -21,18 +21,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Code, call_blocks, implements, kernel, opened, packed, task
-from rigidmd.compile.simd import fill, lane_count, load, store, total, width_of
+from rigidmd.compile import Code, call_blocks, implements, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile.simd import broadcast, lane_count, lanes_of, load, store, sum_lanes
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.ewald.k_vectors import Waves
+from rigidmd.forces.ewald.k_vectors import KVectors
 from rigidmd.forces.neighbors.sites import (
     BodySites,
     CentralSites,
     blocks_of,
-    room_for_virial,
     site_tasks,
-    virial_of_molecules,
+    to_molecular_virial,
+    virial_buffer,
 )
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
@@ -40,7 +40,7 @@ from rigidmd.forces.terms import Setup
 WIDTH = lane_count(np.float64)
 
 
-class WaveSums(NamedTuple):
+class KSpaceSums(NamedTuple):
     """Arrays of an Ewald sum. The sites are padded to whole vectors with charges of 0."""
 
     cell: np.ndarray  # (3, 3) the cell of the present strengths
@@ -53,9 +53,9 @@ class WaveSums(NamedTuple):
     strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k²: times |S|², the energy of n and -n together
     real: np.ndarray  # (waves,) real part of S(k), then of 2 strength S(k)
     imaginary: np.ndarray
-    push: np.ndarray  # (3, slots) forces on the sites, by component
+    force_by_component: np.ndarray  # (3, slots) forces on the sites, by component
     tallies: np.ndarray  # (blocks, 10)
-    virial: np.ndarray  # see `room_for_virial`
+    virial: np.ndarray  # see `virial_buffer`
 
 
 class EwaldSum(NamedTuple):
@@ -64,14 +64,14 @@ class EwaldSum(NamedTuple):
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
     sites: BodySites | CentralSites
-    waves: Waves
+    k_vectors: KVectors
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
         """Room for the sums, which are always in double precision."""
-        s, over = len(self.charge), self.waves
+        s, k_vectors = len(self.charge), self.k_vectors
         slots = -(-s // WIDTH) * WIDTH
-        angles = (3, int(over.most.max()) + 1, slots)
-        sums = WaveSums(
+        angles = (3, int(k_vectors.most.max()) + 1, slots)
+        sums = KSpaceSums(
             cell=np.zeros((3, 3)),
             reciprocal=np.zeros((3, 3)),
             position=np.zeros((s, 3)),
@@ -79,14 +79,14 @@ class EwaldSum(NamedTuple):
             charge=np.concatenate([self.charge, np.zeros(slots - s)]),
             cosine=np.zeros(angles),
             sine=np.zeros(angles),
-            strength=np.zeros(over.total // 2),
-            real=np.zeros(over.total // 2),
-            imaginary=np.zeros(over.total // 2),
-            push=np.zeros((3, slots)),
-            tallies=np.zeros((len(over.bounds) - 1, TALLY_SIZE)),
-            virial=room_for_virial(),
+            strength=np.zeros(k_vectors.total // 2),
+            real=np.zeros(k_vectors.total // 2),
+            imaginary=np.zeros(k_vectors.total // 2),
+            force_by_component=np.zeros((3, slots)),
+            tallies=np.zeros((len(k_vectors.bounds) - 1, TALLY_SIZE)),
+            virial=virial_buffer(),
         )
-        return EwaldWorkspace(self.alpha, self.sites, over, sums)
+        return EwaldWorkspace(self.alpha, self.sites, k_vectors, sums)
 
 
 class EwaldWorkspace(NamedTuple):
@@ -94,8 +94,8 @@ class EwaldWorkspace(NamedTuple):
 
     alpha: float
     sites: BodySites | CentralSites
-    waves: Waves
-    sums: WaveSums
+    k_vectors: KVectors
+    sums: KSpaceSums
     code: Code | None = None
 
     @property
@@ -105,9 +105,16 @@ class EwaldWorkspace(NamedTuple):
 
     def with_code(self) -> "EwaldWorkspace":
         """With its machine code."""
-        content = (self.alpha, self.waves, self.sums)
+        content = (self.alpha, self.k_vectors, self.sums)
         moved = site_tasks(self.sites, self.sums.position, self.sums.force, self.sums.virial)
-        return self._replace(code=Code(turn=(_turn, content), sum=(_sum, content), push=(_push, content), **moved))
+        return self._replace(
+            code=Code(
+                phases=(_compute_phases, content),
+                sum=(_sum_structure_factors, content),
+                forces=(_compute_forces, content),
+                **moved,
+            )
+        )
 
 
 @kernel
@@ -128,67 +135,67 @@ def invert_cell(cell, reciprocal):
 
 @implements(terms.add_forces, EwaldWorkspace, counted=False)
 def _add_ewald_sum(term, state, load, tally):
-    own = term.sums
-    placed, molecules = packed((term.sites, state, own.position)), blocks_of(len(state.position))
-    call_blocks(term.code, "place", placed, molecules)
-    if follow_cell(state.cell, own.cell):
-        volume = abs(invert_cell(own.cell, own.reciprocal))
-        _set_strengths(term.waves, own, term.alpha, volume)
-    parcel = packed((term.alpha, term.waves, own))
-    blocks = len(own.tallies)
-    call_blocks(term.code, "turn", parcel, blocks)
-    call_blocks(term.code, "sum", parcel, blocks)
-    call_blocks(term.code, "push", parcel, blocks)
+    sums = term.sums
+    placed, molecules = pack_arguments((term.sites, state, sums.position)), blocks_of(len(state.position))
+    call_blocks(term.code, "positions", placed, molecules)
+    if follow_cell(state.cell, sums.cell):
+        volume = abs(invert_cell(sums.cell, sums.reciprocal))
+        _set_strengths(term.k_vectors, sums, term.alpha, volume)
+    arguments = pack_arguments((term.alpha, term.k_vectors, sums))
+    blocks = len(sums.tallies)
+    call_blocks(term.code, "phases", arguments, blocks)
+    call_blocks(term.code, "sum", arguments, blocks)
+    call_blocks(term.code, "forces", arguments, blocks)
     if tally is not None:
         for block in range(blocks):
             for k in range(len(tally)):
-                tally[k] += own.tallies[block, k]
-        virial_of_molecules(term.sites, term.code, state, own.force, own.virial, tally)
-    call_blocks(term.code, "load", packed((term.sites, state, load, own.force)), molecules)
+                tally[k] += sums.tallies[block, k]
+        to_molecular_virial(term.sites, term.code, state, sums.force, sums.virial, tally)
+    call_blocks(term.code, "load", pack_arguments((term.sites, state, load, sums.force)), molecules)
     return OK
 
 
 @kernel
-def _set_strengths(over, own, alpha, volume):
-    for c in range(len(over.column)):
-        first = over.column[c, 3]
-        for n in range(over.count[c]):
+def _set_strengths(k_vectors, sums, alpha, volume):
+    for c in range(len(k_vectors.column)):
+        first = k_vectors.column[c, 3]
+        for n in range(k_vectors.count[c]):
             k2 = 0.0
             for d in range(3):
                 k = (
-                    over.column[c, 0] * own.reciprocal[0, d]
-                    + over.column[c, 1] * own.reciprocal[1, d]
-                    + (over.column[c, 2] + n) * own.reciprocal[2, d]
+                    k_vectors.column[c, 0] * sums.reciprocal[0, d]
+                    + k_vectors.column[c, 1] * sums.reciprocal[1, d]
+                    + (k_vectors.column[c, 2] + n) * sums.reciprocal[2, d]
                 )
                 k2 += k * k
-            own.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
+            sums.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
 
 
 @task(counted=False)
-def _turn(parcel, block):
+def _compute_phases(arguments, block):
     """Cosines and sines for a share of the sites, by recurrence: one complex product for each multiple of the angle."""
-    _alpha, over, own = opened(parcel)
-    blocks, s = len(own.tallies), len(own.position)
+    _alpha, k_vectors, sums = load_arguments(arguments)
+    blocks, s = len(sums.tallies), len(sums.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
         for d in range(3):
             turns = 0.0
             for c in range(3):
-                turns += own.position[i, c] * own.reciprocal[d, c] / (2 * pi)
+                turns += sums.position[i, c] * sums.reciprocal[d, c] / (2 * pi)
             angle = 2 * pi * (turns - np.floor(turns))
             cosine, sine = np.cos(angle), np.sin(angle)
-            own.cosine[d, 0, i] = 1.0
-            own.sine[d, 0, i] = 0.0
-            for n in range(1, over.most[d] + 1):
-                a, b = own.cosine[d, n - 1, i], own.sine[d, n - 1, i]
-                own.cosine[d, n, i] = a * cosine - b * sine
-                own.sine[d, n, i] = b * cosine + a * sine
+            sums.cosine[d, 0, i] = 1.0
+            sums.sine[d, 0, i] = 0.0
+            for n in range(1, k_vectors.most[d] + 1):
+                a, b = sums.cosine[d, n - 1, i], sums.sine[d, n - 1, i]
+                sums.cosine[d, n, i] = a * cosine - b * sine
+                sums.sine[d, n, i] = b * cosine + a * sine
 
 
 @kernel(inline=True, counted=False)
-def _phase(own, d, n, at):
+def _phase(sums, d, n, at):
     """exp(2 pi i n x_d) of a vector of sites, as (cosine, sine)."""
-    cosine = load(own.cosine[d, abs(n)], at)
-    sine = load(own.sine[d, abs(n)], at)
+    cosine = load(sums.cosine[d, abs(n)], at)
+    sine = load(sums.sine[d, abs(n)], at)
     return (cosine, sine) if n >= 0 else (cosine, -1.0 * sine)
 
 
@@ -198,53 +205,63 @@ def _times(a, b):
 
 
 @task(counted=False)
-def _sum(parcel, block):
+def _sum_structure_factors(arguments, block):
     """S(k) of the columns of a block, with energy and virial; S(k) is then multiplied for the forces."""
-    alpha, over, own = opened(parcel)
-    width = width_of(own.charge)
-    own.tallies[block] = 0.0
-    for c in range(over.bounds[block], over.bounds[block + 1]):
-        first, count = over.column[c, 3], over.count[c]
+    alpha, k_vectors, sums = load_arguments(arguments)
+    width = lanes_of(sums.charge)
+    sums.tallies[block] = 0.0
+    for c in range(k_vectors.bounds[block], k_vectors.bounds[block + 1]):
+        first, count = k_vectors.column[c, 3], k_vectors.count[c]
         for n in range(count):
-            own.real[first + n] = 0.0
-            own.imaginary[first + n] = 0.0
+            sums.real[first + n] = 0.0
+            sums.imaginary[first + n] = 0.0
         # sites are taken in batches that stay in the L1 cache for a whole column
-        for batch in range(0, len(own.charge), 32 * width):
-            end = min(batch + 32 * width, len(own.charge))
+        for batch in range(0, len(sums.charge), 32 * width):
+            end = min(batch + 32 * width, len(sums.charge))
             for n in range(count):
-                real = fill(0.0, own.charge)
-                imaginary = fill(0.0, own.charge)
+                real = broadcast(0.0, sums.charge)
+                imaginary = broadcast(0.0, sums.charge)
                 for at in range(batch, end, width):
-                    plane = _times(_phase(own, 0, over.column[c, 0], at), _phase(own, 1, over.column[c, 1], at))
-                    phase = _times(plane, _phase(own, 2, over.column[c, 2] + n, at))
-                    charge = load(own.charge, at)
+                    plane = _times(
+                        _phase(sums, 0, k_vectors.column[c, 0], at), _phase(sums, 1, k_vectors.column[c, 1], at)
+                    )
+                    phase = _times(plane, _phase(sums, 2, k_vectors.column[c, 2] + n, at))
+                    charge = load(sums.charge, at)
                     real = real + charge * phase[0]
                     imaginary = imaginary + charge * phase[1]
-                own.real[first + n] += total(real)
-                own.imaginary[first + n] += total(imaginary)
+                sums.real[first + n] += sum_lanes(real)
+                sums.imaginary[first + n] += sum_lanes(imaginary)
         for n in range(count):
-            _count_wave(own, alpha, over.column[c, 0], over.column[c, 1], over.column[c, 2] + n, first + n, block)
+            _add_k_vector(
+                sums,
+                alpha,
+                k_vectors.column[c, 0],
+                k_vectors.column[c, 1],
+                k_vectors.column[c, 2] + n,
+                first + n,
+                block,
+            )
 
 
 @kernel(inline=True, counted=False)
-def _count_wave(own, alpha, nx, ny, nz, wave, block):
-    tally = own.tallies[block]
-    real, imaginary, strength = own.real[wave], own.imaginary[wave], own.strength[wave]
+def _add_k_vector(sums, alpha, nx, ny, nz, index, block):
+    tally = sums.tallies[block]
+    real, imaginary, strength = sums.real[index], sums.imaginary[index], sums.strength[index]
     energy = strength * (real * real + imaginary * imaginary)
-    own.real[wave] = 2 * strength * real
-    own.imaginary[wave] = 2 * strength * imaginary
+    sums.real[index] = 2 * strength * real
+    sums.imaginary[index] = 2 * strength * imaginary
     k = (
-        nx * own.reciprocal[0, 0] + ny * own.reciprocal[1, 0] + nz * own.reciprocal[2, 0],
-        nx * own.reciprocal[0, 1] + ny * own.reciprocal[1, 1] + nz * own.reciprocal[2, 1],
-        nx * own.reciprocal[0, 2] + ny * own.reciprocal[1, 2] + nz * own.reciprocal[2, 2],
+        nx * sums.reciprocal[0, 0] + ny * sums.reciprocal[1, 0] + nz * sums.reciprocal[2, 0],
+        nx * sums.reciprocal[0, 1] + ny * sums.reciprocal[1, 1] + nz * sums.reciprocal[2, 1],
+        nx * sums.reciprocal[0, 2] + ny * sums.reciprocal[1, 2] + nz * sums.reciprocal[2, 2],
     )
     k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
     tally[0] += energy
-    add_wave_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+    add_k_vector_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
 
 
 @kernel(inline=True)
-def add_wave_virial(tally, energy, k, slope):
+def add_k_vector_virial(tally, energy, k, slope):
     """Add the virial energy (1 - slope k k) of a wave with an energy proportional to |S|² exp(-k²/4 alpha²)/(k² V).
 
     slope = 2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)
@@ -256,52 +273,52 @@ def add_wave_virial(tally, energy, k, slope):
 
 
 @task(counted=False)
-def _push(parcel, block):
+def _compute_forces(arguments, block):
     """Forces on a share of the sites."""
-    _alpha, over, own = opened(parcel)
-    width = width_of(own.charge)
-    blocks, vectors = len(own.tallies), len(own.charge) // width
+    _alpha, k_vectors, sums = load_arguments(arguments)
+    width = lanes_of(sums.charge)
+    blocks, vectors = len(sums.tallies), len(sums.charge) // width
     for at in range(width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width):
-        zero = fill(0.0, own.charge)
+        zero = broadcast(0.0, sums.charge)
         fx, fy, fz = zero, zero, zero
-        for c in range(len(over.column)):
-            plane = _times(_phase(own, 0, over.column[c, 0], at), _phase(own, 1, over.column[c, 1], at))
+        for c in range(len(k_vectors.column)):
+            plane = _times(_phase(sums, 0, k_vectors.column[c, 0], at), _phase(sums, 1, k_vectors.column[c, 1], at))
             flat, high = zero, zero
-            for n in range(over.count[c]):
-                z = over.column[c, 2] + n
-                phase = _times(plane, _phase(own, 2, z, at))
-                wave = over.column[c, 3] + n
-                push = phase[1] * own.real[wave] - phase[0] * own.imaginary[wave]
+            for n in range(k_vectors.count[c]):
+                z = k_vectors.column[c, 2] + n
+                phase = _times(plane, _phase(sums, 2, z, at))
+                index = k_vectors.column[c, 3] + n
+                push = phase[1] * sums.real[index] - phase[0] * sums.imaginary[index]
                 flat = flat + push
                 high = high + push * (z + 0.0)
-            x, y = over.column[c, 0] + 0.0, over.column[c, 1] + 0.0
-            fx = fx + flat * (x * own.reciprocal[0, 0] + y * own.reciprocal[1, 0]) + high * own.reciprocal[2, 0]
-            fy = fy + flat * (x * own.reciprocal[0, 1] + y * own.reciprocal[1, 1]) + high * own.reciprocal[2, 1]
-            fz = fz + flat * (x * own.reciprocal[0, 2] + y * own.reciprocal[1, 2]) + high * own.reciprocal[2, 2]
-        charge = load(own.charge, at)
+            x, y = k_vectors.column[c, 0] + 0.0, k_vectors.column[c, 1] + 0.0
+            fx = fx + flat * (x * sums.reciprocal[0, 0] + y * sums.reciprocal[1, 0]) + high * sums.reciprocal[2, 0]
+            fy = fy + flat * (x * sums.reciprocal[0, 1] + y * sums.reciprocal[1, 1]) + high * sums.reciprocal[2, 1]
+            fz = fz + flat * (x * sums.reciprocal[0, 2] + y * sums.reciprocal[1, 2]) + high * sums.reciprocal[2, 2]
+        charge = load(sums.charge, at)
         for k, f in enumerate((charge * fx, charge * fy, charge * fz)):
-            store(own.push[k], at, f)
-        for i in range(at, min(at + width, len(own.force))):
+            store(sums.force_by_component[k], at, f)
+        for i in range(at, min(at + width, len(sums.force))):
             for k in range(3):
-                own.force[i, k] = own.push[k, i]
+                sums.force[i, k] = sums.force_by_component[k, i]
 
 
-def sum_of(
-    charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, over: Waves
+def ewald_sum_in_numpy(
+    charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, k_vectors: KVectors
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in NumPy: for single uses."""
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     turns = position @ reciprocal.T
     energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))
-    for (x, y, z, _), count in zip(over.column, over.count, strict=True):
+    for (x, y, z, _), count in zip(k_vectors.column, k_vectors.count, strict=True):
         n = np.stack([np.full(count, x), np.full(count, y), z + np.arange(count)], axis=1)
         k = n @ reciprocal
         k2 = (k**2).sum(axis=1)
         strength = 4 * pi / abs(np.linalg.det(cell)) * np.exp(-k2 / (4 * alpha**2)) / k2
         phase = charge[:, None] * np.exp(1j * (turns @ n.T))
-        total = phase.sum(axis=0)
-        of = strength * np.abs(total) ** 2
+        sum_lanes = phase.sum(axis=0)
+        of = strength * np.abs(sum_lanes) ** 2
         energy += of.sum()
-        force += (2 * strength * (np.conj(total) * phase).imag) @ k
+        force += (2 * strength * (np.conj(sum_lanes) * phase).imag) @ k
         virial += of.sum() * np.eye(3) - np.einsum("k,ki,kj->ij", of * (2 / k2 + 1 / (2 * alpha**2)), k, k)
     return float(energy), force, virial

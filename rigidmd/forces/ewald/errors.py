@@ -13,12 +13,14 @@ from scipy.optimize import brentq
 
 from rigidmd.forces.ewald.splines import aliases
 
-FAREST = 8.0  # alpha times a cut-off: erfc is 1e-29 there
-PROXY = 32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
+MAX_ALPHA_CUTOFF = 8.0  # alpha times a cut-off: erfc is 1e-29 there
+MAX_PROXY_POINTS = (
+    32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
+)
 ORDERS = (4, 5, 6, 7, 8)
 SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
 #: Along an edge: an edge of 0.1 mm has not more.
-MOST_POINTS = 2**16
+MAX_GRID_POINTS = 2**16
 
 
 #: Distances inside molecules that agree to so many digits (Å) count as the same; with many charges all in a bin do.
@@ -62,8 +64,8 @@ def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:
     sums = np.zeros(len(first))
     np.add.at(sums, which, products)
     order = np.argsort(first)
-    told = [round(distance, FINE) for distance in distances[first[order]].tolist()]
-    return np.array([sums[order], told]).T.copy()
+    rounded = [round(distance, FINE) for distance in distances[first[order]].tolist()]
+    return np.array([sums[order], rounded]).T.copy()
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
@@ -78,7 +80,7 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
 
 
-def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
+def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
     """Error from the waves beyond k = radius (1/Å): an integral over all of them.
 
     Like eq. 32 of Kolafa & Perram, but the charges inside a molecule are correlated, and the integral is not expanded
@@ -90,25 +92,25 @@ def wave_error(charges: Charges, alpha: float, radius: float, volume: float) -> 
     return sqrt(charges.square / charges.count * np.trapezoid(density, k) / volume)
 
 
-def wave_radius_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
+def k_cutoff_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
     """The radius of k (1/Å) at which the waves beyond it make this error."""
     volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
     least = np.linalg.norm(reciprocal, axis=1).min()
     longest = 12 * alpha + least
 
     def left(radius: float) -> float:
-        return np.log(max(wave_error(charges, alpha, radius, volume), 1e-300) / error)
+        return np.log(max(k_space_error(charges, alpha, radius, volume), 1e-300) / error)
 
     radius = least if left(0.0) <= 0 else brentq(left, 0.0, longest)
     return max(radius, least) * (1 + 1e-9)
 
 
-def radius_of(count: int, volume: float) -> float:
+def k_cutoff_of_count(count: int, volume: float) -> float:
     """Radius (1/Å) of a sphere in k that holds `count` waves."""
     return (6 * pi**2 * count / volume) ** (1 / 3)
 
 
-def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
+def pme_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
     """Error of smooth PME with the influence function G of `mesh`, on a grid in a cell (3, 3), rows the edges.
 
     A wave k of charge gives waves k' of potential, k and its aliases, with factors G U(k) U(k'). The error is the
@@ -117,15 +119,15 @@ def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int
     """
     grid = np.array(grid)
     volume = abs(np.linalg.det(cell))
-    points = np.minimum(grid, PROXY)
+    points = np.minimum(grid, MAX_PROXY_POINTS)
     proxy = cell * (points / grid)[:, None]
     b = 2 * pi * np.linalg.inv(proxy).T
     metric = b @ b.T
     of = [aliases(int(n), order) for n in points]
     of[2] = type(of[2])(*(part[: points[2] // 2 + 1] for part in of[2]))
-    n2, odd, own, every, first, second = (
+    n2, odd, unaliased, every, first, second = (
         [np.expand_dims(getattr(of[d], name), [e for e in range(3) if e != d]) for d in range(3)]
-        for name in ("n", "odd", "own", "all", "first", "second")
+        for name in ("n", "odd", "unaliased", "all", "first", "second")
     )
     square = weakened = 0.0
     for d in range(3):
@@ -135,7 +137,7 @@ def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int
         weakened = weakened + 2 * metric[d, o] * first[d] * first[o] * every[e]
     square = square * np.ones_like(weakened)
     square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # the wave 0 is excluded
-    kept, whole = own[0] * own[1] * own[2], every[0] * every[1] * every[2]
+    kept, whole = unaliased[0] * unaliased[1] * unaliased[2], every[0] * every[1] * every[2]
     g = 4 * pi / square * np.exp(-square / (4 * alpha**2))
     influence = square * g * kept / (whole * weakened)
     here = charges.form(np.sqrt(square))
@@ -147,11 +149,11 @@ def mesh_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int
     if points[2] % 2 == 0:
         twice[-1] = 1.0
     left = float((wrong * twice).sum()) / (volume * abs(np.linalg.det(proxy)))
-    beyond = wave_error(charges, alpha, radius_of(int(np.prod(grid)), volume), volume)
+    beyond = k_space_error(charges, alpha, k_cutoff_of_count(int(np.prod(grid)), volume), volume)
     return float(np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond))  # rounding can be negative
 
 
-def smooth_size(least: float) -> int:
+def fft_size(least: float) -> int:
     """The smallest number of points, at least `least`, without prime factors above 7: fast for FFTs."""
     n = max(8, int(np.ceil(least - 1e-9)))
     while True:
@@ -164,7 +166,7 @@ def smooth_size(least: float) -> int:
         n += 1
 
 
-def mesh_for(
+def pme_grid_for(
     charges: Charges,
     alpha: float,
     cell: np.ndarray,
@@ -177,24 +179,24 @@ def mesh_for(
     order, grid : fixed, if given
     """
     edges = np.linalg.norm(cell, axis=1)
-    sensible = SPACINGS[edges.max() / SPACINGS <= MOST_POINTS]
-    grids = [tuple(smooth_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
+    sensible = SPACINGS[edges.max() / SPACINGS <= MAX_GRID_POINTS]
+    grids = [tuple(fft_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
     best = None
     for p in ORDERS if order is None else (order,):
         low, high = 0, len(grids)
         while low < high:
             middle = (low + high) // 2
-            if mesh_error(charges, alpha, cell, grids[middle], p) <= error:
+            if pme_error(charges, alpha, cell, grids[middle], p) <= error:
                 high = middle
             else:
                 low = middle + 1
         if low < len(grids):
-            cost = work_of(charges.count, grids[low], p)
+            cost = pme_time(charges.count, grids[low], p)
             if best is None or cost < best[0]:
                 best = (cost, grids[low], p)
     return best[1:] if best else None
 
 
-def work_of(sites: int, grid: tuple[int, int, int], order: int) -> float:
+def pme_time(sites: int, grid: tuple[int, int, int], order: int) -> float:
     """Approximate time (ns) of the reciprocal part on one core; measured with 12288 sites, grids of 32³ to 48³."""
     return sites * (20 + 2.4 * order**2) + 8.0 * float(np.prod(grid))

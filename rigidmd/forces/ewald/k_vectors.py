@@ -8,10 +8,10 @@ import numpy as np
 from rigidmd.compile import BLOCKS
 
 #: The basis of a cell that was not changed from its description.
-AS_GIVEN = np.eye(3, dtype=int)
+SAME_BASIS = np.eye(3, dtype=int)
 
 
-class Waves(NamedTuple):
+class KVectors(NamedTuple):
     """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are their negatives."""
 
     column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, index of that vector in the sum
@@ -25,7 +25,9 @@ class Waves(NamedTuple):
         return 2 * int(self.count.sum())
 
 
-def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = AS_GIVEN) -> Waves:
+def k_vectors_up_to(
+    most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = SAME_BASIS
+) -> KVectors:
     """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if given.
 
     basis (3, 3) : integers; the edges of this cell are `basis` times those of another cell of the same lattice, and the
@@ -37,16 +39,16 @@ def waves(most: tuple[int, int, int], largest_square: int | None = None, basis: 
         other = _in_other(n, basis)
         return (np.abs(other) <= most).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
 
-    return _waves(np.abs(basis) @ most, inside)
+    return _in_columns(np.abs(basis) @ most, inside)
 
 
-def waves_within(
-    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = AS_GIVEN
-) -> Waves:
+def k_vectors_within(
+    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = SAME_BASIS
+) -> KVectors:
     """All n != 0 with |k| up to `radius` (1/Å), and with |n_x|, |n_y|, |n_z| up to `limit` if given.
 
     reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
-    basis : for the limit, see `waves`
+    basis : for the limit, see `k_vectors_up_to`
     """
     cell = 2 * pi * np.linalg.inv(reciprocal).T
     most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
@@ -55,15 +57,15 @@ def waves_within(
         short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
         return short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
 
-    return _waves(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
+    return _in_columns(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
 
 
 def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """The n (..., 3) of the same wave vectors in the other cell, see `waves`."""
+    """The n (..., 3) of the same wave vectors in the other cell, see `k_vectors_up_to`."""
     return n @ np.rint(np.linalg.inv(basis)).astype(int).T
 
 
-def _waves(most, inside) -> Waves:
+def _in_columns(most, inside) -> KVectors:
     mx, my, mz = (int(m) for m in most)
     z = np.arange(-mz, mz + 1)
     columns, counts = [], []
@@ -78,10 +80,10 @@ def _waves(most, inside) -> Waves:
     ends = np.cumsum(count)
     total = int(count.sum())
     blocks = max(1, min(BLOCKS, len(count)))
-    shares = np.searchsorted(ends, np.linspace(0, total, blocks + 1)[1:-1])
-    return Waves(
+    block_ends = np.searchsorted(ends, np.linspace(0, total, blocks + 1)[1:-1])
+    return KVectors(
         np.column_stack([np.concatenate(columns), ends - count]).astype(np.int64),
         count,
         np.array([mx, my, mz]),
-        np.array([0, *shares, len(count)], np.int64),
+        np.array([0, *block_ends, len(count)], np.int64),
     )

@@ -8,9 +8,9 @@ Essmann et al. but the one with the smallest error of the forces (Hockney & East
 Holm 2012, J. Chem. Theory Comput. 8, 936, for forces by differentiation): the same work with smaller errors.
 
 The forces from the grid do not sum to zero, and pairs inside a rigid molecule exert a force on it. Both are part of the
-error that `errors.mesh_error` estimates. Subtracting them would leave forces that are not a gradient.
+error that `errors.pme_error` estimates. Subtracting them would leave forces that are not a gradient.
 
-The work is divided into blocks of planes, of rows of waves, and of sites. Sites are sorted by plane, and each plane is
+The work is divided into blocks of planes, of rows of spectrum_shape, and of sites. Sites are sorted by plane, and each plane is
 written by one block. The number of blocks does not depend on that of threads, so the bits of the result do not either.
 
 This file needs rocket-fft; only scenes with PME import it.
@@ -31,22 +31,22 @@ from rigidmd.compile import (
     implements,
     is_a,
     kernel,
-    opened,
-    packed,
+    load_arguments,
+    pack_arguments,
     task,
 )
-from rigidmd.compile.simd import load_eight, load_four, store, total
+from rigidmd.compile.simd import load_eight, load_four, store, sum_lanes
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.ewald.direct_sum import add_wave_virial, invert_cell
+from rigidmd.forces.ewald.direct_sum import add_k_vector_virial, invert_cell
 from rigidmd.forces.ewald.splines import aliases, weights
 from rigidmd.forces.neighbors.sites import (
     BodySites,
     CentralSites,
     blocks_of,
-    room_for_virial,
     site_tasks,
-    virial_of_molecules,
+    to_molecular_virial,
+    virial_buffer,
 )
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
@@ -55,7 +55,7 @@ PLANES = 16  # of a block, where there are more blocks than the fewest
 SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, and no thread is started
 
 
-class UpToFour(NamedTuple):
+class LowOrderSpline(NamedTuple):
     """Splines of order 3 and 4: weights as vectors of four."""
 
     nodes: tuple[int, ...]  # 0 ... order - 1; its length is a constant at compile time
@@ -63,7 +63,7 @@ class UpToFour(NamedTuple):
     slope: np.ndarray  # (4 (order - 1),) coefficients of their derivatives
 
 
-class UpToEight(NamedTuple):
+class HighOrderSpline(NamedTuple):
     """Splines of order 5 to 8: weights as vectors of eight."""
 
     nodes: tuple[int, ...]
@@ -71,7 +71,7 @@ class UpToEight(NamedTuple):
     slope: np.ndarray
 
 
-class Mesh(NamedTuple):
+class PmeMesh(NamedTuple):
     """The grid and its arrays. Rows of points are longer than the grid, so that splines need not wrap around."""
 
     points: np.ndarray  # (3,) number along a, b, c
@@ -81,17 +81,17 @@ class Mesh(NamedTuple):
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     corner: np.ndarray  # (s, 3) int32 first grid point to which a site is spread
-    part: np.ndarray  # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
+    offset: np.ndarray  # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
     order: np.ndarray  # (s,) int32 sites sorted by the plane of their corner
     first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
-    wave: np.ndarray  # (n_a, n_b, n_c//2 + 1)
+    spectrum: np.ndarray  # (n_a, n_b, n_c//2 + 1)
     influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) factor from waves of charge to waves of potential
     alias: np.ndarray  # (3, 6, most points) splines.Aliases of the axes
     axes: np.ndarray  # (3, 1) numbers of the axes, for the transforms
     tallies: np.ndarray  # (blocks, 10)
-    virial: np.ndarray  # see `room_for_virial`
-    lost: np.ndarray  # (blocks,) whether a position is not finite
+    virial: np.ndarray  # see `virial_buffer`
+    not_finite: np.ndarray  # (blocks,) whether a position is not finite
     weight: np.ndarray  # (blocks, 64) the weights of one site, which are read one by one
 
 
@@ -115,14 +115,14 @@ class Pme(NamedTuple):
         value = np.zeros((order, width))
         value[:, :order] = weights(order)
         slope = value[1:] * np.arange(1, order)[:, None]
-        spline = (UpToFour if width == 4 else UpToEight)(
+        spline = (LowOrderSpline if width == 4 else HighOrderSpline)(
             tuple(range(order)), value.ravel().astype(kind), slope.ravel().astype(kind)
         )
         table = np.zeros((3, 6, max(grid)))
         for d in range(3):
             table[d, :, : grid[d]] = aliases(grid[d], order)
-        waves = (grid[0], grid[1], grid[2] // 2 + 1)
-        mesh = Mesh(
+        spectrum_shape = (grid[0], grid[1], grid[2] // 2 + 1)
+        mesh = PmeMesh(
             points=np.array(grid, np.int64),
             bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
             cell=np.zeros((3, 3)),
@@ -130,17 +130,17 @@ class Pme(NamedTuple):
             position=np.zeros((s, 3)),
             force=np.zeros((s, 3)),
             corner=np.zeros((s, 3), np.int32),
-            part=np.zeros((s, 4), kind),
+            offset=np.zeros((s, 4), kind),
             order=np.zeros(s, np.int32),
             first=np.zeros(grid[0] + 1, np.int64),
             grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
-            wave=np.zeros(waves, pair),
-            influence=np.zeros(waves, kind),
+            spectrum=np.zeros(spectrum_shape, pair),
+            influence=np.zeros(spectrum_shape, kind),
             alias=table,
             axes=np.arange(3)[:, None],
             tallies=np.zeros((blocks, TALLY_SIZE)),
-            virial=room_for_virial(),
-            lost=np.zeros(blocks, np.bool_),
+            virial=virial_buffer(),
+            not_finite=np.zeros(blocks, np.bool_),
             weight=np.zeros((blocks, 64), kind),
         )
         return PmeWorkspace(self.alpha, self.charge, self.sites, spline, mesh)
@@ -152,8 +152,8 @@ class PmeWorkspace(NamedTuple):
     alpha: float
     charge: np.ndarray
     sites: BodySites | CentralSites
-    spline: UpToFour | UpToEight
-    mesh: Mesh
+    spline: LowOrderSpline | HighOrderSpline
+    mesh: PmeMesh
     code: Code | None = None
 
     @property
@@ -164,8 +164,17 @@ class PmeWorkspace(NamedTuple):
     def with_code(self) -> "PmeWorkspace":
         """With its machine code."""
         content = (self.alpha, self.charge, self.spline, self.mesh)
-        tasks = (_weigh, _scale, _sort, _spread, _convolve, _convolve_and_count, _back, _pull)
-        names = ("weigh", "scale", "sort", "spread", "convolve", "convolve_and_count", "back", "pull")
+        tasks = (
+            _set_influence,
+            _scale_positions,
+            _sort_sites,
+            _spread_charges,
+            _convolve,
+            _convolve_with_virial,
+            _transform_back,
+            _interpolate_forces,
+        )
+        names = ("influence", "scale", "sort", "spread", "convolve", "convolve_with_virial", "back", "forces")
         found = {name: (one, content) for name, one in zip(names, tasks, strict=True)}
         moved = site_tasks(self.sites, self.mesh.position, self.mesh.force, self.mesh.virial)
         return self._replace(code=Code(**found, **moved))
@@ -175,37 +184,37 @@ class PmeWorkspace(NamedTuple):
 def _add_pme(term, state, load, tally):
     code, mesh = term.code, term.mesh
     blocks = len(mesh.tallies)
-    parcel = packed((term.alpha, term.charge, term.spline, mesh))
-    placed, molecules = packed((term.sites, state, mesh.position)), blocks_of(len(state.position))
-    call_blocks(code, "place", placed, molecules)
+    arguments = pack_arguments((term.alpha, term.charge, term.spline, mesh))
+    placed, molecules = pack_arguments((term.sites, state, mesh.position)), blocks_of(len(state.position))
+    call_blocks(code, "positions", placed, molecules)
     if follow_cell(state.cell, mesh.cell):
         invert_cell(mesh.cell, mesh.reciprocal)
-        call_blocks(code, "weigh", parcel, blocks)
-    call_blocks(code, "scale", parcel, blocks)
+        call_blocks(code, "influence", arguments, blocks)
+    call_blocks(code, "scale", arguments, blocks)
     for block in range(blocks):
-        if mesh.lost[block]:
+        if mesh.not_finite[block]:
             return NOT_FINITE
-    call(code, "sort", parcel)
-    call_blocks(code, "spread", parcel, blocks)
+    call(code, "sort", arguments)
+    call_blocks(code, "spread", arguments, blocks)
     if tally is None:
-        call_blocks(code, "convolve", parcel, blocks)
+        call_blocks(code, "convolve", arguments, blocks)
     else:
-        call_blocks(code, "convolve_and_count", parcel, blocks)
-    call_blocks(code, "back", parcel, blocks)
-    call_blocks(code, "pull", parcel, blocks)
+        call_blocks(code, "convolve_with_virial", arguments, blocks)
+    call_blocks(code, "back", arguments, blocks)
+    call_blocks(code, "forces", arguments, blocks)
     if tally is not None:
         for block in range(blocks):
             for k in range(len(tally)):
                 tally[k] += mesh.tallies[block, k]
-        virial_of_molecules(term.sites, code, state, mesh.force, mesh.virial, tally)
-    call_blocks(code, "load", packed((term.sites, state, load, mesh.force)), molecules)
+        to_molecular_virial(term.sites, code, state, mesh.force, mesh.virial, tally)
+    call_blocks(code, "load", pack_arguments((term.sites, state, load, mesh.force)), molecules)
     return OK
 
 
 @task(counted=False)
-def _weigh(parcel, block):
+def _set_influence(arguments, block):
     """Influence function for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
-    alpha, _charge, _spline, mesh = opened(parcel)
+    alpha, _charge, _spline, mesh = load_arguments(arguments)
     b, of = mesh.reciprocal, mesh.alias
     volume = (
         8
@@ -216,9 +225,9 @@ def _weigh(parcel, block):
             + b[0, 2] * (b[1, 0] * b[2, 1] - b[1, 1] * b[2, 0])
         )
     )
-    for x in range(mesh.wave.shape[0]):
+    for x in range(mesh.spectrum.shape[0]):
         for y in range(mesh.bounds[1, block], mesh.bounds[1, block + 1]):
-            for z in range(mesh.wave.shape[2]):
+            for z in range(mesh.spectrum.shape[2]):
                 at = (x, y, z)
                 square = weakened = 0.0
                 for d in range(3):
@@ -232,19 +241,19 @@ def _weigh(parcel, block):
                             last = 3 - d - e
                             square += metric * of[d, 1, at[d]] * of[e, 1, at[e]]
                             weakened += metric * of[d, 4, at[d]] * of[e, 4, at[e]] * of[last, 3, at[last]]
-                own = of[0, 2, x] * of[1, 2, y] * of[2, 2, z]
+                unaliased = of[0, 2, x] * of[1, 2, y] * of[2, 2, z]
                 whole = of[0, 3, x] * of[1, 3, y] * of[2, 3, z]
                 mesh.influence[x, y, z] = 0.0
                 if x + y + z > 0:
                     g = 4 * pi / volume * np.exp(-square / (4 * alpha * alpha))
-                    mesh.influence[x, y, z] = g * own / (whole * weakened)
+                    mesh.influence[x, y, z] = g * unaliased / (whole * weakened)
 
 
 @task(counted=False)
-def _scale(parcel, block):
+def _scale_positions(arguments, block):
     """Positions of a share of the sites in grid cells."""
-    _alpha, charge, _spline, mesh = opened(parcel)
-    mesh.lost[block] = False
+    _alpha, charge, _spline, mesh = load_arguments(arguments)
+    mesh.not_finite[block] = False
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         for d in range(3):
             turns = (
@@ -254,18 +263,18 @@ def _scale(parcel, block):
             ) * (0.5 / pi)
             x = (turns - np.floor(turns)) * mesh.points[d]
             if not abs(x) < 1e9:
-                mesh.lost[block] = True
+                mesh.not_finite[block] = True
                 return
             corner = int(x)
-            mesh.part[i, d] = x - corner - 0.5
+            mesh.offset[i, d] = x - corner - 0.5
             mesh.corner[i, d] = corner if corner < mesh.points[d] else 0
-        mesh.part[i, 3] = charge[i]
+        mesh.offset[i, 3] = charge[i]
 
 
 @task(counted=False)
-def _sort(parcel, block):
+def _sort_sites(arguments, block):
     """Sort sites by the plane of their corner; the sort is stable."""
-    _alpha, _charge, _spline, mesh = opened(parcel)
+    _alpha, _charge, _spline, mesh = load_arguments(arguments)
     first = mesh.first
     first[:] = 0
     for i in range(len(mesh.order)):
@@ -281,48 +290,48 @@ def _sort(parcel, block):
     first[0] = 0
 
 
-def few(spline, array, index):
+def load_vector(spline, array, index):
     """Numbers of an array from an index on, as a vector of four or eight, like the spline's weights."""
     raise TypeError("compiled code only")
 
 
-@implements(few, inline=True, counted=False)
-def _few(spline, array, index):
-    if is_a(spline, UpToFour):
+@implements(load_vector, inline=True, counted=False)
+def _load_vector(spline, array, index):
+    if is_a(spline, LowOrderSpline):
         return lambda spline, array, index: load_four(array, index)
     return lambda spline, array, index: load_eight(array, index)
 
 
 @kernel(inline=True, counted=False)
-def weights_at(spline, part):
+def weights_at(spline, offset):
     """Weights of the grid points from the corner on, as a vector."""
-    return _polynomials(spline, spline.value, spline.nodes, part)
+    return _polynomials(spline, spline.value, spline.nodes, offset)
 
 
 @kernel(inline=True, counted=False)
-def slopes_at(spline, part):
+def slopes_at(spline, offset):
     """Derivatives of these weights, per grid cell."""
-    return _polynomials(spline, spline.slope, spline.nodes[1:], part)
+    return _polynomials(spline, spline.slope, spline.nodes[1:], offset)
 
 
 @kernel(inline=True, counted=False)
-def _polynomials(spline, coefficients, powers, part):
-    """Polynomials in `part`, one in each lane, from coefficients (powers width,).
+def _polynomials(spline, coefficients, powers, offset):
+    """Polynomials in `offset`, one in each lane, from coefficients (powers width,).
 
     powers : a tuple, whose length is a constant at compile time, so that the loop is unrolled
     """
     terms = len(powers)
     width = len(coefficients) // terms
-    found = few(spline, coefficients, width * (terms - 1))
+    found = load_vector(spline, coefficients, width * (terms - 1))
     for j in range(terms - 2, -1, -1):
-        found = found * part + few(spline, coefficients, width * j)
+        found = found * offset + load_vector(spline, coefficients, width * j)
     return found
 
 
 @task(counted=False)
-def _spread(parcel, block):
+def _spread_charges(arguments, block):
     """Spread charges over the planes of a block, and transform them within the planes."""
-    _alpha, _charge, spline, mesh = opened(parcel)
+    _alpha, _charge, spline, mesh = load_arguments(arguments)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
@@ -333,9 +342,9 @@ def _spread(parcel, block):
         corner += na if corner < 0 else 0
         for n in range(mesh.first[corner], mesh.first[corner + 1]):
             i = mesh.order[n]
-            store(weight, 0, weights_at(spline, mesh.part[i, 0]))
-            store(weight, 8, weights_at(spline, mesh.part[i, 1]))
-            z = weights_at(spline, mesh.part[i, 2]) * mesh.part[i, 3]
+            store(weight, 0, weights_at(spline, mesh.offset[i, 0]))
+            store(weight, 8, weights_at(spline, mesh.offset[i, 1]))
+            z = weights_at(spline, mesh.offset[i, 2]) * mesh.offset[i, 3]
             b, c = mesh.corner[i, 1], mesh.corner[i, 2]
             for j in range(order):
                 plane = corner + j
@@ -343,7 +352,7 @@ def _spread(parcel, block):
                 if low <= plane < high:
                     for k in range(order):
                         row = grid[plane, b + k]
-                        store(row, c, few(spline, row, c) + z * (weight[j] * weight[8 + k]))
+                        store(row, c, load_vector(spline, row, c) + z * (weight[j] * weight[8 + k]))
     for plane in range(low, high):
         for k in range(order - 1):
             for c in range(nc + order - 1):
@@ -351,19 +360,19 @@ def _spread(parcel, block):
         for b in range(nb):
             for c in range(order - 1):
                 grid[plane, b, c] += grid[plane, b, nc + c]
-    r2c(grid[low:high, :nb, :nc], mesh.wave[low:high], mesh.axes[2], True, 1.0, 1)
-    c2c(mesh.wave[low:high], mesh.wave[low:high], mesh.axes[1], True, 1.0, 1)
+    r2c(grid[low:high, :nb, :nc], mesh.spectrum[low:high], mesh.axes[2], True, 1.0, 1)
+    c2c(mesh.spectrum[low:high], mesh.spectrum[low:high], mesh.axes[1], True, 1.0, 1)
 
 
 @task(counted=False)
-def _convolve(parcel, block):
-    alpha, _charge, _spline, mesh = opened(parcel)
+def _convolve(arguments, block):
+    alpha, _charge, _spline, mesh = load_arguments(arguments)
     convolve_block(alpha, mesh, None, block)
 
 
 @task(counted=False)
-def _convolve_and_count(parcel, block):
-    alpha, _charge, _spline, mesh = opened(parcel)
+def _convolve_with_virial(arguments, block):
+    alpha, _charge, _spline, mesh = load_arguments(arguments)
     convolve_block(alpha, mesh, mesh.tallies, block)
 
 
@@ -371,15 +380,15 @@ def _convolve_and_count(parcel, block):
 def convolve_block(alpha, mesh, tallies, block):
     """From waves of charge to waves of potential for a block of rows; energy and virial into `tallies` unless None."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
-    wave, of, b = mesh.wave, mesh.alias, mesh.reciprocal
+    spectrum, of, b = mesh.spectrum, mesh.alias, mesh.reciprocal
     if tallies is not None:
         tallies[block] = 0.0
-    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], True, 1.0, 1)
-    for x in range(wave.shape[0]):
+    c2c(spectrum[:, low:high], spectrum[:, low:high], mesh.axes[0], True, 1.0, 1)
+    for x in range(spectrum.shape[0]):
         for y in range(low, high):
-            for z in range(wave.shape[2]):
-                value, strength = wave[x, y, z], mesh.influence[x, y, z]
-                wave[x, y, z] = value * strength
+            for z in range(spectrum.shape[2]):
+                value, strength = spectrum[x, y, z], mesh.influence[x, y, z]
+                spectrum[x, y, z] = value * strength
                 if tallies is not None and x + y + z > 0:
                     n = (of[0, 0, x], of[1, 0, y], of[2, 0, z])
                     k = (
@@ -389,24 +398,24 @@ def convolve_block(alpha, mesh, tallies, block):
                     )
                     k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
                     # waves with n_c and -n_c are stored once, unless they are the same
-                    share = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
+                    multiplicity = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
-                    energy = share * strength * (real * real + imaginary * imaginary)
+                    energy = multiplicity * strength * (real * real + imaginary * imaginary)
                     tallies[block, 0] += energy
-                    add_wave_virial(tallies[block], energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
-    c2c(wave[:, low:high], wave[:, low:high], mesh.axes[0], False, 1.0, 1)
+                    add_k_vector_virial(tallies[block], energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+    c2c(spectrum[:, low:high], spectrum[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
 @task(counted=False)
-def _back(parcel, block):
+def _transform_back(arguments, block):
     """Transform the planes of a block back to the potential."""
-    _alpha, _charge, spline, mesh = opened(parcel)
+    _alpha, _charge, spline, mesh = load_arguments(arguments)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     nb, nc = mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
     grid = mesh.grid
-    c2c(mesh.wave[low:high], mesh.wave[low:high], mesh.axes[1], False, 1.0, 1)
-    c2r(mesh.wave[low:high], grid[low:high, :nb, :nc], mesh.axes[2], False, 1.0, 1)
+    c2c(mesh.spectrum[low:high], mesh.spectrum[low:high], mesh.axes[1], False, 1.0, 1)
+    c2r(mesh.spectrum[low:high], grid[low:high, :nb, :nc], mesh.axes[2], False, 1.0, 1)
     for plane in range(low, high):
         for b in range(nb):
             for c in range(order - 1):
@@ -417,20 +426,20 @@ def _back(parcel, block):
 
 
 @task(counted=False)
-def _pull(parcel, block):
+def _interpolate_forces(arguments, block):
     """Forces on a share of the sites: minus the gradient of the potential at each site, times its charge."""
-    _alpha, charge, spline, mesh = opened(parcel)
+    _alpha, charge, spline, mesh = load_arguments(arguments)
     na = mesh.points[0]
     order = len(spline.nodes)
     grid, weight = mesh.grid, mesh.weight[block]
     for n in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         i = mesh.order[n]
-        store(weight, 0, weights_at(spline, mesh.part[i, 0]))
-        store(weight, 8, weights_at(spline, mesh.part[i, 1]))
-        store(weight, 16, slopes_at(spline, mesh.part[i, 0]))
-        store(weight, 24, slopes_at(spline, mesh.part[i, 1]))
-        z = weights_at(spline, mesh.part[i, 2])
-        dz = slopes_at(spline, mesh.part[i, 2])
+        store(weight, 0, weights_at(spline, mesh.offset[i, 0]))
+        store(weight, 8, weights_at(spline, mesh.offset[i, 1]))
+        store(weight, 16, slopes_at(spline, mesh.offset[i, 0]))
+        store(weight, 24, slopes_at(spline, mesh.offset[i, 1]))
+        z = weights_at(spline, mesh.offset[i, 2])
+        dz = slopes_at(spline, mesh.offset[i, 2])
         a, b, c = mesh.corner[i, 0], mesh.corner[i, 1], mesh.corner[i, 2]
         nothing = z * 0.0
         along_a = nothing
@@ -442,14 +451,14 @@ def _pull(parcel, block):
             flat = nothing
             tilted = nothing
             for k in range(order):
-                row = few(spline, grid[plane, b + k], c)
+                row = load_vector(spline, grid[plane, b + k], c)
                 flat = flat + row * weight[8 + k]
                 tilted = tilted + row * weight[24 + k]
             along_a = along_a + flat * weight[16 + j]
             along_b = along_b + tilted * weight[j]
             along_c = along_c + flat * weight[j]
-        ga = -charge[i] * mesh.points[0] * total(along_a * z) * (0.5 / pi)
-        gb = -charge[i] * mesh.points[1] * total(along_b * z) * (0.5 / pi)
-        gc = -charge[i] * mesh.points[2] * total(along_c * dz) * (0.5 / pi)
+        ga = -charge[i] * mesh.points[0] * sum_lanes(along_a * z) * (0.5 / pi)
+        gb = -charge[i] * mesh.points[1] * sum_lanes(along_b * z) * (0.5 / pi)
+        gc = -charge[i] * mesh.points[2] * sum_lanes(along_c * dz) * (0.5 / pi)
         for k in range(3):
             mesh.force[i, k] = ga * mesh.reciprocal[0, k] + gb * mesh.reciprocal[1, k] + gc * mesh.reciprocal[2, k]

@@ -26,7 +26,7 @@ class Aliases(NamedTuple):
 
     n: np.ndarray  # -K/2 < n <= K/2
     odd: np.ndarray  # n, but 0 where n and -n are the same wave
-    own: np.ndarray  # U(n)²
+    unaliased: np.ndarray  # U(n)²
     all: np.ndarray  # sum over m of U(n + m K)²
     first: np.ndarray  # sum of (n + m K) U²
     second: np.ndarray  # sum of (n + m K)² U²

@@ -22,7 +22,7 @@ import numpy as np
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import NOW, OK
 from rigidmd.forces.terms import add_forces, energy_rate
-from rigidmd.mechanics.translation import along
+from rigidmd.mechanics.translation import body_component
 
 
 class ElectricField(NamedTuple):
@@ -56,7 +56,7 @@ class OscillatingField(NamedTuple):
     frequency: float  # angular, rad/ps
     phase: float  # rad
 
-    drives = True
+    time_dependent = True
     changes_momentum = ElectricField.changes_momentum
     tied_to_places = ElectricField.tied_to_places
 
@@ -75,22 +75,22 @@ def _add_electric_field(term, state, load, tally):
 
 
 @kernel
-def _add_field(term, state, load, tally, share):
-    """Forces, torques and energy of `share` times the field."""
+def _add_field(term, state, load, tally, factor):
+    """Forces, torques and energy of `factor` times the field."""
     for m in range(len(state.position)):
         kind = term.species[m]
         for k in range(3):
-            load.force[m, k] += share * term.charge[kind] * term.field[k]
+            load.force[m, k] += factor * term.charge[kind] * term.field[k]
     for m in range(len(state.rotation)):
         mu, q = term.dipole_body[term.species[m]], state.rotation[m]
-        a = share * along(q, term.field, 0)
-        b = share * along(q, term.field, 1)
-        c = share * along(q, term.field, 2)
+        a = factor * body_component(q, term.field, 0)
+        b = factor * body_component(q, term.field, 1)
+        c = factor * body_component(q, term.field, 2)
         load.torque_body[m, 0] += mu[1] * c - mu[2] * b
         load.torque_body[m, 1] += mu[2] * a - mu[0] * c
         load.torque_body[m, 2] += mu[0] * b - mu[1] * a
     if tally is not None:
-        tally[0] -= share * _along_moment(term, state)
+        tally[0] -= factor * _along_moment(term, state)
     return OK
 
 
@@ -105,7 +105,7 @@ def _along_moment(term, state):
     for m in range(len(state.rotation)):
         mu = term.dipole_body[term.species[m]]
         for k in range(3):
-            total += mu[k] * along(state.rotation[m], term.field, k)
+            total += mu[k] * body_component(state.rotation[m], term.field, k)
     return total
 
 

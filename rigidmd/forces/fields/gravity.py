@@ -9,7 +9,7 @@ from rigidmd.core.state import OK
 from rigidmd.forces.terms import add_forces
 
 
-class Weight(NamedTuple):
+class Gravity(NamedTuple):
     """U = -sum m g . R: the force m g at each centre of mass R, which is never wrapped."""
 
     species: np.ndarray  # (n,) int32
@@ -24,7 +24,7 @@ class Weight(NamedTuple):
         return self.acceleration != 0
 
 
-@implements(add_forces, Weight)
+@implements(add_forces, Gravity)
 def _add_weight(term, state, load, tally):
     for m in range(len(state.position)):
         mass = term.mass[term.species[m]]

@@ -16,7 +16,7 @@ class Restraints(NamedTuple):
     """
 
     molecule: np.ndarray  # (r,) int64, each once
-    place: np.ndarray  # (r, 3) lab frame, Å
+    reference: np.ndarray  # (r, 3) lab frame, Å
     stiffness: np.ndarray  # (3,) along x, y, z, u/ps²
 
     tied_to_places = True
@@ -32,7 +32,7 @@ def _add_restraints(term, state, load, tally):
     for r in range(len(term.molecule)):
         m = term.molecule[r]
         for k in range(3):
-            away = state.position[m, k] - term.place[r, k]
+            away = state.position[m, k] - term.reference[r, k]
             load.force[m, k] -= term.stiffness[k] * away
             if tally is not None:
                 tally[0] += 0.5 * term.stiffness[k] * away * away

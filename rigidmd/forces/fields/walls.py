@@ -16,7 +16,7 @@ import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import BEHIND_WALL, NOT_FINITE, OK, State
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, place
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, locate_site
 from rigidmd.forces.terms import add_forces
 
 
@@ -38,7 +38,7 @@ class LennardJonesWalls(NamedTuple):
         """Components (3,) of the total momentum that they change: the one across them."""
         return np.arange(3) == self.axis
 
-    def behind(self, state: State) -> "Behind | None":
+    def behind(self, state: State) -> "SiteBehindWall | None":
         """The site that is furthest behind a wall, or on it; None where all are before it."""
         x = _across(self, state)
         if not len(x):
@@ -49,7 +49,7 @@ class LennardJonesWalls(NamedTuple):
         if depth < 0:
             return None
         wall = self.lower if x[site] <= self.lower else self.upper
-        return Behind(int(self.sites.molecule[site]), self.axis, float(x[site]), wall)
+        return SiteBehindWall(int(self.sites.molecule[site]), self.axis, float(x[site]), wall)
 
 
 class HarmonicWalls(NamedTuple):
@@ -65,7 +65,7 @@ class HarmonicWalls(NamedTuple):
     tied_to_places = True
 
 
-class Behind(NamedTuple):
+class SiteBehindWall(NamedTuple):
     """Where a site is behind a wall."""
 
     molecule: int
@@ -87,13 +87,13 @@ def _across(walls: LennardJonesWalls, state: State) -> np.ndarray:
     return x + np.einsum("sj,sj->s", state.rotation[m, walls.axis], walls.sites.offsets())
 
 
-def push_site(sites, state, load, m, i, axis, force):
+def add_site_force(sites, state, load, m, i, axis, force):
     """Add a force along an axis of the lab on site i of molecule m to the molecule's force and torque."""
     raise TypeError("compiled code only")
 
 
-@implements(push_site, inline=True)
-def _push_site(sites, state, load, m, i, axis, force):
+@implements(add_site_force, inline=True)
+def _add_site_force(sites, state, load, m, i, axis, force):
     if is_a(sites, CentralSites):
 
         def push_centre(sites, state, load, m, i, axis, force):
@@ -114,24 +114,24 @@ def _push_site(sites, state, load, m, i, axis, force):
 
 @implements(add_forces, LennardJonesWalls)
 def _add_lennard_jones_walls(term, state, load, tally):
-    at_cutoff = _nine_three(term.sigma / term.cutoff)[0]
+    at_cutoff = _lj93(term.sigma / term.cutoff)[0]
     for m in range(len(state.position)):
         for i in range(term.sites.first[m], term.sites.first[m + 1]):
-            x = place(term.sites, state, m, i)[term.axis]
+            x = locate_site(term.sites, state, m, i)[term.axis]
             for outward, distance in ((1.0, x - term.lower), (-1.0, term.upper - x)):
                 if not distance > 0:
                     return NOT_FINITE if isnan(distance) else BEHIND_WALL
                 if distance < term.cutoff:
-                    energy, slope = _nine_three(term.sigma / distance)
+                    energy, slope = _lj93(term.sigma / distance)
                     force = outward * term.epsilon * slope / distance
-                    push_site(term.sites, state, load, m, i, term.axis, force)
+                    add_site_force(term.sites, state, load, m, i, term.axis, force)
                     if tally is not None:
                         tally[0] += term.epsilon * (energy - at_cutoff)
     return OK
 
 
 @kernel(inline=True)
-def _nine_three(s):
+def _lj93(s):
     """(2/15) s^9 - s^3 with s = sigma/d; and -d times its derivative by d."""
     s3 = s * s * s
     s9 = s3 * s3 * s3
@@ -142,11 +142,11 @@ def _nine_three(s):
 def _add_harmonic_walls(term, state, load, tally):
     for m in range(len(state.position)):
         for i in range(term.sites.first[m], term.sites.first[m + 1]):
-            x = place(term.sites, state, m, i)[term.axis]
+            x = locate_site(term.sites, state, m, i)[term.axis]
             for outward, depth in ((1.0, term.lower - x), (-1.0, x - term.upper)):
                 if depth > 0:
                     force = outward * term.stiffness * depth
-                    push_site(term.sites, state, load, m, i, term.axis, force)
+                    add_site_force(term.sites, state, load, m, i, term.axis, force)
                     if tally is not None:
                         tally[0] += 0.5 * term.stiffness * depth * depth
     return OK

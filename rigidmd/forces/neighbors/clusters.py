@@ -11,14 +11,24 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
-from rigidmd.compile.simd import bits, item, lane_count, largest, load, root, store, width_of, zeros
-from rigidmd.forces.neighbors.sites import first_of_slot, place, place_ahead
+from rigidmd.compile.simd import (
+    lane_count,
+    lanes_of,
+    largest_lane,
+    load,
+    load_scalar,
+    mask_bits,
+    square_root,
+    store,
+    zeros,
+)
+from rigidmd.forces.neighbors.sites import index_of_x, locate_site, predict_site
 
-SERIAL_SITES = 128  # up to this number there is one block
+MAX_SERIAL_SITES = 128  # up to this number there is one block
 
 
 class Clusters(NamedTuple):
-    """The sites of one law in clusters. The last cluster is padded with copies of the last site."""
+    """The sites of one potential in clusters. The last cluster is padded with copies of the last site."""
 
     bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
     slot: np.ndarray  # (s,) int32 the slot of each site
@@ -31,7 +41,7 @@ class Clusters(NamedTuple):
     half_square: np.ndarray  # (slots,) half the squares of `reference` as vectors, Å²
     reference: np.ndarray  # (3 slots,) the places for which the sites were sorted, as `local`
     moved: np.ndarray  # (slots,) distance of each site from there, Å
-    farthest: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
+    largest_displacement: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
     extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
 
 
@@ -41,7 +51,7 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
     count = max(1, ceil(sites / width))
     # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as the cut-off. So the
     # number of blocks grows as the edge of the box: memory for the sums is then in proportion to the sites.
-    blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > SERIAL_SITES else 1
+    blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > MAX_SERIAL_SITES else 1
     slots = count * width
     scratch = zeros(3 * slots, dtype)
     half_square, order, group = scratch.reshape(3, slots)
@@ -58,7 +68,7 @@ def clusters_of(sites: int, dtype: type) -> Clusters:
         reference=zeros(3 * slots, dtype),
         moved=zeros(slots, dtype),
         extent=np.zeros((blocks, 6)),
-        farthest=np.zeros(blocks),
+        largest_displacement=np.zeros(blocks),
     )
 
 
@@ -71,28 +81,28 @@ def order_of(clusters: Clusters) -> np.ndarray:
 
 
 @kernel(inline=True)
-def _share(sites, blocks, block):
+def _molecules_of_block(sites, blocks, block):
     """The first molecule of a block, and the first after it."""
     n = len(sites.first) - 1
     return n * block // blocks, n * (block + 1) // blocks
 
 
 @kernel(counted=False)
-def wrap_block(clusters, cell, sites, state, lead, farthest, block):
-    """Places in the brick of the sites of a share of the molecules, for `bin_block` into `local`, and their extent.
+def wrap_sites_of_block(clusters, cell, sites, state, lead, largest_displacement, block):
+    """Places in the brick of the sites of a share of the molecules, for `bin_sites_of_block` into `local`, and their extent.
 
     The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
-    places are those ahead by a time `lead`, see `place_ahead`. The extent is NaN if a coordinate is farther from the
-    origin than `farthest`, or is not finite.
+    places are those ahead by a time `lead`, see `predict_site`. The extent is NaN if a coordinate is farther from the
+    origin than `largest_displacement`, or is not finite.
     """
     extent, local = clusters.extent[block], clusters.local
     for k in range(3):
         extent[k], extent[3 + k] = inf, -inf
-    first, end = _share(sites, len(clusters.extent), block)
+    first, end = _molecules_of_block(sites, len(clusters.extent), block)
     for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
             at = _ahead(sites, state, m, i, lead)
-            if not abs(at[0]) + abs(at[1]) + abs(at[2]) < farthest:
+            if not abs(at[0]) + abs(at[1]) + abs(at[2]) < largest_displacement:
                 extent[0] = nan
                 return
             _count_boxes(clusters.boxes, cell, i, at)
@@ -104,7 +114,7 @@ def wrap_block(clusters, cell, sites, state, lead, farthest, block):
 
 
 @kernel(counted=False)
-def bin_block(clusters, sites, block):
+def bin_sites_of_block(clusters, sites, block):
     """Bins of the sites of a share of the molecules, and heights within bins, into `slot` and `moved`.
 
     Bins form columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that
@@ -112,7 +122,7 @@ def bin_block(clusters, sites, block):
     """
     low, extent, (nx, ny, nz) = _bins(clusters)
     local = clusters.local
-    first, end = _share(sites, len(clusters.extent), block)
+    first, end = _molecules_of_block(sites, len(clusters.extent), block)
     for i in range(sites.first[first], sites.first[end]):
         height = local[3 * i + 2]
         x = _bin(local[3 * i] - low[0], extent[0], nx)
@@ -126,7 +136,7 @@ def bin_block(clusters, sites, block):
 
 @kernel
 def sort_into_clusters(clusters):
-    """Sort sites by bin and height; `settle_block` must follow. False if the extent is not finite."""
+    """Sort sites by bin and height; `set_origins_of_block` must follow. False if the extent is not finite."""
     s = len(clusters.slot)
     _, extent, (nx, ny, nz) = _bins(clusters)
     if not extent[0] >= 0:
@@ -168,7 +178,7 @@ def _bins(clusters):
         lost |= of[0] != of[0]
     x, y, z = nan if lost else high[0] - low[0], high[1] - low[1], high[2] - low[2]
     s = len(clusters.slot)
-    edge = (x * y * z * width_of(clusters.local) / s) ** (1 / 3)
+    edge = (x * y * z * lanes_of(clusters.local) / s) ** (1 / 3)
     nx = max(1, min(s, round(x / edge))) if edge > 0 else 1
     ny = max(1, min(s // nx, round(y / edge))) if edge > 0 else 1
     return low, (x, y, z), (nx, ny, max(1, s // (nx * ny)))
@@ -209,9 +219,9 @@ def _bin(x, extent, count):
 
 
 @kernel(counted=False)
-def settle_block(clusters, cell, sites, state, lead, group, block):
+def set_origins_of_block(clusters, cell, sites, state, lead, group, block):
     """Origins and references of newly sorted clusters; the origin is the middle of the bounding box."""
-    width = width_of(clusters.local)
+    width = lanes_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         base = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
@@ -246,8 +256,8 @@ def _ahead_in_brick(clusters, cell, sites, state, i, lead):
 
 @kernel(inline=True)
 def _ahead(sites, state, m, i, lead):
-    """`place_ahead`, or the present place, for which no velocity has to be a number."""
-    return place_ahead(sites, state, m, i, lead) if lead != 0.0 else place(sites, state, m, i)
+    """`predict_site`, or the present place, for which no velocity has to be a number."""
+    return predict_site(sites, state, m, i, lead) if lead != 0.0 else locate_site(sites, state, m, i)
 
 
 @kernel(inline=True)
@@ -271,9 +281,9 @@ def _pair_up(order, at, width, first, end):
 
 
 @kernel(counted=False)
-def settle_again(clusters):
-    """Distances as `settle_block` left them, from order, origin and reference."""
-    width = width_of(clusters.local)
+def restore_half_squares(clusters):
+    """Distances as `set_origins_of_block` left them, from order, origin and reference."""
+    width = lanes_of(clusters.local)
     for slot in range(len(clusters.order)):
         clusters.half_square[slot] = 0.0
         for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
@@ -281,40 +291,40 @@ def settle_again(clusters):
 
 
 @kernel(counted=False)
-def place_block(clusters, cell, sites, state, block):
+def set_local_of_block(clusters, cell, sites, state, block):
     """Set `local` of the sites of a share of the molecules to the present positions of the molecules.
 
     The slots without a site stay at their references.
     """
-    width = width_of(clusters.local)
+    width = lanes_of(clusters.local)
     local, origin = clusters.local, clusters.origin
-    first, end = _share(sites, len(clusters.extent), block)
+    first, end = _molecules_of_block(sites, len(clusters.extent), block)
     for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
-            x, y, z = _in_brick(clusters.boxes, cell, i, place(sites, state, m, i))
-            slot = item(clusters.slot, i)
-            at, c = first_of_slot(slot, width), 4 * (np.uint32(slot) // np.uint32(width))
-            local[np.uint64(at)] = x - item(origin, c)
-            local[np.uint64(at + width)] = y - item(origin, c + 1)
-            local[np.uint64(at + 2 * width)] = z - item(origin, c + 2)
+            x, y, z = _in_brick(clusters.boxes, cell, i, locate_site(sites, state, m, i))
+            slot = load_scalar(clusters.slot, i)
+            at, c = index_of_x(slot, width), 4 * (np.uint32(slot) // np.uint32(width))
+            local[np.uint64(at)] = x - load_scalar(origin, c)
+            local[np.uint64(at + width)] = y - load_scalar(origin, c + 1)
+            local[np.uint64(at + 2 * width)] = z - load_scalar(origin, c + 2)
     if block == len(clusters.extent) - 1:
         for slot in range(len(clusters.slot), len(clusters.order)):
-            at = first_of_slot(slot, width)
+            at = index_of_x(slot, width)
             for n in range(at, at + 3 * width, width):
                 local[n] = clusters.reference[n]
 
 
 @kernel(counted=False)
-def hold(clusters):
+def use_present_as_reference(clusters):
     """Let the present positions be the references. A skin may be smaller than the rounding between the two."""
     for n in range(len(clusters.local)):
         clusters.reference[n] = clusters.local[n]
 
 
 @kernel(inline=True, counted=False)
-def follow_block(clusters, limit, block):
-    """Displacements of the sites of a block: `moved`, and `farthest`, infinite if one exceeds the limit."""
-    width = width_of(clusters.local)
+def measure_displacements_of_block(clusters, limit, block):
+    """Displacements of the sites of a block: `moved`, and `largest_displacement`, infinite if one exceeds the limit."""
+    width = lanes_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1
     worst = 0.0
@@ -323,7 +333,7 @@ def follow_block(clusters, limit, block):
         dx = load(local, at) - load(reference, at)
         dy = load(local, at + width) - load(reference, at + width)
         dz = load(local, at + 2 * width) - load(reference, at + 2 * width)
-        moved = root(dx * dx + dy * dy + dz * dz)
+        moved = square_root(dx * dx + dy * dy + dz * dz)
         store(clusters.moved, width * c, moved)
-        worst = max(worst, largest(moved)) if bits(moved <= limit) == full else inf
-    clusters.farthest[block] = worst
+        worst = max(worst, largest_lane(moved)) if mask_bits(moved <= limit) == full else inf
+    clusters.largest_displacement[block] = worst

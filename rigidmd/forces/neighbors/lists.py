@@ -1,4 +1,4 @@
-"""Neighbour lists: for each row of sites of one law, the clusters that may hold a site inside the cut-off.
+"""Neighbour lists: for each row of sites of one potential, the clusters that may hold a site inside the cut-off.
 
 A row is two sites near one another, so whatever is loaded of a cluster serves both. The rows of a cluster meet much the
 same clusters: these are listed once, with the vectors between, and an entry of a row is a place in that list.
@@ -27,29 +27,29 @@ from rigidmd.compile.simd import lane_count, zeros
 from rigidmd.core.state import CELL_CHANGED
 from rigidmd.errors import SimulationError
 from rigidmd.forces.neighbors.clusters import Clusters, clusters_of, order_of
-from rigidmd.forces.neighbors.tree import BoxTree, box_tree
+from rigidmd.forces.neighbors.tree import BoxTree, empty_tree
 
 IMAGE_BITS = 6
 IMAGES = 1 << IMAGE_BITS  # enough for all images of a box within reach
-MOST_MET = 2**16  # clusters that the rows of one cluster can meet
+MAX_NEIGHBORS = 2**16  # clusters that the rows of one cluster can meet
 MASK_BITS = 16  # of one site; no vector has more lanes
 SHELLS = 15  # the first: inside the cut-off when the list is built; the others divide the skin
-MOST_BEYOND = 2**8 - 1
+MAX_BEYOND = 2**8 - 1
 LONGEST_SKIN = 0.45  # of the smallest edge
 ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
 
 # Columns of PairList.needed and PairList.counters.
 # WINDOW: clusters behind those of the block, of which its rows reach the last.
-ENTRIES, MASKED, MET, WINDOW, MET_BY_ONE = 0, 1, 2, 3, 4
+ENTRIES, MASKED, NEIGHBORS, WINDOW, NEIGHBORS_OF_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
-BUILT, AHEAD = 0, 1  # of PairList.times
+BUILT, LEAD_TIME = 0, 1  # of PairList.times
 
 
 class PairList(NamedTuple):
-    """Rows of clusters for the sites of one law.
+    """Rows of clusters for the sites of one potential.
 
-    Cluster c meets the images met[b, first:end] of clusters: b its block, end = near[c], first = near[c - 1], or 0 for
+    Cluster c meets the images neighbors[b, first:end] of clusters: b its block, end = near[c], first = near[c - 1], or 0 for
     the first cluster of a block. An image is the integer IMAGES * cluster + number; `shift` has its displacement. An
     entry of a row is a place among what its cluster meets.
     """
@@ -66,15 +66,21 @@ class PairList(NamedTuple):
     multiple: np.ndarray  # (IMAGES, 3) int32 edges a, b, c by which each image is displaced
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     slack: np.ndarray  # (1,) the farthest that an image has moved since the list was built, Å
-    row: np.ndarray  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
+    row_end: (
+        np.ndarray
+    )  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
     beyond: np.ndarray  # (rows, SHELLS) uint8 how many entries at the end of a row are beyond shell k
     entries: np.ndarray  # (blocks, capacity) uint16
-    special: np.ndarray  # (rows,) int32 end of each row in masked[b]
+    masked_end: np.ndarray  # (rows,) int32 end of each row in masked[b]
     masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
-    near: np.ndarray  # (clusters,) int32
-    met: np.ndarray  # (blocks, capacity) int32
-    apart: np.ndarray  # (blocks, 3 capacity) from the origins of what is met to that of c, Å; (blocks, 0) in float64
-    needed: np.ndarray  # (blocks, 5) room expected or needed: entries, masked, met, clusters behind, met by one
+    neighbor_end: np.ndarray  # (clusters,) int32
+    neighbors: np.ndarray  # (blocks, capacity) int32
+    origin_vector: (
+        np.ndarray
+    )  # (blocks, 3 capacity) from the origins of what is neighbors to that of c, Å; (blocks, 0) in float64
+    needed: (
+        np.ndarray
+    )  # (blocks, 5) capacity expected or needed: entries, masked, neighbors, clusters behind, neighbors by one
     counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
     times: np.ndarray  # (2,) when the list was built, NaN before; how far ahead the places are for which it was; ps
 
@@ -86,7 +92,7 @@ def cluster_of(image):
 
 
 @kernel(inline=True)
-def number_of(image):
+def image_number(image):
     """The number of an image."""
     return image & (IMAGES - 1)
 
@@ -101,20 +107,20 @@ def behind_block(bounds, block, cluster):
 
 
 def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
-    """A list that is built at its first use, with about the room that evenly spread sites would need.
+    """A list that is built at its first use, with about the capacity that evenly spread sites would need.
 
     cell : (3, 3)
     reach : largest distance between sites of one group, Å; infinite if it is not known
     """
     clusters = clusters_of(len(group), dtype)
-    blocks, slots = len(clusters.farthest), len(clusters.order)
+    blocks, slots = len(clusters.largest_displacement), len(clusters.order)
     rows = slots // 2
     count = len(clusters.origin) // 4
     most_rows = rows // count * int(np.diff(clusters.bounds).max())  # of a block
-    room = ceil(_clusters_met(cell, count, cutoff + skin, 1.0) * most_rows)
-    met = ceil(_clusters_met(cell, count, cutoff + skin, 1.75) * most_rows * count / rows)
+    capacity = ceil(_expected_neighbors(cell, count, cutoff + skin, 1.0) * most_rows)
+    neighbors = ceil(_expected_neighbors(cell, count, cutoff + skin, 1.75) * most_rows * count / rows)
     needed = np.zeros((blocks, 5), np.int64)
-    needed[:, WINDOW] = _clusters_ahead(cell, count, blocks, cutoff + skin)
+    needed[:, WINDOW] = _expected_window(cell, count, blocks, cutoff + skin)
     skin = _fitting_skin(cell, cutoff, skin)
     return PairList(
         cutoff=cutoff,
@@ -125,27 +131,27 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
         cell=cell.copy(),
         built=cell.copy(),
         clusters=clusters,
-        tree=box_tree(count),
+        tree=empty_tree(count),
         multiple=np.zeros((IMAGES, 3), np.int32),
         shift=zeros(4 * IMAGES, np.float64),
         slack=np.zeros(1),
-        row=np.zeros(rows, np.int32),
+        row_end=np.zeros(rows, np.int32),
         beyond=np.zeros((rows, SHELLS), np.uint8),
-        entries=np.empty((blocks, room), np.uint16),
-        special=np.zeros(rows, np.int32),
+        entries=np.empty((blocks, capacity), np.uint16),
+        masked_end=np.zeros(rows, np.int32),
         masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),  # measured per row: argon 1.1, water 1.5
-        near=np.zeros(count, np.int32),
-        met=np.empty((blocks, met), np.int32),
-        apart=_room_for_apart(blocks, met, dtype),
+        neighbor_end=np.zeros(count, np.int32),
+        neighbors=np.empty((blocks, neighbors), np.int32),
+        origin_vector=_origin_vector_buffer(blocks, neighbors, dtype),
         needed=needed,
         counters=np.zeros(4, np.int64),
         times=np.array([nan, 0.0]),
     )
 
 
-def _room_for_apart(blocks: int, met: int, dtype: type) -> np.ndarray:
-    """Room for `PairList.apart`. In float64 it would be larger than all else, and save no time."""
-    return np.empty((blocks, 3 * met if dtype == np.float32 else 0), dtype)
+def _origin_vector_buffer(blocks: int, neighbors: int, dtype: type) -> np.ndarray:
+    """Room for `PairList.origin_vector`. In float64 it would be larger than all else, and save no time."""
+    return np.empty((blocks, 3 * neighbors if dtype == np.float32 else 0), dtype)
 
 
 def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
@@ -153,7 +159,7 @@ def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
     return min(skin, LONGEST_SKIN * cell.diagonal().min()) if cutoff < inf else inf
 
 
-def _clusters_met(cell: np.ndarray, count: int, radius: float, size: float) -> float:
+def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float) -> float:
     """Expected number of clusters within a radius of sites, half of them; 0 if the density is not known, and the first
     build then finds it.
 
@@ -170,7 +176,7 @@ def _clusters_met(cell: np.ndarray, count: int, radius: float, size: float) -> f
     return min(0.42 * near / cluster, count / 2) + 1  # a sixth less than half: measured, cubes have corners
 
 
-def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
+def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
     """Expected number of clusters behind a block of which its rows reach the last."""
     volume = cell.diagonal().prod()
     if volume == inf or radius == inf:
@@ -180,52 +186,52 @@ def _clusters_ahead(cell: np.ndarray, count: int, blocks: int, radius: float) ->
 
 
 #: Arrays of `Clusters` from which a list is built again as it was, besides the order of the sites.
-REMEMBERED = ("boxes", "origin", "reference")
+CHECKPOINTED = ("boxes", "origin", "reference")
 
 
-def memory_of(pairs: PairList) -> dict[str, np.ndarray]:
-    """What `recalled` needs to have this list again, bit for bit, where sites have moved since it was built."""
+def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
+    """What `restored` needs to have this list again, bit for bit, where sites have moved since it was built."""
     found = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
-        found |= {name: getattr(pairs.clusters, name) for name in REMEMBERED}
+        found |= {name: getattr(pairs.clusters, name) for name in CHECKPOINTED}
         found |= {"order": order_of(pairs.clusters), "built": pairs.built, "times": pairs.times}
     return found
 
 
-def recalled(pairs: PairList, memory: dict[str, np.ndarray], asked: float, now: float) -> PairList:
-    """The new list with the clusters and the skin of a memory; `update.refill` must follow if there are clusters.
+def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float, now: float) -> PairList:
+    """The new list with the clusters and the skin of a arrays; `update.refill` must follow if there are clusters.
 
-    asked : the skin that was asked for, Å. now : the present time, ps
-    Raises ValueError if the memory is that of no such list.
+    requested_skin : the skin that was requested_skin for, Å. now : the present time, ps
+    Raises ValueError if the arrays is that of no such list.
     """
     clusters, cell = pairs.clusters, pairs.cell
-    like = {name: getattr(clusters, name) for name in (*REMEMBERED, "order")}
+    like = {name: getattr(clusters, name) for name in (*CHECKPOINTED, "order")}
     like |= {"built": pairs.built, "times": pairs.times}
-    if memory.keys() not in ({"skin"}, {"skin", *like}):
-        raise ValueError(f"a neighbour list has {', '.join(memory)}")
+    if arrays.keys() not in ({"skin"}, {"skin", *like}):
+        raise ValueError(f"a neighbour list has {', '.join(arrays)}")
     for name, array in ({"skin": np.array(pairs.skin)} | like).items():
-        found = memory.get(name, array)
+        found = arrays.get(name, array)
         if (found.shape, found.dtype) != (array.shape, array.dtype):
             raise ValueError(f"{name} of a neighbour list has another shape or type")
-        if name in memory and name not in ("skin", "built") and not np.isfinite(found).all():
+        if name in arrays and name not in ("skin", "built") and not np.isfinite(found).all():
             raise ValueError(f"{name} of a neighbour list is not finite")
-    skin = float(memory["skin"])
-    if not (min(pairs.skin, 2 * LONGEST_SKIN * pairs.cutoff) <= skin <= max(pairs.skin, asked)):
+    skin = float(arrays["skin"])
+    if not (min(pairs.skin, 2 * LONGEST_SKIN * pairs.cutoff) <= skin <= max(pairs.skin, requested_skin)):
         raise ValueError(f"a neighbour list has the skin {skin:g} Å")
     pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
-    if "order" not in memory:
+    if "order" not in arrays:
         return pairs
     with np.errstate(invalid="ignore"):  # of edges that are infinite
-        moved = np.abs(memory["built"] - cell)
-    if not ((memory["built"] == cell) | ((moved <= skin) & (moved < inf))).all():
+        moved = np.abs(arrays["built"] - cell)
+    if not ((arrays["built"] == cell) | ((moved <= skin) & (moved < inf))).all():
         raise ValueError("a neighbour list was built for another box")
-    if not 0 <= memory["times"][BUILT] <= now:
-        raise ValueError(f"a neighbour list was built at {memory['times'][BUILT]:g} ps")
+    if not 0 <= arrays["times"][BUILT] <= now:
+        raise ValueError(f"a neighbour list was built at {arrays['times'][BUILT]:g} ps")
     sites = len(clusters.slot)
-    if not np.array_equal(np.sort(memory["order"][:sites]), np.arange(sites)):
+    if not np.array_equal(np.sort(arrays["order"][:sites]), np.arange(sites)):
         raise ValueError("order of a neighbour list is none of its sites")
     for name, array in like.items():
-        array[:] = memory[name]
+        array[:] = arrays[name]
     clusters.order[sites:] = clusters.order[sites - 1]
     clusters.slot[clusters.order[:sites]] = np.arange(sites)
     clusters.group[:] = pairs.group[clusters.order]
@@ -233,8 +239,8 @@ def recalled(pairs: PairList, memory: dict[str, np.ndarray], asked: float, now: 
     return pairs
 
 
-def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
-    """The list with the room that its last build needed and a tenth more, and with a skin that fits into the cell.
+def with_capacity(pairs: PairList, cell: np.ndarray) -> PairList:
+    """The list with the capacity that its last build needed and a tenth more, and with a skin that fits into the cell.
 
     Raises SimulationError if the cell has become too small for the cut-off, or too many sites are within it.
     """
@@ -247,20 +253,20 @@ def with_room(pairs: PairList, cell: np.ndarray) -> PairList:
         skin = _fitting_skin(cell, pairs.cutoff, pairs.skin)
         pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     blocks = len(pairs.needed)
-    entries, masked, met, _, of_one = pairs.needed.max(axis=0)
-    if of_one > MOST_MET:
+    entries, masked, neighbors, _, of_one = pairs.needed.max(axis=0)
+    if of_one > MAX_NEIGHBORS:
         raise SimulationError(
-            f"more than {MOST_MET * lane_count(pairs.apart.dtype)} sites are within the cut-off of {pairs.cutoff:g} Å: "
+            f"more than {MAX_NEIGHBORS * lane_count(pairs.origin_vector.dtype)} sites are within the cut-off of {pairs.cutoff:g} Å: "
             "take a shorter one, or fewer molecules"
         )
     if entries > pairs.entries.shape[1]:
         pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.uint16))
     if masked > pairs.masked.shape[1]:
         pairs = pairs._replace(masked=np.empty((blocks, int(1.1 * masked) + 16, 2), np.int32))
-    if met > pairs.met.shape[1]:
-        room = int(1.1 * met) + 16
-        apart = _room_for_apart(blocks, room, pairs.apart.dtype)
-        pairs = pairs._replace(met=np.empty((blocks, room), np.int32), apart=apart)
+    if neighbors > pairs.neighbors.shape[1]:
+        capacity = int(1.1 * neighbors) + 16
+        origin_vector = _origin_vector_buffer(blocks, capacity, pairs.origin_vector.dtype)
+        pairs = pairs._replace(neighbors=np.empty((blocks, capacity), np.int32), origin_vector=origin_vector)
     return pairs
 
 
@@ -274,20 +280,20 @@ def most_needed(pairs, k):
 
 
 @kernel(inline=True)
-def farthest(pairs):
+def largest_displacement(pairs):
     """The largest distance of any site's image from its place in the list, Å; infinite if the list is not valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
-        found = max(found, pairs.clusters.farthest[block])
+        found = max(found, pairs.clusters.largest_displacement[block])
     return found + pairs.slack[0]
 
 
 @kernel(inline=True)
-def end_of_row(pairs, r, farthest):
-    """End of the entries of row r that can hold a site inside the cut-off; `farthest` as above, Å."""
+def end_of_row(pairs, r, largest_displacement):
+    """End of the entries of row r that can hold a site inside the cut-off; `largest_displacement` as above, Å."""
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
-    shell = min(SHELLS - 1, ceil((moved + farthest) * pairs.shells_per_A))
-    return pairs.row[r] - pairs.beyond[r, shell]
+    shell = min(SHELLS - 1, ceil((moved + largest_displacement) * pairs.shells_per_A))
+    return pairs.row_end[r] - pairs.beyond[r, shell]
 
 
 @kernel(inline=True)

@@ -7,18 +7,18 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.compile.simd import (  # fmt: skip
-    bits,
-    fill,
-    item,
-    larger,
+    broadcast,
+    lanes_of,
     load,
-    load_beside,
-    root,
-    smaller,
-    smaller_of_two,
-    spread,
-    store_whole_alternate,
-    width_of,
+    load_broadcast,
+    load_converted,
+    load_scalar,
+    mask_bits,
+    maximum,
+    minimum,
+    pairwise_minimum,
+    square_root,
+    store_even_lanes,
 )
 from rigidmd.forces.neighbors.lists import (  # fmt: skip
     ENTRIES,
@@ -26,20 +26,20 @@ from rigidmd.forces.neighbors.lists import (  # fmt: skip
     IMAGES_FOUND,
     MASK_BITS,
     MASKED,
-    MET,
-    MET_BY_ONE,
-    MOST_BEYOND,
+    MAX_BEYOND,
+    NEIGHBORS,
+    NEIGHBORS_OF_ONE,
     ROUNDING,
     SHELLS,
     WINDOW,
     behind_block,
     cluster_of,
-    number_of,
+    image_number,
 )
 from rigidmd.forces.neighbors.tree import ahead, families_within_reach, near
 
-BEYOND = SHELLS  # where a candidate counts that a row does not meet, after the shells
-SPECIAL = SHELLS + 1  # where one counts that needs a mask
+OUT_OF_REACH = SHELLS  # where a candidate counts that a row does not meet, after the shells
+NEEDS_MASK = SHELLS + 1  # where one counts that needs a mask
 KINDS = SHELLS + 2
 
 
@@ -49,50 +49,50 @@ class Scratch(NamedTuple):
     stack: np.ndarray  # (levels, 2) for families_within_reach
     low: np.ndarray  # (3,) a box, moved by an image
     high: np.ndarray  # (3,)
-    family: np.ndarray  # (room,) families of clusters near some clusters, as IMAGES * family + number of the image
-    candidate: np.ndarray  # (room + arity,) images of clusters that may be met, at last those that are
-    close: np.ndarray  # (room,) those of them that may need a mask
-    kind: np.ndarray  # (room * rows,) uint8 shell of entry n in row k of the cluster, at n * rows + k
-    place: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind; then where the next of them goes
-    sorted: np.ndarray  # (rows of a cluster, room) uint16 entries in the order of their kinds
+    family: np.ndarray  # (capacity,) families of clusters near some clusters, as IMAGES * family + number of the image
+    candidate: np.ndarray  # (capacity + arity,) images of clusters that may be count, at last those that are
+    close: np.ndarray  # (capacity,) those of them that may need a mask
+    kind: np.ndarray  # (capacity * rows,) uint8 shell of entry n in row k of the cluster, at n * rows + k
+    kind_end: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind; then where the next of them goes
+    sorted: np.ndarray  # (rows of a cluster, capacity) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
 
 @kernel
-def _scratch(pairs, room):
-    rows = width_of(pairs.clusters.local) // 2
+def _new_scratch(pairs, capacity):
+    rows = lanes_of(pairs.clusters.local) // 2
     return Scratch(
         np.empty((len(pairs.tree.level), 2), np.int64),
         np.empty(3),
         np.empty(3),
-        np.empty(room, np.int64),
-        np.empty(room + width_of(pairs.tree.low), np.int64),
-        np.empty(room, np.int64),
-        np.empty(rows * (room + 1), np.uint8),  # one more, since what no row has is written too
+        np.empty(capacity, np.int64),
+        np.empty(capacity + lanes_of(pairs.tree.low), np.int64),
+        np.empty(capacity, np.int64),
+        np.empty(rows * (capacity + 1), np.uint8),  # one more, since what no row has is written too
         np.empty((rows, KINDS), np.uint32),  # unsigned: no index is checked for being negative
-        np.empty((rows, room), np.uint16),
+        np.empty((rows, capacity), np.uint16),
         np.zeros(5, np.int64),
     )
 
 
 @kernel(inline=True)
-def fill_block(pairs, block, room):
-    """Fill the rows of one block. Entries beyond the room are counted but not stored.
+def fill_block(pairs, block, capacity):
+    """Fill the rows of one block. Entries beyond the capacity are counted but not stored.
 
-    Returns 0, or the room needed for candidates if it is too small; the rows are then incomplete.
+    Returns 0, or the capacity needed for candidates if it is too small; the rows are then incomplete.
     """
     clusters = pairs.clusters
-    scratch = _scratch(pairs, room)
-    arity = width_of(pairs.tree.low)
+    scratch = _new_scratch(pairs, capacity)
+    arity = lanes_of(pairs.tree.low)
     end = clusters.bounds[block + 1]
     for first in range(clusters.bounds[block], end, arity):
         last = min(first + arity, end)
         families = _find_families(pairs, first, last, scratch)
-        if families > room:
+        if families > capacity:
             return 2 * families
         for c in range(first, last):
             candidates = _find_candidates(pairs, c, scratch, families)
-            if candidates > room:
+            if candidates > capacity:
                 return 2 * candidates
             _fill_rows(pairs, block, c, scratch, candidates)
     for k in range(len(scratch.filled)):
@@ -104,7 +104,7 @@ def fill_block(pairs, block, room):
 def _find_families(pairs, first, end, scratch):
     """Families of clusters that may be within reach of clusters first ... end - 1. Returns their number.
 
-    The number may exceed the room.
+    The number may exceed the capacity.
     """
     tree, into, low, high = pairs.tree, scratch.family, scratch.low, scratch.high
     radius = _reach(pairs)
@@ -141,16 +141,16 @@ def _reach(pairs):
 def _find_candidates(pairs, c, scratch, families):
     """Candidates for a cluster's rows: clusters and images whose box is within reach of its box. Returns their number.
 
-    The number may exceed the room. There is no branch for each candidate: the next one takes the place of one that is
+    The number may exceed the capacity. There is no branch for each candidate: the next one takes the place of one that is
     none.
     """
     tree, into, shift = pairs.tree, scratch.candidate, pairs.shift
-    arity = width_of(tree.low)
+    arity = lanes_of(tree.low)
     count = len(pairs.clusters.origin) // 4
     radius = _reach(pairs)
     candidates = 0
     for n in range(families):
-        first, image = arity * cluster_of(scratch.family[n]), number_of(scratch.family[n])
+        first, image = arity * cluster_of(scratch.family[n]), image_number(scratch.family[n])
         at = 4 * image
         low = tree.low[0, c] - shift[at], tree.low[1, c] - shift[at + 1], tree.low[2, c] - shift[at + 2]
         high = tree.high[0, c] - shift[at], tree.high[1, c] - shift[at + 1], tree.high[2, c] - shift[at + 2]
@@ -166,19 +166,19 @@ def _find_candidates(pairs, c, scratch, families):
 @kernel(inline=True, counted=False)
 def _fill_rows(pairs, block, c, scratch, candidates):
     """Fill the rows of a cluster from its candidates."""
-    width = width_of(pairs.clusters.local)
+    width = lanes_of(pairs.clusters.local)
     rows = width // 2
     masked, filled = pairs.masked[block], scratch.filled
     radius2 = _reach(pairs) ** 2
-    met = _find_kinds(pairs, c, scratch, candidates)
-    _meet(pairs, block, c, scratch, met)
-    _sort_by_kind(pairs, c, scratch, met)
-    for own in range(rows):
-        r = rows * c + own
-        here = scratch.sorted[own]
-        _write_row(pairs.entries[block], here, scratch.place[own, SHELLS - 1], filled)
-        pairs.row[r] = min(filled[ENTRIES], pairs.entries.shape[1])
-        for n in range(scratch.place[own, BEYOND], scratch.place[own, SPECIAL]):
+    count = _find_kinds(pairs, c, scratch, candidates)
+    _store_neighbors(pairs, block, c, scratch, count)
+    _sort_by_kind(pairs, c, scratch, count)
+    for row in range(rows):
+        r = rows * c + row
+        here = scratch.sorted[row]
+        _write_row(pairs.entries[block], here, scratch.kind_end[row, SHELLS - 1], filled)
+        pairs.row_end[r] = min(filled[ENTRIES], pairs.entries.shape[1])
+        for n in range(scratch.kind_end[row, OUT_OF_REACH], scratch.kind_end[row, NEEDS_MASK]):
             entry = np.int64(here[n])
             first_of_row = _mask_of_lanes(pairs, 2 * r, scratch.candidate[entry], radius2)
             second = _mask_of_lanes(pairs, 2 * r + 1, scratch.candidate[entry], radius2)
@@ -187,69 +187,69 @@ def _fill_rows(pairs, block, c, scratch, candidates):
                     masked[filled[MASKED], 0] = entry
                     masked[filled[MASKED], 1] = first_of_row | second << MASK_BITS
                 filled[MASKED] += 1
-        pairs.special[r] = min(filled[MASKED], len(masked))
+        pairs.masked_end[r] = min(filled[MASKED], len(masked))
 
 
 @kernel(inline=True)
-def _meet(pairs, block, c, scratch, met):
+def _store_neighbors(pairs, block, c, scratch, count):
     """List what the rows of a cluster meet: the first of the candidates."""
-    there, apart, filled = pairs.met[block], pairs.apart[block], scratch.filled
-    first = filled[MET]
-    for n in range(met):
-        other, image = cluster_of(scratch.candidate[n]), number_of(scratch.candidate[n])
+    there, origin_vector, filled = pairs.neighbors[block], pairs.origin_vector[block], scratch.filled
+    first = filled[NEIGHBORS]
+    for n in range(count):
+        other, image = cluster_of(scratch.candidate[n]), image_number(scratch.candidate[n])
         if first + n < len(there):
             there[first + n] = scratch.candidate[n]
-            if len(apart) > 0:
+            if len(origin_vector) > 0:
                 for k in range(3):
-                    apart[3 * (first + n) + k] = _apart(pairs, c, other, image, k)
+                    origin_vector[3 * (first + n) + k] = _origin_vector(pairs, c, other, image, k)
         filled[WINDOW] = max(filled[WINDOW], behind_block(pairs.clusters.bounds, block, other) + 1)
-    filled[MET] += met
-    filled[MET_BY_ONE] = max(filled[MET_BY_ONE], met)
-    pairs.near[c] = min(filled[MET], len(there))
+    filled[NEIGHBORS] += count
+    filled[NEIGHBORS_OF_ONE] = max(filled[NEIGHBORS_OF_ONE], count)
+    pairs.neighbor_end[c] = min(filled[NEIGHBORS], len(there))
 
 
 @kernel(inline=True)
-def _sort_by_kind(pairs, c, scratch, met):
+def _sort_by_kind(pairs, c, scratch, count):
     """Write the entries of each row of a cluster by their kinds; `place` then has the end of each kind.
 
     The rows go together: an entry waits for the one before it in its row, and meanwhile the other rows have theirs.
     """
-    rows = width_of(pairs.clusters.local) // 2
-    place, kind = scratch.place, scratch.kind
-    place[:] = 0
-    for n in range(met):
-        for own in range(rows):
-            place[own, item(kind, n * rows + own)] += 1
-    for own in range(rows):
-        _begin_kinds(pairs.beyond[rows * c + own], place[own])
-    for n in range(met):
-        for own in range(rows):
-            k = item(kind, n * rows + own)
-            scratch.sorted[own, place[own, k]] = n
-            place[own, k] += 1
+    rows = lanes_of(pairs.clusters.local) // 2
+    kind_end, kind = scratch.kind_end, scratch.kind
+    kind_end[:] = 0
+    for n in range(count):
+        for row in range(rows):
+            kind_end[row, load_scalar(kind, n * rows + row)] += 1
+    for row in range(rows):
+        _begin_kinds(pairs.beyond[rows * c + row], kind_end[row])
+    for n in range(count):
+        for row in range(rows):
+            k = load_scalar(kind, n * rows + row)
+            scratch.sorted[row, kind_end[row, k]] = n
+            kind_end[row, k] += 1
 
 
 @kernel(inline=True)
-def _begin_kinds(beyond, place):
+def _begin_kinds(beyond, kind_end):
     """Where the entries of each kind begin in a row, from their numbers, and how many are beyond each shell.
 
     `beyond` is limited by its type: entries above that limit count as if they were inside the shell.
     """
     inside = 0
     for k in range(SHELLS):
-        inside += place[k]
+        inside += kind_end[k]
     begin = 0
     for k in range(KINDS):
-        size = place[k]
-        place[k] = begin
+        size = kind_end[k]
+        kind_end[k] = begin
         begin += size
         if k < SHELLS:
-            beyond[k] = min(inside - begin, MOST_BEYOND)
+            beyond[k] = min(inside - begin, MAX_BEYOND)
 
 
 @kernel(inline=True)
 def _write_row(entries, found, count, filled):
-    """Append the first `count` found to the entries, if there is room."""
+    """Append the first `count` found to the entries, if there is capacity."""
     first = filled[ENTRIES]
     filled[ENTRIES] += count
     if filled[ENTRIES] <= len(entries):
@@ -263,26 +263,26 @@ def _find_kinds(pairs, c, scratch, candidates):
 
     There are no unpredictable branches: the processor works on several candidates at a time.
     """
-    rows = width_of(pairs.clusters.local) // 2
+    rows = lanes_of(pairs.clusters.local) // 2
     candidate, close = scratch.candidate, scratch.close
     last = len(pairs.clusters.origin) // 4 - 1  # the cluster that may have slots without a site
-    met = closes = 0
+    count = close_count = 0
     for n in range(candidates):
         image = candidate[n]
         other = cluster_of(image)
-        has_row, is_close = _measure(pairs, c, scratch.kind, image, rows * met)
-        candidate[met] = image
-        close[closes] = met
-        met += has_row
-        closes += is_close | (other == c) | (other == last) | (c == last)
-    for n in range(closes):
-        if close[n] < met:
-            _set_aside(pairs, c, scratch.kind, candidate[close[n]], rows * close[n])
-    return met
+        has_row, is_close = _find_kinds_of_candidate(pairs, c, scratch.kind, image, rows * count)
+        candidate[count] = image
+        close[close_count] = count
+        count += has_row
+        close_count += is_close | (other == c) | (other == last) | (c == last)
+    for n in range(close_count):
+        if close[n] < count:
+            _mark_entries_to_mask(pairs, c, scratch.kind, candidate[close[n]], rows * close[n])
+    return count
 
 
 @kernel(inline=True)
-def _measure(pairs, c, kind, candidate, at):
+def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
     """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry needed a mask.
 
     Returns whether a row has it, and whether some sites are as near as those of one group can be.
@@ -292,55 +292,55 @@ def _measure(pairs, c, kind, candidate, at):
     """
     clusters = pairs.clusters
     places = clusters.reference
-    width = width_of(places)
-    other, image = cluster_of(candidate), number_of(candidate)
+    width = lanes_of(places)
+    other, image = cluster_of(candidate), image_number(candidate)
     begin = 3 * width * c
-    x = load(places, begin) + _apart(pairs, c, other, image, 0)
-    y = load(places, begin + width) + _apart(pairs, c, other, image, 1)
-    z = load(places, begin + 2 * width) + _apart(pairs, c, other, image, 2)
+    x = load(places, begin) + _origin_vector(pairs, c, other, image, 0)
+    y = load(places, begin + width) + _origin_vector(pairs, c, other, image, 1)
+    z = load(places, begin + 2 * width) + _origin_vector(pairs, c, other, image, 2)
     # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|²,
     # is subtracted. Of two sums none waits for the other.
-    one, two = fill(inf, places), fill(inf, places)
+    one, two = broadcast(inf, places), broadcast(inf, places)
     for lane in range(0, width, 2):
-        one = smaller(one, _rest(clusters, other, lane, x, y, z))
-        two = smaller(two, _rest(clusters, other, lane + 1, x, y, z))
-    nearest2 = 2.0 * smaller(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
-    kinds = fill(0.0, places)
+        one = minimum(one, _half_square_less_product(clusters, other, lane, x, y, z))
+        two = minimum(two, _half_square_less_product(clusters, other, lane + 1, x, y, z))
+    nearest2 = 2.0 * minimum(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
+    kinds = broadcast(0.0, places)
     if pairs.cutoff < inf:
-        distance = root(larger(smaller_of_two(nearest2), 0.0))
+        distance = square_root(maximum(pairwise_minimum(nearest2), 0.0))
         scale = pairs.shells_per_A
         shell = distance * (scale * (1 - ROUNDING)) + (1 - pairs.cutoff * scale)  # 1 to 2 in the first beyond
-        kinds = smaller(larger(shell, 0.0), float(BEYOND))
-    store_whole_alternate(kind, at, kinds)
-    return bits(kinds < float(BEYOND)) != 0, bits(nearest2 <= pairs.reach2) != 0
+        kinds = minimum(maximum(shell, 0.0), float(OUT_OF_REACH))
+    store_even_lanes(kind, at, kinds)
+    return mask_bits(kinds < float(OUT_OF_REACH)) != 0, mask_bits(nearest2 <= pairs.reach2) != 0
 
 
 @kernel(inline=True)
-def _rest(clusters, other, lane, x, y, z):
+def _half_square_less_product(clusters, other, lane, x, y, z):
     """|y|²/2 - x y for one site y of another cluster."""
     places = clusters.reference
-    width = width_of(places)
+    width = lanes_of(places)
     at = 3 * width * other + lane
-    rest = spread(clusters.half_square, width * other + lane) - z * spread(places, at + 2 * width)
-    return rest - y * spread(places, at + width) - x * spread(places, at)
+    rest = load_broadcast(clusters.half_square, width * other + lane) - z * load_broadcast(places, at + 2 * width)
+    return rest - y * load_broadcast(places, at + width) - x * load_broadcast(places, at)
 
 
 @kernel(inline=True)
-def _set_aside(pairs, c, kind, candidate, at):
+def _mark_entries_to_mask(pairs, c, kind, candidate, at):
     """Set the kind of a candidate to SPECIAL in the rows for which it needs a mask."""
     clusters = pairs.clusters
-    width = width_of(clusters.local)
+    width = lanes_of(clusters.local)
     other, last = cluster_of(candidate), len(clusters.origin) // 4 - 1
-    everyone = (1 << width) - 1
-    special = everyone
+    all_lanes = (1 << width) - 1
+    special = all_lanes
     if other != c and c != last and other != last:
-        group = load_beside(clusters.group, width * c, clusters.local)
+        group = load_converted(clusters.group, width * c, clusters.local)
         mates = group < group
         for lane in range(width):
             mates = mates | (group == clusters.group[width * other + lane])
-        special = bits(mates)
-    for own in range(width // 2):
-        kind[at + own] = SPECIAL if special >> 2 * own & 3 else kind[at + own]  # written anyway: no branch
+        special = mask_bits(mates)
+    for row in range(width // 2):
+        kind[at + row] = NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]  # written anyway: no branch
 
 
 @kernel(inline=True)
@@ -350,47 +350,47 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
         return 0
     clusters = pairs.clusters
     places = clusters.reference
-    width = width_of(places)
-    everyone = (1 << width) - 1
-    c, other, image = i // width, cluster_of(candidate), number_of(candidate)
+    width = lanes_of(places)
+    all_lanes = (1 << width) - 1
+    c, other, image = i // width, cluster_of(candidate), image_number(candidate)
     at = 2 * width * c + i
     start = 3 * width * other
-    dx = places[at] + _apart(pairs, c, other, image, 0) - load(places, start)
-    dy = places[at + width] + _apart(pairs, c, other, image, 1) - load(places, start + width)
-    dz = places[at + 2 * width] + _apart(pairs, c, other, image, 2) - load(places, start + 2 * width)
-    left_out = bits(load_beside(clusters.group, width * other, places) == clusters.group[i])
+    dx = places[at] + _origin_vector(pairs, c, other, image, 0) - load(places, start)
+    dy = places[at + width] + _origin_vector(pairs, c, other, image, 1) - load(places, start + width)
+    dz = places[at + 2 * width] + _origin_vector(pairs, c, other, image, 2) - load(places, start + 2 * width)
+    left_out = mask_bits(load_converted(clusters.group, width * other, places) == clusters.group[i])
     if other == c:
         left_out |= (2 << (i - width * c)) - 1  # each pair once
     if other == len(clusters.origin) // 4 - 1:
-        left_out |= everyone ^ (everyone >> _filler(pairs))
-    meets = everyone & ~left_out
-    return meets if bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
+        left_out |= all_lanes ^ (all_lanes >> _padding_slots(pairs))
+    meets = all_lanes & ~left_out
+    return meets if mask_bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
 
 @kernel(counted=False)
-def part_block(pairs, block):
+def update_origin_vectors_of_block(pairs, block):
     """Write the vectors between the origins of a block anew, where images have moved."""
-    apart = pairs.apart[block]
-    if len(apart) == 0:
+    origin_vector = pairs.origin_vector[block]
+    if len(origin_vector) == 0:
         return
     first = 0
     for c in range(pairs.clusters.bounds[block], pairs.clusters.bounds[block + 1]):
-        for n in range(first, pairs.near[c]):
-            other, image = cluster_of(pairs.met[block, n]), number_of(pairs.met[block, n])
+        for n in range(first, pairs.neighbor_end[c]):
+            other, image = cluster_of(pairs.neighbors[block, n]), image_number(pairs.neighbors[block, n])
             if image != 0:
                 for k in range(3):
-                    apart[3 * n + k] = _apart(pairs, c, other, image, k)
-        first = pairs.near[c]
+                    origin_vector[3 * n + k] = _origin_vector(pairs, c, other, image, k)
+        first = pairs.neighbor_end[c]
 
 
 @kernel(inline=True)
-def _apart(pairs, c, other, image, k):
+def _origin_vector(pairs, c, other, image, k):
     """Component k of the vector from the image of another cluster's origin to the origin of cluster c, Å."""
     clusters = pairs.clusters
     return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]
 
 
 @kernel(inline=True)
-def _filler(pairs):
+def _padding_slots(pairs):
     """Number of slots in the last cluster that hold no site."""
     return len(pairs.clusters.order) - len(pairs.group)

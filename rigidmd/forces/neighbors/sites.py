@@ -1,6 +1,6 @@
-"""Sites of one law: their positions for a state of the bodies, and the forces and torques on the bodies from theirs.
+"""Sites of one potential: their positions for a state of the bodies, and the forces and torques on the bodies from theirs.
 
-Each law has its own list of sites: those that take part in it. Sites of one molecule are consecutive.
+Each potential has its own list of sites: those that take part in it. Sites of one molecule are consecutive.
 """
 
 from typing import NamedTuple
@@ -8,23 +8,33 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from rigidmd.compile import BLOCKS, MOST_BLOCKS, call_blocks, implements, is_a, kernel, opened, packed, task
-from rigidmd.compile.simd import item, lane_count, width_of
+from rigidmd.compile import (
+    BLOCKS,
+    MOST_BLOCKS,
+    call_blocks,
+    implements,
+    is_a,
+    kernel,
+    load_arguments,
+    pack_arguments,
+    task,
+)
+from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import EXAMPLE
 
 # Up to this number, loops over molecules stay on one thread: they take a few microseconds.
-SERIAL = 128
-SHARE = 4096  # molecules of a block, where there are more blocks than the fewest
+SERIAL_MOLECULES = 128
+MOLECULES_PER_BLOCK = 4096  # molecules of a block, where there are more blocks than the fewest
 
 
 @kernel(outer=True)
 def blocks_of(molecules):
     """Number of blocks in which molecules are moved: one, on this thread, where there are few."""
-    return max(BLOCKS, min(MOST_BLOCKS, molecules // SHARE)) if molecules > SERIAL else 1
+    return max(BLOCKS, min(MOST_BLOCKS, molecules // MOLECULES_PER_BLOCK)) if molecules > SERIAL_MOLECULES else 1
 
 
 @kernel(inline=True)
-def share_of(molecules, block, together):
+def molecules_of_block(molecules, block, together):
     """The first molecule of a block, and the first that is no more in it: whole groups of so many, but for the last."""
     blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
     return together * (groups * block // blocks), min(molecules, together * (groups * (block + 1) // blocks))
@@ -66,7 +76,7 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np
 
     inverse_inertia : (species, 3) as in `Model`
     """
-    counts = np.array([len(own) for own in offsets])
+    counts = np.array([len(of_species) for of_species in offsets])
     first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
     molecule = np.repeat(np.arange(len(species), dtype=np.int32), counts[species])
     if np.array_equal(molecule, first[:-1]):
@@ -80,7 +90,7 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np
     return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
 
 
-def groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
+def exclusion_groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
     """Group of each site (s,); sites of one group do not interact. A molecule is one; all frozen molecules are one.
 
     frozen (n,) : whether each molecule is
@@ -104,54 +114,58 @@ class InSlots(NamedTuple):
 
 
 @kernel(inline=True)
-def first_of_slot(slot, width):
+def index_of_x(slot, width):
     """Where arrays of x, y, z in slots have the x of a slot; `width` is a power of two."""
     return 3 * slot - 2 * (slot & (width - 1))
 
 
-def of_site(vectors, i):
+def site_vector(vectors, i):
     """(x, y, z) of site i in an array (s, 3) or `InSlots`."""
     raise TypeError("compiled code only")
 
 
-@implements(of_site, inline=True)
-def _of_site(vectors, i):
+@implements(site_vector, inline=True)
+def _site_vector(vectors, i):
     if isinstance(vectors, types.Array):
         return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
 
     def from_slot(vectors, i):
-        width = width_of(vectors.value)
-        at = first_of_slot(item(vectors.slot, i), width)
-        return item(vectors.value, at), item(vectors.value, at + width), item(vectors.value, at + 2 * width)
+        width = lanes_of(vectors.value)
+        at = index_of_x(load_scalar(vectors.slot, i), width)
+        return (
+            load_scalar(vectors.value, at),
+            load_scalar(vectors.value, at + width),
+            load_scalar(vectors.value, at + 2 * width),
+        )
 
     return from_slot
 
 
-def place(sites, state, m, i):
+def locate_site(sites, state, m, i):
     """Position (x, y, z) of site i of molecule m, lab frame, Å."""
     raise TypeError("compiled code only")
 
 
-@implements(place, inline=True)
-def _place(sites, state, m, i):
+@implements(locate_site, inline=True)
+def _locate_site(sites, state, m, i):
     if is_a(sites, CentralSites):
         return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
 
-    def place(sites, state, m, i):
+    def locate_site(sites, state, m, i):
         x, y, z = turned(sites, state, m, i)
         centre = state.position[np.uint64(m)]
         return centre[0] + x, centre[1] + y, centre[2] + z
 
-    return place
+    return locate_site
 
 
-def place_ahead(sites, state, m, i, lead):
+def predict_site(sites, state, m, i, lead):
     """Where site i of molecule m will be after a time `lead` if nothing acts and it keeps its angular velocity, Å."""
     raise TypeError("compiled code only")
 
 
-@implements(place_ahead, inline=True)
-def _place_ahead(sites, state, m, i, lead):
+@implements(predict_site, inline=True)
+def _predict_site(sites, state, m, i, lead):
     if is_a(sites, CentralSites):
         return lambda sites, state, m, i, lead: (
             state.position[m, 0] + lead * state.velocity[m, 0],
@@ -159,7 +173,7 @@ def _place_ahead(sites, state, m, i, lead):
             state.position[m, 2] + lead * state.velocity[m, 2],
         )
 
-    def place_ahead(sites, state, m, i, lead):
+    def predict_site(sites, state, m, i, lead):
         q, centre, velocity, momentum = (
             state.rotation[m], state.position[m], state.velocity[m], state.angular_momentum_body[m]
         )  # fmt: skip
@@ -172,8 +186,8 @@ def _place_ahead(sites, state, m, i, lead):
             0.5 * lead * inverse[2] * momentum[2],
         )
         x, y, z = offset[0], offset[1], offset[2]
-        share = 2 / (1 + a * a + b * b + c * c)
-        u, v, w = share * (b * z - c * y), share * (c * x - a * z), share * (a * y - b * x)
+        factor = 2 / (1 + a * a + b * b + c * c)
+        u, v, w = factor * (b * z - c * y), factor * (c * x - a * z), factor * (a * y - b * x)
         x, y, z = x + u + (b * w - c * v), y + v + (c * u - a * w), z + w + (a * v - b * u)
         return (
             centre[0] + lead * velocity[0] + q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
@@ -181,7 +195,7 @@ def _place_ahead(sites, state, m, i, lead):
             centre[2] + lead * velocity[2] + q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
         )
 
-    return place_ahead
+    return predict_site
 
 
 @kernel(inline=True)
@@ -209,7 +223,7 @@ def _load_molecule(sites, state, load, m, site_force):
 
         def load_central(sites, state, load, m, site_force):
             for i in range(sites.first[m], sites.first[m + 1]):
-                fx, fy, fz = of_site(site_force, i)
+                fx, fy, fz = site_vector(site_force, i)
                 load.force[m, 0] += fx
                 load.force[m, 1] += fy
                 load.force[m, 2] += fz
@@ -222,7 +236,7 @@ def _load_molecule(sites, state, load, m, site_force):
         begin = sites.kind[m] - sites.first[m]
         sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = 0.0  # kept in registers until the last site
         for i in range(sites.first[m], sites.first[np.uint64(m + 1)]):
-            fx, fy, fz = of_site(site_force, i)
+            fx, fy, fz = site_vector(site_force, i)
             sum_x, sum_y, sum_z = sum_x + fx, sum_y + fy, sum_z + fz
             # n_body = d x (Q^T f), with the site's offset d in the body frame
             bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
@@ -244,17 +258,17 @@ def _load_molecule(sites, state, load, m, site_force):
 
 
 @kernel(inline=True)
-def place_molecule(sites, state, m, site_position):
+def compute_molecule_positions(sites, state, m, site_position):
     """Write the positions of molecule m's sites into site_position (s, 3), lab frame."""
     for i in range(sites.first[m], sites.first[m + 1]):
-        site_position[i, 0], site_position[i, 1], site_position[i, 2] = place(sites, state, m, i)
+        site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
 
 
 @kernel(outer=True)
-def place_sites(sites, state, site_position):
+def compute_site_positions(sites, state, site_position):
     """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
     for m in range(len(state.position)):
-        place_molecule(sites, state, m, site_position)
+        compute_molecule_positions(sites, state, m, site_position)
 
 
 @kernel
@@ -265,85 +279,85 @@ def load_from_sites(sites, state, load, site_force):
 
 
 @task()
-def place_some(parcel, block):
-    """`place_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
-    sites, state, site_position = opened(parcel)
+def compute_positions_of_block(arguments, block):
+    """`compute_site_positions` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    sites, state, site_position = load_arguments(arguments)
     for m in _molecules_of(state, block):
-        place_molecule(sites, state, m, site_position)
+        compute_molecule_positions(sites, state, m, site_position)
 
 
 @task()
-def load_some(parcel, block):
+def load_block(arguments, block):
     """`load_from_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
-    sites, state, load, site_force = opened(parcel)
+    sites, state, load, site_force = load_arguments(arguments)
     for m in _molecules_of(state, block):
         load_molecule(sites, state, load, m, site_force)
 
 
 @task()
-def count_some(parcel, block):
+def add_offset_virial_of_block(arguments, block):
     """Sums of f (x) (x_site - X_molecule) over the molecules of a block (`blocks_of`), into a row (9,) of `virial`."""
-    sites, state, site_force, virial = opened(parcel)
-    own = virial[block]
-    own[:] = 0.0
+    sites, state, site_force, virial = load_arguments(arguments)
+    block_virial = virial[block]
+    block_virial[:] = 0.0
     for m in _molecules_of(state, block):
-        _count_offsets(sites, state, m, site_force, own)
+        _add_offset_virial(sites, state, m, site_force, block_virial)
 
 
 def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray, virial: np.ndarray) -> dict:
-    """The tasks "place", "load" and "count" for positions and forces (s, 3), see `Code`."""
+    """The tasks "positions", "load" and "offset_virial" for positions and forces (s, 3), see `Code`."""
     state, load = EXAMPLE
     return {
-        "place": (place_some, (sites, state, position)),
-        "load": (load_some, (sites, state, load, force)),
-        "count": (count_some, (sites, state, force, virial)),
+        "positions": (compute_positions_of_block, (sites, state, position)),
+        "load": (load_block, (sites, state, load, force)),
+        "offset_virial": (add_offset_virial_of_block, (sites, state, force, virial)),
     }
 
 
-def room_for_virial() -> np.ndarray:
-    """Room for the sums of `count_some`: 9 of each block, which has two lines of cache to itself."""
+def virial_buffer() -> np.ndarray:
+    """Room for the sums of `add_offset_virial_of_block`: 9 of each block, which has two lines of cache to itself."""
     return np.zeros((MOST_BLOCKS, 16))
 
 
-def virial_of_molecules(sites, code, state, site_force, virial, tally):
+def to_molecular_virial(sites, code, state, site_force, virial, tally):
     """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule).
 
-    code : has `count_some` as "count"; virial : of `room_for_virial`
+    code : has `add_offset_virial_of_block` as "offset_virial"; virial : of `virial_buffer`
     """
     raise TypeError("compiled code only")
 
 
-@implements(virial_of_molecules)
+@implements(to_molecular_virial)
 def _virial_of_molecules(sites, code, state, site_force, virial, tally):
     if is_a(sites, CentralSites):
         return lambda sites, code, state, site_force, virial, tally: None
 
-    def virial_of_molecules(sites, code, state, site_force, virial, tally):
+    def to_molecular_virial(sites, code, state, site_force, virial, tally):
         blocks = blocks_of(len(state.position))
-        call_blocks(code, "count", packed((sites, state, site_force, virial)), blocks)
+        call_blocks(code, "offset_virial", pack_arguments((sites, state, site_force, virial)), blocks)
         for block in range(blocks):
             for k in range(9):
                 tally[1 + k] -= virial[block, k]
 
-    return virial_of_molecules
+    return to_molecular_virial
 
 
-def _count_offsets(sites, state, m, site_force, virial):
+def _add_offset_virial(sites, state, m, site_force, virial):
     """Add f (x) (x_site - X_molecule) of a molecule's sites to nine numbers."""
     raise TypeError("compiled code only")
 
 
-@implements(_count_offsets, inline=True)
-def _count_offsets_of(sites, state, m, site_force, virial):
+@implements(_add_offset_virial, inline=True)
+def _add_offset_virial_of(sites, state, m, site_force, virial):
     if is_a(sites, CentralSites):
         return lambda sites, state, m, site_force, virial: None
 
-    def count_offsets(sites, state, m, site_force, virial):
+    def add_offset_virial(sites, state, m, site_force, virial):
         for i in range(sites.first[m], sites.first[m + 1]):
             offset = turned(sites, state, m, i)
-            force = of_site(site_force, i)
+            force = site_vector(site_force, i)
             for row in range(3):
                 for k in range(3):
                     virial[3 * row + k] += force[row] * offset[k]
 
-    return count_offsets
+    return add_offset_virial

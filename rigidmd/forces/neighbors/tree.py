@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.compile.simd import bits, lane_count, larger, load, lowest_bit, width_of
+from rigidmd.compile.simd import lane_count, lanes_of, load, lowest_bit, mask_bits, maximum
 
 
 class BoxTree(NamedTuple):
@@ -21,7 +21,7 @@ class BoxTree(NamedTuple):
     level: np.ndarray  # (levels + 1,) first node of each level
 
 
-def box_tree(count: int) -> BoxTree:
+def empty_tree(count: int) -> BoxTree:
     """Room for a tree of this many clusters."""
     arity = lane_count(np.float64)
     level = [0]
@@ -33,10 +33,10 @@ def box_tree(count: int) -> BoxTree:
 
 
 @kernel(counted=False)
-def grow(tree, clusters):
+def fit_boxes(tree, clusters):
     """Fit the boxes to newly sorted clusters."""
-    arity = width_of(tree.low)
-    width = width_of(clusters.local)
+    arity = lanes_of(tree.low)
+    width = lanes_of(clusters.local)
     tree.low[:] = inf
     tree.high[:] = -inf
     for c in range(len(clusters.origin) // 4):
@@ -61,7 +61,7 @@ def families_within_reach(tree, low, high, radius2, first, end, clusters, stack,
     turn ahead, on the ring, of one of clusters first ... end - 1. Returns the new count, which may exceed the room;
     stack (levels, 2) is scratch.
     """
-    arity = width_of(tree.low)
+    arity = lanes_of(tree.low)
     top = len(tree.level) - 2
     half = clusters // 2
     depth = 0
@@ -93,10 +93,10 @@ def families_within_reach(tree, low, high, radius2, first, end, clusters, stack,
 @kernel(inline=True)
 def near(tree, node, low, high, radius2):
     """Which of the boxes from a node on, as many as its siblings, are closer than a radius to a box, as bits."""
-    dx = larger(larger(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
-    dy = larger(larger(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
-    dz = larger(larger(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
-    return bits(dx * dx + dy * dy + dz * dz < radius2)
+    dx = maximum(maximum(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
+    dy = maximum(maximum(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
+    dz = maximum(maximum(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
+    return mask_bits(dx * dx + dy * dy + dz * dz < radius2)
 
 
 @kernel(inline=True)

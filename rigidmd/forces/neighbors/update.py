@@ -2,60 +2,62 @@
 
 from math import ceil, floor, inf, sqrt
 
-from rigidmd.compile import Code, call, call_blocks, kernel, opened, packed, task
+from rigidmd.compile import Code, call, call_blocks, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
-    bin_block,
-    follow_block,
-    hold,
-    place_block,
-    settle_again,
-    settle_block,
+    bin_sites_of_block,
+    measure_displacements_of_block,
+    restore_half_squares,
+    set_local_of_block,
+    set_origins_of_block,
     sort_into_clusters,
-    wrap_block,
+    use_present_as_reference,
+    wrap_sites_of_block,
 )
 from rigidmd.forces.neighbors.lists import (  # fmt: skip
-    AHEAD,
     BUILDS,
     BUILT,
     ENTRIES,
     IMAGES_FOUND,
+    LEAD_TIME,
     LONGEST_SKIN,
     MASKED,
-    MET,
-    MET_BY_ONE,
-    MOST_MET,
+    MAX_NEIGHBORS,
+    NEIGHBORS,
+    NEIGHBORS_OF_ONE,
     STATUS,
     USABLE,
     PairList,
-    farthest,
+    largest_displacement,
     most_needed,
 )
-from rigidmd.forces.neighbors.rows import fill_block, part_block
+from rigidmd.forces.neighbors.rows import fill_block, update_origin_vectors_of_block
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell
-from rigidmd.forces.neighbors.tree import grow
+from rigidmd.forces.neighbors.tree import fit_boxes
 
 #: A list is built for places that are ahead of the present ones by this share of the time that the last one served:
 #: its sites come nearer to them before they go away. It serves longer by a fifth (water) or a half (nitrogen). With a
 #: larger share the sites are farther from their places on average, and more shells of clusters have to be worked
 #: through.
-LEAD = 0.25
-LOST = 1e9  # list radii from the origin; no radius is longer than a box, so 32 bits can count the boxes on the way
+LEAD_FRACTION = 0.25
+MAX_DISTANCE = (
+    1e9  # list radii from the origin; no radius is longer than a box, so 32 bits can count the boxes on the way
+)
 
 
 def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
     """The machine code of the tasks that keep a list."""
-    placed = (pairs, sites, EXAMPLE[0])
+    site_arguments = (pairs, sites, EXAMPLE[0])
     return Code(
-        part=(_part, pairs),
-        place=(_place, placed),
-        follow=(_follow, pairs),
-        wrap=(_wrap, placed),
-        bin=(_bin, placed),
-        prepare=(_prepare, pairs),
-        settle=(_settle, placed),
-        grow=(_grow, pairs),
+        origin_vectors=(_update_origin_vectors, pairs),
+        local=(_set_local, site_arguments),
+        displacements=(_measure_displacements, pairs),
+        wrap=(_wrap_sites, site_arguments),
+        bin=(_bin_sites, site_arguments),
+        sort=(_sort_sites, pairs),
+        origins=(_set_origins, site_arguments),
+        boxes=(_fit_boxes, pairs),
         fill=(_fill, pairs),
     )
 
@@ -64,46 +66,46 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
 def update_list(pairs, code, sites, state):
     """Move the clusters with the molecules, and rebuild the list if it is no longer valid; a status code."""
     blocks = len(pairs.needed)
-    parcel = packed(pairs)
-    placed = packed((pairs, sites, state))
+    arguments = pack_arguments(pairs)
+    site_arguments = pack_arguments((pairs, sites, state))
     if follow_cell(state.cell, pairs.cell):
-        if not _is_known(pairs.cell):
+        if not _has_no_nan(pairs.cell):
             pairs.counters[USABLE] = 0
             return NOT_FINITE
         if pairs.counters[USABLE] == 1:
             if _move_images(pairs):
-                call_blocks(code, "part", parcel, blocks)
+                call_blocks(code, "origin_vectors", arguments, blocks)
             else:
                 pairs.counters[USABLE] = 0
     if pairs.counters[USABLE] == 1:
-        call_blocks(code, "place", placed, blocks)
-        call_blocks(code, "follow", parcel, blocks)
-        if farthest(pairs) < inf:
+        call_blocks(code, "local", site_arguments, blocks)
+        call_blocks(code, "displacements", arguments, blocks)
+        if largest_displacement(pairs) < inf:
             return OK
     pairs.counters[USABLE] = 0
-    if not _fits(pairs):
+    if not _cell_fits(pairs):
         return CELL_CHANGED
     now = state.time[NOW]
-    lead = LEAD * (now - pairs.times[BUILT])
+    lead = LEAD_FRACTION * (now - pairs.times[BUILT])
     # the second time where some site is too far from its place ahead
     for ahead in (lead if abs(lead) < inf else 0.0), 0.0:
-        pairs.times[AHEAD] = ahead
-        call_blocks(code, "wrap", placed, blocks)
-        call_blocks(code, "bin", placed, blocks)
-        call(code, "prepare", parcel)
+        pairs.times[LEAD_TIME] = ahead
+        call_blocks(code, "wrap", site_arguments, blocks)
+        call_blocks(code, "bin", site_arguments, blocks)
+        call(code, "sort", arguments)
         if pairs.counters[STATUS] == OK:
-            call_blocks(code, "settle", placed, blocks)
-            call_blocks(code, "place", placed, blocks)
+            call_blocks(code, "origins", site_arguments, blocks)
+            call_blocks(code, "local", site_arguments, blocks)
             if ahead == 0.0:
-                hold(pairs.clusters)
-            call_blocks(code, "follow", parcel, blocks)
-            if farthest(pairs) < inf:
+                use_present_as_reference(pairs.clusters)
+            call_blocks(code, "displacements", arguments, blocks)
+            if largest_displacement(pairs) < inf:
                 break
     if pairs.counters[STATUS] != OK:
         return pairs.counters[STATUS]
-    call(code, "grow", parcel)
-    call_blocks(code, "fill", parcel, blocks)
-    status = _judged(pairs)
+    call(code, "boxes", arguments)
+    call_blocks(code, "fill", arguments, blocks)
+    status = _finish_build(pairs)
     if status == OK:
         pairs.times[BUILT] = now
     return status
@@ -111,23 +113,23 @@ def update_list(pairs, code, sites, state):
 
 @kernel(counted=False)
 def refill(pairs, code):
-    """Build the list again from the clusters that `lists.recalled` has put in; a status code."""
-    settle_again(pairs.clusters)
+    """Build the list again from the clusters that `lists.restored` has put in; a status code."""
+    restore_half_squares(pairs.clusters)
     _find_images(pairs)
-    parcel = packed(pairs)
-    call(code, "grow", parcel)
-    call_blocks(code, "fill", parcel, len(pairs.needed))
-    return _judged(pairs)
+    arguments = pack_arguments(pairs)
+    call(code, "boxes", arguments)
+    call_blocks(code, "fill", arguments, len(pairs.needed))
+    return _finish_build(pairs)
 
 
 @kernel(counted=False)
-def _judged(pairs):
+def _finish_build(pairs):
     """Whether a list that has been filled is whole, into its counters; a status code."""
     if (
         most_needed(pairs, ENTRIES) > pairs.entries.shape[1]
         or most_needed(pairs, MASKED) > pairs.masked.shape[1]
-        or most_needed(pairs, MET) > pairs.met.shape[1]
-        or most_needed(pairs, MET_BY_ONE) > MOST_MET
+        or most_needed(pairs, NEIGHBORS) > pairs.neighbors.shape[1]
+        or most_needed(pairs, NEIGHBORS_OF_ONE) > MAX_NEIGHBORS
     ):
         return LIST_FULL
     pairs.counters[USABLE] = 1
@@ -136,7 +138,7 @@ def _judged(pairs):
 
 
 @kernel
-def _is_known(cell):
+def _has_no_nan(cell):
     """Whether no component of a cell is NaN: comparisons and extremes would pass over it."""
     for vector in range(3):
         for k in range(3):
@@ -151,18 +153,18 @@ def _shortest(cell):
 
 
 @kernel
-def _fits(pairs):
-    """Whether the cell has room for the cut-off and the skin."""
+def _cell_fits(pairs):
+    """Whether the cell has capacity for the cut-off and the skin."""
     shortest = _shortest(pairs.cell)
     return pairs.cutoff == inf or (2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest)
 
 
 @kernel
-def _most_slack(pairs):
+def _max_slack(pairs):
     """How far images may move until the list is built again, Å.
 
     Images are sought so much farther than sites: one that was left out, and may move by twice as much as those that
-    were found, is out of reach meanwhile. No slack if such a search could find more images than there is room for.
+    were found, is out of reach meanwhile. No slack if such a search could find more images than there is capacity for.
     """
     is_short = pairs.cutoff < inf and 2.5 * pairs.skin <= _shortest(pairs.built)
     return 0.25 * pairs.skin if is_short else 0.0
@@ -170,7 +172,7 @@ def _most_slack(pairs):
 
 @kernel
 def _move_images(pairs):
-    """Move the images with the cell. Whether the list still serves; `part_block` must then follow."""
+    """Move the images with the cell. Whether the list still serves; `update_origin_vectors_of_block` must then follow."""
     farthest2 = 0.0
     for n in range(pairs.counters[IMAGES_FOUND]):
         moved2 = 0.0
@@ -180,7 +182,7 @@ def _move_images(pairs):
             moved2 += (pairs.shift[4 * n + k] - before) ** 2
         farthest2 = max(farthest2, moved2)
     pairs.slack[0] = sqrt(farthest2)
-    return _fits(pairs) and pairs.slack[0] <= _most_slack(pairs)
+    return _cell_fits(pairs) and pairs.slack[0] <= _max_slack(pairs)
 
 
 @kernel(inline=True)
@@ -194,40 +196,40 @@ def _displacement(cell, multiple, k):
 
 
 @task(counted=False)
-def _part(parcel, block):
-    pairs = opened(parcel)
-    part_block(pairs, block)
+def _update_origin_vectors(arguments, block):
+    pairs = load_arguments(arguments)
+    update_origin_vectors_of_block(pairs, block)
 
 
 @task(counted=False)
-def _place(parcel, block):
-    pairs, sites, state = opened(parcel)
-    place_block(pairs.clusters, pairs.cell, sites, state, block)
+def _set_local(arguments, block):
+    pairs, sites, state = load_arguments(arguments)
+    set_local_of_block(pairs.clusters, pairs.cell, sites, state, block)
 
 
 @task(counted=False)
-def _follow(parcel, block):
-    pairs = opened(parcel)
-    follow_block(pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0]), block)
+def _measure_displacements(arguments, block):
+    pairs = load_arguments(arguments)
+    measure_displacements_of_block(pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0]), block)
 
 
 @task(counted=False)
-def _wrap(parcel, block):
-    pairs, sites, state = opened(parcel)
-    lost = LOST * (pairs.cutoff + pairs.skin)
-    wrap_block(pairs.clusters, pairs.cell, sites, state, pairs.times[AHEAD], lost, block)
+def _wrap_sites(arguments, block):
+    pairs, sites, state = load_arguments(arguments)
+    lost = MAX_DISTANCE * (pairs.cutoff + pairs.skin)
+    wrap_sites_of_block(pairs.clusters, pairs.cell, sites, state, pairs.times[LEAD_TIME], lost, block)
 
 
 @task(counted=False)
-def _bin(parcel, block):
-    pairs, sites, _ = opened(parcel)
-    bin_block(pairs.clusters, sites, block)
+def _bin_sites(arguments, block):
+    pairs, sites, _ = load_arguments(arguments)
+    bin_sites_of_block(pairs.clusters, sites, block)
 
 
 @task()
-def _prepare(parcel, block):
+def _sort_sites(arguments, block):
     """Sort the sites for a new list; a status code into counters[STATUS]."""
-    pairs = opened(parcel)
+    pairs = load_arguments(arguments)
     pairs.counters[STATUS] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
     _find_images(pairs)
 
@@ -244,7 +246,7 @@ def _find_images(pairs):
         for k in range(3):
             pairs.built[vector, k] = cell[vector, k]
     pairs.slack[0] = 0.0
-    radius = min(pairs.cutoff + pairs.skin + _most_slack(pairs), _shortest(cell))  # rounding may exceed it
+    radius = min(pairs.cutoff + pairs.skin + _max_slack(pairs), _shortest(cell))  # rounding may exceed it
     multiple[0, 0] = multiple[0, 1] = multiple[0, 2] = 0
     found = 1
     for z in range(-1, 2):
@@ -275,20 +277,20 @@ def _images_along(cell, k, offset, radius):
 
 
 @task(counted=False)
-def _settle(parcel, block):
-    pairs, sites, state = opened(parcel)
-    settle_block(pairs.clusters, pairs.cell, sites, state, pairs.times[AHEAD], pairs.group, block)
+def _set_origins(arguments, block):
+    pairs, sites, state = load_arguments(arguments)
+    set_origins_of_block(pairs.clusters, pairs.cell, sites, state, pairs.times[LEAD_TIME], pairs.group, block)
 
 
 @task(counted=False)
-def _grow(parcel, block):
-    pairs = opened(parcel)
-    grow(pairs.tree, pairs.clusters)
+def _fit_boxes(arguments, block):
+    pairs = load_arguments(arguments)
+    fit_boxes(pairs.tree, pairs.clusters)
 
 
 @task()
-def _fill(parcel, block):
-    pairs = opened(parcel)
-    room = 256
-    while room > 0:
-        room = fill_block(pairs, block, room)
+def _fill(arguments, block):
+    pairs = load_arguments(arguments)
+    capacity = 256
+    while capacity > 0:
+        capacity = fill_block(pairs, block, capacity)

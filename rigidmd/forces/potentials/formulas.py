@@ -1,4 +1,4 @@
-"""Formulas of laws between pairs of sites: from the text of an energy, from a function, from a table.
+"""Formulas of potentials between pairs of sites: from the text of an energy, from a function, from a table.
 
 The force of a text is its derivative (SymPy). What does not depend on the distance is computed once for each pair of
 kinds, so that 4 eps ((sig/r)**12 - (sig/r)**6) costs what the built-in Lennard-Jones does. The code is written as a
@@ -19,11 +19,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from rigidmd.compile import implements, is_a
-from rigidmd.compile.own import foreign
-from rigidmd.core.toml import cut
+from rigidmd.compile.kernels import compile_user_function
+from rigidmd.core.toml import shorten_text
 from rigidmd.core.user_modules import module_of
-from rigidmd.errors import told
-from rigidmd.forces.potentials.custom import Table, Tabulated, of_distance
+from rigidmd.errors import describe_error
+from rigidmd.forces.potentials.custom import Table, Tabulated, energy_and_force_at
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 FUNCTIONS = {"exp": exp, "log": log, "sqrt": sqrt, "sin": sin, "cos": cos}
 OPERATORS = {ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.Pow: pow}
 DISTANCE = "r"
-LONGEST_TEXT, LARGEST_POWER, MOST_NODES, DEEPEST = 2000, 200, 200, 20
+MAX_TEXT_LENGTH, MAX_POWER, MAX_NODES, MAX_DEPTH = 2000, 200, 200, 20
 #: Decimal digits that numbers of a formula may have before or behind the point, powers of them multiplied out.
-MOST_DIGITS = 300
+MAX_DIGITS = 300
 #: Function of a distance (Å) that gives the energy v, -v' and -v'', in u Å²/ps².
 Radial = Callable[[float], tuple[float, float, float]]
 #: Values of r² in a table, equally spaced.
@@ -43,7 +43,7 @@ STEPS = 4096
 
 
 class Formula(NamedTuple):
-    """A radial law, energies in kJ/mol and distances in Å where users see them, u Å²/ps² in compiled code."""
+    """A radial potential, energies in kJ/mol and distances in Å where users see them, u Å²/ps² in compiled code."""
 
     text: str  # what it is, for messages
     parameters: tuple[str, ...]  # names of the parameters of a pair of sites
@@ -61,7 +61,7 @@ class FormulaError(ValueError):
 # --- from a text -----------------------------------------------------------------------------------------------------
 
 
-def of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formula:
+def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formula:
     """The formula of an energy (kJ/mol) such as "A*exp(-B*r) - C/r**6", of r (Å) and named parameters.
 
     constants : parameters that are the same for all sites, which then are numbers of the formula. Raises FormulaError.
@@ -84,9 +84,9 @@ def of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formul
     except FormulaError:
         raise
     except (ArithmeticError, ValueError, TypeError, RecursionError, MemoryError) as error:  # of SymPy and mpmath
-        raise FormulaError(f"{energy!r} cannot be differentiated: {told(error)}") from None
-    module = module_of(source.encode(), f"<law {energy}>")
-    names = {symbol.name[len(OWN) :]: symbol for symbol in symbols}
+        raise FormulaError(f"{energy!r} cannot be differentiated: {describe_error(error)}") from None
+    module = module_of(source.encode(), f"<potential {energy}>")
+    names = {symbol.name[len(PARAMETER_PREFIX) :]: symbol for symbol in symbols}
 
     def numbers(given: Mapping[str, float]) -> tuple[float, ...]:
         values = {symbol: given[name] for name, symbol in names.items()}
@@ -104,12 +104,12 @@ def of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formul
     return Formula(energy, tuple(names), numbers, radial, module.Formula)
 
 
-#: Before the names of a formula's own parameters, which then differ from all others.
-OWN, HOISTED = "own_", "whole_"
+#: Before the names of a formula's formula_class parameters, which then differ from all others.
+PARAMETER_PREFIX, CONSTANT_PREFIX = "own_", "whole_"
 
 
 def _derivative(e: "sympy.Expr", r: "sympy.Symbol", known: "dict[sympy.Expr, sympy.Expr]") -> "sympy.Expr":
-    """The derivative by r. SymPy's own asks for signs of all that it makes, which takes 2**depth."""
+    """The derivative by r. SymPy's formula_class asks for signs of all that it makes, which takes 2**depth."""
     import sympy
 
     if e not in known:
@@ -190,7 +190,7 @@ def _hoisted(u: "sympy.Expr", r: "sympy.Symbol") -> "tuple[dict[sympy.Symbol, sy
     hoisted, total = {}, sympy.Integer(0)
     for k, (rest, factor) in enumerate(of.items()):
         if factor.free_symbols:
-            symbol = sympy.Symbol(f"{HOISTED}{k}", real=True)
+            symbol = sympy.Symbol(f"{CONSTANT_PREFIX}{k}", real=True)
             hoisted[symbol], factor = factor, symbol
         total += factor * rest
     return hoisted, total
@@ -306,16 +306,16 @@ def _parsed(energy: str, constants: Mapping[str, float]) -> "sympy.Expr":
     """An energy as SymPy has it, read without running it: only arithmetic and `FUNCTIONS`. Raises FormulaError."""
     import sympy
 
-    if len(energy) > LONGEST_TEXT:
-        raise FormulaError(f"it has {len(energy)} characters; {LONGEST_TEXT} are the most")
+    if len(energy) > MAX_TEXT_LENGTH:
+        raise FormulaError(f"it has {len(energy)} characters; {MAX_TEXT_LENGTH} are the most")
     try:
         tree = ast.parse(energy.strip(), mode="eval")
     except (SyntaxError, ValueError, MemoryError, RecursionError):
         reserved = [word for word in re.findall(r"[^\W\d]\w*", energy) if keyword.iskeyword(word)]
         why = f": {reserved[0]} is a reserved word of Python" if reserved else ""
         raise FormulaError(f"{energy!r} is not a formula such as A*exp(-B*r) - C/r**6{why}") from None
-    if sum(1 for _ in ast.walk(tree)) > MOST_NODES:
-        raise FormulaError(f"it has more than {MOST_NODES} numbers, names and operations")
+    if sum(1 for _ in ast.walk(tree)) > MAX_NODES:
+        raise FormulaError(f"it has more than {MAX_NODES} numbers, names and operations")
     found = _read(tree.body, constants, 0).value
     if found.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         raise FormulaError(f"{energy!r} is not finite")
@@ -336,8 +336,8 @@ def _number(x: float, what: str) -> _Part:
     """A number of a formula. Raises FormulaError."""
     import sympy
 
-    if isinstance(x, complex) or not isfinite(x) or (x and not abs(log10(abs(x))) <= MOST_DIGITS):
-        raise FormulaError(f"{what} is no real number between 1e-{MOST_DIGITS} and 1e{MOST_DIGITS}")
+    if isinstance(x, complex) or not isfinite(x) or (x and not abs(log10(abs(x))) <= MAX_DIGITS):
+        raise FormulaError(f"{what} is no real number between 1e-{MAX_DIGITS} and 1e{MAX_DIGITS}")
     whole = 2 * x == int(2 * x) and abs(x) < 1e9  # and halves, for square roots
     return _Part(sympy.Rational(int(2 * x), 2) if whole else sympy.Float(x), x, abs(log10(abs(x))) if x else 0.0)
 
@@ -350,9 +350,9 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
     def inner(of: ast.AST, more: int = 1) -> _Part:
         return _read(of, constants, depth + more)
 
-    if depth > DEEPEST:
-        raise FormulaError(f"it has more than {DEEPEST} functions, powers and brackets inside one another")
-    what = cut(ast.unparse(node))
+    if depth > MAX_DEPTH:
+        raise FormulaError(f"it has more than {MAX_DEPTH} functions, powers and brackets inside one another")
+    what = shorten_text(ast.unparse(node))
     try:
         match node:
             case ast.Constant(value=int() | float() as x) if not isinstance(x, bool):
@@ -364,7 +364,7 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
             case ast.Name(id=name) if name in constants:
                 return _number(constants[name], what)
             case ast.Name(id=name):
-                return _Part(sympy.Symbol(f"{OWN}{name}", real=True), None, 0.0)
+                return _Part(sympy.Symbol(f"{PARAMETER_PREFIX}{name}", real=True), None, 0.0)
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as op, operand=of):
                 part, sign = inner(of, 0), 1 if isinstance(op, ast.UAdd) else -1
                 return part._replace(value=sign * part.value, number=part.number and sign * part.number)
@@ -409,10 +409,10 @@ def _combined(function: Callable, first: _Part, second: _Part, is_power: bool, w
 
 def _check(digits: float, power: float, what: str) -> None:
     """Raise FormulaError if numbers of a part or its powers are too large."""
-    if not power <= LARGEST_POWER:
-        raise FormulaError(f"{what} is a power beyond {LARGEST_POWER}")
-    if not digits <= MOST_DIGITS:
-        raise FormulaError(f"{what} has numbers of more than {MOST_DIGITS} digits")
+    if not power <= MAX_POWER:
+        raise FormulaError(f"{what} is a power beyond {MAX_POWER}")
+    if not digits <= MAX_DIGITS:
+        raise FormulaError(f"{what} has numbers of more than {MAX_DIGITS} digits")
 
 
 # --- from a function -------------------------------------------------------------------------------------------------
@@ -422,7 +422,7 @@ _COUNT = itertools.count()
 ARGUMENTS = ("r", "r2", "inverse")
 
 
-def of_function(function: Callable, kind: type | None = None) -> Formula:
+def formula_of_function(function: Callable, kind: type | None = None) -> Formula:
     """The formula of a function f(p, r) that gives (energy in kJ/mol, -dE/dr in kJ/mol/Å) for the parameters p.
 
     It is compiled for vectors of distances: arithmetic, and exp, log, pow, sin, cos, sqrt, fabs of Python's `math`. By
@@ -430,7 +430,7 @@ def of_function(function: Callable, kind: type | None = None) -> Formula:
     kind : NamedTuple class of the parameters; default: the annotation of p. Raises FormulaError.
     """
     function = getattr(function, "py_func", function)
-    name = getattr(function, "__name__", "a law")
+    name = getattr(function, "__name__", "a potential")
     if not inspect.isfunction(function):
         raise FormulaError(f"{function!r:.60} is not a function of Python, made by def or lambda")
     arguments = list(inspect.signature(function).parameters.values())
@@ -445,17 +445,17 @@ def of_function(function: Callable, kind: type | None = None) -> Formula:
         raise FormulaError(
             f"{name} does not say what its parameters are: annotate {arguments[0].name} with a NamedTuple"
         )
-    own = _class_for(kind, function)
+    formula_class = _class_for(kind, function)
     given = [one.name for one in arguments[1:]]
 
     def called(values: Mapping[str, float], distance: float) -> tuple[float, float]:
         asked = {"r": distance, "r2": distance**2, "inverse": 1 / distance}
         try:
-            found = function(own(**values), *(asked[name] for name in given))
+            found = function(formula_class(**values), *(asked[name] for name in given))
             energy, force = map(float, found)
         except (Exception, SystemExit) as error:  # whatever a stranger's function raises
             raise FormulaError(
-                f"{name} at r = {distance:g} Å must give (energy, force), two numbers; {told(error)}"
+                f"{name} at r = {distance:g} Å must give (energy, force), two numbers; {describe_error(error)}"
             ) from error
         return energy * KJ_PER_MOL, force * KJ_PER_MOL
 
@@ -468,7 +468,13 @@ def of_function(function: Callable, kind: type | None = None) -> Formula:
 
         return value
 
-    return Formula(name, own._fields, lambda values: tuple(values[field] for field in own._fields), radial, own)
+    return Formula(
+        name,
+        formula_class._fields,
+        lambda values: tuple(values[field] for field in formula_class._fields),
+        radial,
+        formula_class,
+    )
 
 
 def _annotated(function: Callable, argument: str) -> Any:
@@ -481,9 +487,9 @@ def _annotated(function: Callable, argument: str) -> Any:
 def _class_for(kind: type, function: Callable) -> type:
     """A new class for a function, which compiled code tells it by: it sees the values that the function uses now."""
     module, name = function.__module__, f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}"
-    own = type(name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True})
-    own.__name__ = f"{name}_{next(_COUNT)}"  # Numba's dispatchers take classes of one name for one type
-    compiled = foreign(function, inline=True)
+    formula_class = type(name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True})
+    formula_class.__name__ = f"{name}_{next(_COUNT)}"  # Numba's dispatchers take classes of one name for one type
+    compiled = compile_user_function(function, inline=True)
     asked = tuple(name for name in list(inspect.signature(function).parameters)[1:])
     values = {"r": "r2 * inverse1", "r2": "r2", "inverse": "inverse1"}
     source = (
@@ -494,17 +500,17 @@ def _class_for(kind: type, function: Callable) -> type:
     names = {"function": compiled}
     exec(source, names)
 
-    @implements(of_distance, inline=True)
+    @implements(energy_and_force_at, inline=True)
     def _of_function(formula, shared, r2, inverse1, inverse2):
-        return names["of_distance"] if is_a(formula, own) else None
+        return names["of_distance"] if is_a(formula, formula_class) else None
 
-    return own
+    return formula_class
 
 
 # --- from a table ----------------------------------------------------------------------------------------------------
 
 
-def of_table(distance: Sequence[float], energy: Sequence[float], cutoff: float) -> Formula:
+def formula_of_table(distance: Sequence[float], energy: Sequence[float], cutoff: float) -> Formula:
     """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to the cut-off.
 
     A cubic spline through the values, taken again at equal steps of r², where the pair loop reads it; its force is the

@@ -1,7 +1,7 @@
-"""Screened charges, with a Coulomb law erfc(alpha r)/r: the real-space part of Ewald sums, and damped shifted forces.
+"""Screened charges, with a Coulomb potential erfc(alpha r)/r: the real-space part of Ewald sums, and damped shifted forces.
 
 The pair loop computes neither erfc nor exp. The screening part erf(alpha r)/r is a smooth function of r², and so is its
-force over r. Each is a polynomial in r², fitted when the law is created, with as many terms as the cut-off, alpha and
+force over r. Each is a polynomial in r², fitted when the potential is created, with as many terms as the cut-off, alpha and
 the precision of the loop require. A vector of pairs then costs one inverse square root and one multiply-add per term.
 
 In vectors of 16 float32 the force is rather a cubic for each of 32 intervals of r²: a lookup takes one instruction,
@@ -17,7 +17,16 @@ import numpy as np
 from scipy.special import erfc, ive
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.simd import HAS_AVX512, inverse_root, load, parted, picked, polynomial, root_and_cube, zeros
+from rigidmd.compile.simd import (
+    HAS_AVX512,
+    inverse_root_and_cube,
+    inverse_square_root,
+    load,
+    permute_two,
+    polynomial,
+    split_integer_part,
+    zeros,
+)
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.units import COULOMB_CHARGE
 
@@ -147,8 +156,8 @@ class ScreenedCoulomb(NamedTuple):
     screening: Screening | TabledScreening
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
-    def room(self, slots: int, dtype: type) -> "ScreenedCoulomb":
-        """The law with room for the charges in slots, in the precision of lanes."""
+    def for_slots(self, slots: int, dtype: type) -> "ScreenedCoulomb":
+        """The potential with room for the charges in slots, in the precision of lanes."""
         error = self.error if dtype == np.float32 else 0.0
         fitted = screening_of_lanes(self.alpha, self.cutoff, dtype, error)
         return self._replace(charge=zeros(slots, dtype), screening=fitted)
@@ -157,7 +166,7 @@ class ScreenedCoulomb(NamedTuple):
 def screened_coulomb(
     charge_e: np.ndarray, cutoff: float, alpha: float, shifted: bool = False, error: float = 0.0
 ) -> ScreenedCoulomb:
-    """The law for sites with charges (s,) in e.
+    """The potential for sites with charges (s,) in e.
 
     shifted : whether the energy is 0 at the cut-off
     error : allowed for forces between unit charges in single precision, 1/Å²; more terms of the polynomials would only
@@ -181,14 +190,14 @@ class DampedShiftedForce(NamedTuple):
     shift: float  # 1/Å, the constant part
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
-    def room(self, slots: int, dtype: type) -> "DampedShiftedForce":
-        """The law with room for the charges in slots, in the precision of lanes."""
+    def for_slots(self, slots: int, dtype: type) -> "DampedShiftedForce":
+        """The potential with room for the charges in slots, in the precision of lanes."""
         fitted = screening_of_lanes(self.alpha, self.cutoff, dtype)
         return self._replace(charge=zeros(slots, dtype), screening=fitted)
 
 
 def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> DampedShiftedForce:
-    """The law for sites with charges (s,) in e; alpha in 1/Å, 0 for no damping."""
+    """The potential for sites with charges (s,) in e; alpha in 1/Å, 0 for no damping."""
     x = alpha * cutoff
     slope = float(erfc(x)) / cutoff**2 + 2 * alpha / sqrt(pi) * exp(-(x**2)) / cutoff
     shift = -float(erfc(x)) / cutoff - slope * cutoff
@@ -219,7 +228,7 @@ def _screened(screening, inverse, cube, r2):
 
     def by_table(screening, inverse, cube, r2):
         u = inverse - polynomial(screening.energy, screening.scale * r2 - 1.0)
-        k, x = parted(screening.density * r2)
+        k, x = split_integer_part(screening.density * r2)
         force = _coefficient(screening.table, 3, k)
         for term in (2, 1, 0):
             force = force * x + _coefficient(screening.table, term, k)
@@ -231,51 +240,55 @@ def _screened(screening, inverse, cube, r2):
 @kernel(inline=True)
 def _coefficient(table, term, k):
     """Coefficients of x^term in intervals k."""
-    return picked(load(table, INTERVALS * term), load(table, INTERVALS * term + 16), k)
+    return permute_two(load(table, INTERVALS * term), load(table, INTERVALS * term + 16), k)
 
 
 @implements(pairs.pair, inline=True)
-def _pair(law, i, j, r2):
-    if is_a(law, ScreenedCoulomb):
+def _pair(potential, i, j, r2):
+    if is_a(potential, ScreenedCoulomb):
 
-        def ewald_pair(law, i, j, r2):
-            qq = law.charge[i] * load(law.charge, j)
-            inverse, one, two = root_and_cube(r2)
-            u, w = screened(law.screening, inverse, (one, two), r2)
-            return qq * (u - law.shift), qq * w
+        def ewald_pair(potential, i, j, r2):
+            qq = potential.charge[i] * load(potential.charge, j)
+            inverse, one, two = inverse_root_and_cube(r2)
+            u, w = screened(potential.screening, inverse, (one, two), r2)
+            return qq * (u - potential.shift), qq * w
 
         return ewald_pair
-    if not is_a(law, DampedShiftedForce):
+    if not is_a(potential, DampedShiftedForce):
         return None
 
-    def shifted_pair(law, i, j, r2):
-        qq = law.charge[i] * load(law.charge, j)
-        inverse = inverse_root(r2)
-        u, w = screened(law.screening, inverse, (inverse, inverse * inverse), r2)
-        return qq * (u + law.slope * (r2 * inverse) + law.shift), qq * (w - law.slope * inverse)
+    def shifted_pair(potential, i, j, r2):
+        qq = potential.charge[i] * load(potential.charge, j)
+        inverse = inverse_square_root(r2)
+        u, w = screened(potential.screening, inverse, (inverse, inverse * inverse), r2)
+        return qq * (u + potential.slope * (r2 * inverse) + potential.shift), qq * (w - potential.slope * inverse)
 
     return shifted_pair
 
 
 @implements(pairs.arrange)
-def _arrange(law, arranged, order):
-    if not (is_a(law, ScreenedCoulomb) or is_a(law, DampedShiftedForce)):
+def _arrange(potential, slot_potential, order):
+    if not (is_a(potential, ScreenedCoulomb) or is_a(potential, DampedShiftedForce)):
         return None
-    return lambda law, arranged, order: pairs.into_slots(law.charge, arranged.charge, order)
+    return lambda potential, slot_potential, order: pairs.into_slots(potential.charge, slot_potential.charge, order)
 
 
-def damped_self_energy(law: DampedShiftedForce, position: np.ndarray) -> float:
+def damped_self_energy(potential: DampedShiftedForce, position: np.ndarray) -> float:
     """Energy (u Å²/ps²) of one molecule's charges with the neutralising images of damped shifted force.
 
-    position (s, 3) of the molecule's charged sites, in the order of the first s of law.charge. Each charge interacts
+    position (s, 3) of the molecule's charged sites, in the order of the first s of potential.charge. Each charge interacts
     with its own image (Fennell & Gezelter 2006) and with those of its molecule, for which the pair loop has no pairs.
     The energy is constant for a rigid body.
     """
-    charge = law.charge[: len(position)]
-    energy = (0.5 * law.shift - law.alpha / sqrt(pi)) * charge @ charge
+    charge = potential.charge[: len(position)]
+    energy = (0.5 * potential.shift - potential.alpha / sqrt(pi)) * charge @ charge
     for i in range(len(position)):
         for j in range(i):
             r = float(np.linalg.norm(position[i] - position[j]))
-            u = float(erfc(law.alpha * r)) / r + law.slope * r + law.shift if r < law.cutoff else 0.0
+            u = (
+                float(erfc(potential.alpha * r)) / r + potential.slope * r + potential.shift
+                if r < potential.cutoff
+                else 0.0
+            )
             energy += charge[i] * charge[j] * (u - 1 / r)
     return float(energy)

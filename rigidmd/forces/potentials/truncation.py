@@ -1,6 +1,6 @@
-"""Truncation of a radial law at its cut-off: plain, shift, force_shift, force_switch, switch or smooth_switch.
+"""Truncation of a radial potential at its cut-off: plain, shift, force_shift, force_switch, switch or smooth_switch.
 
-A law is a sum of radial parts v(r). Inside the cut-off, v(r) becomes
+A potential is a sum of radial parts v(r). Inside the cut-off, v(r) becomes
 
     v(r) + constant - integral of p(x) dx,   x = r - start,   p(x) = linear + quadratic x² + cubic x³   (r > start)
 
@@ -29,19 +29,19 @@ from numpy.polynomial import Polynomial as Polynomials
 from numpy.polynomial import chebyshev
 
 from rigidmd.compile import implements, is_a, kernel
-from rigidmd.compile.simd import inverse_root, larger, polynomial
+from rigidmd.compile.simd import inverse_square_root, maximum, polynomial
 
-Name = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
-NAMES: tuple[str, ...] = get_args(Name)
+TruncationName = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
+TRUNCATIONS: tuple[str, ...] = get_args(TruncationName)
 
 
-class Plain(NamedTuple):
+class Unmodified(NamedTuple):
     """No change of the force inside the cut-off; `plain` and `shift`."""
 
     cutoff: float  # Å, may be infinite
 
 
-class Bent(NamedTuple):
+class ForceShifted(NamedTuple):
     """A polynomial is added to the force beyond the start; `force_shift` and `force_switch`."""
 
     cutoff: float  # Å
@@ -62,28 +62,30 @@ class SmoothlySwitched(NamedTuple):
     start: float  # Å
 
 
-Shape = Plain | Bent | Switched | SmoothlySwitched
-Polynomial = tuple[float, float, float, float]
+Truncation = Unmodified | ForceShifted | Switched | SmoothlySwitched
+TruncationTerms = tuple[float, float, float, float]
 SWITCHES = {"switch": Switched, "smooth_switch": SmoothlySwitched}
 
 
-def shape_of(name: Name, cutoff: float, start: float) -> Shape:
-    """The shape of the ending `name`; `start` (Å) matters for force_switch, switch and smooth_switch only."""
+def truncation_of(name: TruncationName, cutoff: float, start: float) -> Truncation:
+    """The truncation of the ending `name`; `start` (Å) matters for force_switch, switch and smooth_switch only."""
     if cutoff == inf or name in ("plain", "shift"):
-        return Plain(cutoff)
+        return Unmodified(cutoff)
     if name in SWITCHES:
         return SWITCHES[name](cutoff, start)
-    return Bent(cutoff, 0.0 if name == "force_shift" else start)
+    return ForceShifted(cutoff, 0.0 if name == "force_shift" else start)
 
 
-def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, float, float]]) -> Polynomial:
+def truncation_terms(
+    name: TruncationName, truncation: Truncation, at_cutoff: Callable[[float], tuple[float, float, float]]
+) -> TruncationTerms:
     """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) gives its energy v, force -v' and -v''."""
-    if shape.cutoff == inf or name == "plain" or name in SWITCHES:
+    if truncation.cutoff == inf or name == "plain" or name in SWITCHES:
         return (0.0, 0.0, 0.0, 0.0)
-    v, force, slope = at_cutoff(shape.cutoff)
+    v, force, slope = at_cutoff(truncation.cutoff)
     if name == "shift":
         return (-v, 0.0, 0.0, 0.0)
-    d = shape.cutoff - shape.start
+    d = truncation.cutoff - truncation.start
     if name == "force_shift":
         return (-v - force * d, -force, 0.0, 0.0)
     quadratic = (slope - 3 * force / d) / d
@@ -93,16 +95,16 @@ def ending(name: Name, shape: Shape, at_cutoff: Callable[[float], tuple[float, f
 
 #: k and c of a switch S = 1 + t^(k+1) (c0 + c1 t + c2 t² + ...), t = (r - start)/(cutoff - start). Its derivative by t
 #: is (k + 1) c0 t^k (1 - t)^k.
-SERIES = {Switched: (2, (-10, 15, -6)), SmoothlySwitched: (4, (-126, 420, -540, 315, -70))}
+SWITCH_SERIES = {Switched: (2, (-10, 15, -6)), SmoothlySwitched: (4, (-126, 420, -540, 315, -70))}
 
 
-class Addend(NamedTuple):
+class SwitchTerm(NamedTuple):
     """t^k (b0 + b1 t + b2 t² + ...): what a switch adds to p in the force/r p/r^(p+2) of 1/r^p."""
 
     coefficients: tuple[float, ...]
 
 
-class Correction(NamedTuple):
+class SwitchCorrection(NamedTuple):
     """(x + 1)² (b0 + b1 x + b2 x² + ...): what `switch` adds to force/r. It needs no root.
 
     x goes from -1 at the start to 1 at the cut-off, evenly in r². In powers of x + 1 the terms would be thousands of
@@ -114,87 +116,87 @@ class Correction(NamedTuple):
 
 #: Of endings that are no switch.
 NO_SWITCH = ()
-#: The error of a `Correction`, relative to its largest value, and the most coefficients that it may have.
-CORRECTION_ERROR, MOST_COEFFICIENTS = 2e-7, 18
+#: The error of a `SwitchCorrection`, relative to its largest value, and the most coefficients that it may have.
+CORRECTION_ERROR, MAX_COEFFICIENTS = 2e-7, 18
 
 
-def addend_of(shape: Shape, powers: dict[int, float], dtype: type) -> Addend | tuple[()]:
+def switch_term_of(truncation: Truncation, powers: dict[int, float], dtype: type) -> SwitchTerm | tuple[()]:
     """The addend of a power c/r^p, given as {p: c}, or of a sum of powers, to the coefficient of the highest of them.
 
     It is exact: of r^-p, force/r becomes r^-(p+2) (p S - r S'), and S is a polynomial in t, as r is. Fractions keep all
     digits where powers cancel, as those of a reaction field do. None of `smooth_switch` in single precision: its terms
     are up to 1e4 times their sum.
     """
-    if type(shape) not in SERIES or (isinstance(shape, SmoothlySwitched) and dtype == np.float32):
+    if type(truncation) not in SWITCH_SERIES or (isinstance(truncation, SmoothlySwitched) and dtype == np.float32):
         return NO_SWITCH
-    k, series = SERIES[type(shape)]
-    start, width = Fraction(shape.start), Fraction(shape.cutoff) - Fraction(shape.start)
+    k, series = SWITCH_SERIES[type(truncation)]
+    start, width = Fraction(truncation.start), Fraction(truncation.cutoff) - Fraction(truncation.start)
     t, left = Polynomials([Fraction(0), Fraction(1)]), Polynomials([Fraction(1), Fraction(-1)])
     r = start + width * t
     fall = sum((c * t ** (n + 1) for n, c in enumerate(series)), t * 0)  # of S, less 1, over t^k
     slope = (k + 1) * series[0] * left**k / width
     of_powers = [Fraction(c) * r ** (max(powers) - p) * (p * fall - r * slope) for p, c in powers.items()]
-    return Addend(tuple(float(b) for b in sum(of_powers).coef))
+    return SwitchTerm(tuple(float(b) for b in sum(of_powers).coef))
 
 
-def correction_of(shape: Shape, powers: dict[int, float], dtype: type) -> Correction | tuple[()]:
-    """The correction of a sum of powers, given as for `addend_of`, in single precision.
+def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype: type) -> SwitchCorrection | tuple[()]:
+    """The correction of a sum of powers, given as for `switch_term_of`, in single precision.
 
     None in double precision, where it would have too many coefficients; nor of a switch that is too wide; nor of
     `smooth_switch`, whose terms would be a thousand times their sum.
     """
-    if not isinstance(shape, Switched) or dtype != np.float32 or shape.start == 0:
+    if not isinstance(truncation, Switched) or dtype != np.float32 or truncation.start == 0:
         return NO_SWITCH
-    of_highest = Polynomials(addend_of(shape, powers, np.float64).coefficients)
+    of_highest = Polynomials(switch_term_of(truncation, powers, np.float64).coefficients)
 
     def over_square(x: np.ndarray) -> np.ndarray:
-        square = shape.cutoff**2 - shape.start**2
-        r = np.sqrt(shape.start**2 + (x + 1) / 2 * square)
-        per_x = square / (2 * (r + shape.start) * (shape.cutoff - shape.start))  # t is per_x (x + 1)
+        square = truncation.cutoff**2 - truncation.start**2
+        r = np.sqrt(truncation.start**2 + (x + 1) / 2 * square)
+        per_x = square / (2 * (r + truncation.start) * (truncation.cutoff - truncation.start))  # t is per_x (x + 1)
         return per_x**2 * of_highest(per_x * (x + 1)) * r ** -(max(powers) + 2.0)
 
     x = np.linspace(-1, 1, 200)
     with np.errstate(all="ignore"):  # a switch from almost 0 on is too wide
-        found = chebyshev.chebinterpolate(over_square, 2 * MOST_COEFFICIENTS)
+        found = chebyshev.chebinterpolate(over_square, 2 * MAX_COEFFICIENTS)
         largest = np.abs((x + 1) ** 2 * over_square(x)).max()
     left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]  # at most, without this coefficient and those after it
     count = int(np.argmax(left_out < CORRECTION_ERROR * largest))
-    if not 0 < count <= MOST_COEFFICIENTS:
+    if not 0 < count <= MAX_COEFFICIENTS:
         return NO_SWITCH
-    return Correction(tuple(chebyshev.cheb2poly(found[:count]).tolist()))
+    return SwitchCorrection(tuple(chebyshev.cheb2poly(found[:count]).tolist()))
 
 
-def addend(shape, switched, r):
-    """An `Addend` at distances r; 0 below the start, and of anything else."""
+def switch_term(truncation, switched, r):
+    """An `SwitchTerm` at distances r; 0 below the start, and of anything else."""
     raise TypeError("compiled code only")
 
 
-@implements(addend, inline=True)
-def _addend(shape, switched, r):
-    if not is_a(switched, Addend):
-        return lambda shape, switched, r: 0.0
-    power = squared if is_a(shape, Switched) else to_the_fourth
+@implements(switch_term, inline=True)
+def _switch_term(truncation, switched, r):
+    if not is_a(switched, SwitchTerm):
+        return lambda truncation, switched, r: 0.0
+    power = squared if is_a(truncation, Switched) else to_the_fourth
 
-    def addend(shape, switched, r):
-        t = beyond(shape, r)
+    def switch_term(truncation, switched, r):
+        t = switch_coordinate(truncation, r)
         return power(t) * polynomial(switched.coefficients, t)
 
-    return addend
+    return switch_term
 
 
-def correction(shape, switched, r2):
-    """A `Correction` at squared distances r2; 0 below the start, and of anything else."""
+def correction(truncation, switched, r2):
+    """A `SwitchCorrection` at squared distances r2; 0 below the start, and of anything else."""
     raise TypeError("compiled code only")
 
 
 @implements(correction, inline=True)
-def _correction(shape, switched, r2):
-    if not is_a(switched, Correction):
-        return lambda shape, switched, r2: 0.0
+def _correction(truncation, switched, r2):
+    if not is_a(switched, SwitchCorrection):
+        return lambda truncation, switched, r2: 0.0
 
-    def correction(shape, switched, r2):
-        first, last = shape.start * shape.start, shape.cutoff * shape.cutoff
-        x = larger(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
+    def correction(truncation, switched, r2):
+        first, last = truncation.start * truncation.start, truncation.cutoff * truncation.cutoff
+        x = maximum(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
         return squared(x + 1.0) * polynomial(switched.coefficients, x)
 
     return correction
@@ -213,75 +215,78 @@ def to_the_fourth(x):
 
 
 @kernel(inline=True, outer=True)
-def beyond(shape, r):
+def switch_coordinate(truncation, r):
     """t of a switch: 0 up to the start, 1 at the cut-off."""
-    return larger((r - shape.start) * (1 / (shape.cutoff - shape.start)), 0.0)
+    return maximum((r - truncation.start) * (1 / (truncation.cutoff - truncation.start)), 0.0)
 
 
-def ended(shape, end, switched, r2, inverse, u, w):
-    """(energy, force/r) with the ending, from u, w without it at squared distances r2; scalars or vectors.
+def truncated(truncation, terms, switched, r2, inverse, u, w):
+    """(energy, force/r) with the truncation_terms, from u, w without it at squared distances r2; scalars or vectors.
 
-    u already includes the constant of `end`. inverse : 1/r, where `needs_root` says so. switched : the addend or
-    correction that w already has; without one, a switch multiplies the energy here, whatever the law
+    u already includes the constant of `terms`. inverse : 1/r, where `needs_root` says so. switched : the addend or
+    correction that w already has; without one, a switch multiplies the energy here, whatever the potential
     """
     raise TypeError("compiled code only")
 
 
-def needs_root(shape, switched) -> bool:
+def needs_root(truncation, switched) -> bool:
     """Whether a force with an ending needs 1/r, by their Numba types."""
-    return not is_a(shape, Plain) and not is_a(switched, Correction)
+    return not is_a(truncation, Unmodified) and not is_a(switched, SwitchCorrection)
 
 
-@implements(ended, inline=True)
-def _ended(shape, end, switched, r2, inverse, u, w):
-    if is_a(shape, Plain):
-        return lambda shape, end, switched, r2, inverse, u, w: (u, w)
-    if is_a(shape, Bent):
+@implements(truncated, inline=True)
+def _truncated(truncation, terms, switched, r2, inverse, u, w):
+    if is_a(truncation, Unmodified):
+        return lambda truncation, terms, switched, r2, inverse, u, w: (u, w)
+    if is_a(truncation, ForceShifted):
 
-        def bent(shape, end, switched, r2, inverse, u, w):
-            du, df = added(end, larger(r2 * inverse - shape.start, 0.0))
+        def bent(truncation, terms, switched, r2, inverse, u, w):
+            du, df = truncation_polynomial(terms, maximum(r2 * inverse - truncation.start, 0.0))
             return u + du, w + df * inverse
 
         return bent
 
-    factor = quintic if is_a(shape, Switched) else nonic
+    factor = quintic if is_a(truncation, Switched) else nonic
     if len(switched) > 0:  # the root is for the energy alone
-        return lambda shape, end, switched, r2, inverse, u, w: (factor(shape, r2 * inverse_root(r2))[0] * u, w)
+        return lambda truncation, terms, switched, r2, inverse, u, w: (
+            factor(truncation, r2 * inverse_square_root(r2))[0] * u,
+            w,
+        )
 
-    def multiplied(shape, end, switched, r2, inverse, u, w):
-        s, slope = factor(shape, r2 * inverse)
+    def multiplied(truncation, terms, switched, r2, inverse, u, w):
+        s, slope = factor(truncation, r2 * inverse)
         return s * u, s * w - slope * u * inverse
 
     return multiplied
 
 
 @kernel(inline=True, outer=True)
-def added(end, x):
+def truncation_polynomial(terms, x):
     """(energy, force) that an ending adds at x = r - start >= 0, without its constant."""
-    linear = end[1]
-    quadratic = end[2]
-    cubic = end[3]
+    linear = terms[1]
+    quadratic = terms[2]
+    cubic = terms[3]
     x2 = x * x
     return -1.0 * x * (linear + x2 * (quadratic / 3 + x * (cubic / 4))), linear + x2 * (quadratic + x * cubic)
 
 
 @kernel(inline=True, outer=True)
-def quintic(shape, r):
-    """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, with t of `beyond`."""
-    t = beyond(shape, r)
+def quintic(truncation, r):
+    """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, with t of `switch_coordinate`."""
+    t = switch_coordinate(truncation, r)
     left = 1.0 - t
-    slope = t * t * left * left * (-30.0 / (shape.cutoff - shape.start))
+    slope = t * t * left * left * (-30.0 / (truncation.cutoff - truncation.start))
     return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), slope
 
 
 @kernel(inline=True, outer=True)
-def nonic(shape, r):
-    """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t of `beyond`."""
-    t = beyond(shape, r)
+def nonic(truncation, r):
+    """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t of `switch_coordinate`."""
+    t = switch_coordinate(truncation, r)
     four = t * t * t * t
     left2 = (1.0 - t) * (1.0 - t)
     s = 1.0 - four * t * (126.0 - t * (420.0 - t * (540.0 - t * (315.0 - 70.0 * t))))
-    return s, four * left2 * left2 * (-630.0 / (shape.cutoff - shape.start))
+    return s, four * left2 * left2 * (-630.0 / (truncation.cutoff - truncation.start))
 
 
-POLYNOMIALS = {Switched: quintic, SmoothlySwitched: nonic}
+SWITCH_FUNCTIONS = {Switched: quintic, SmoothlySwitched: nonic}

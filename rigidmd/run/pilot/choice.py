@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.drift import ENERGY_ERROR
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import State
+from rigidmd.core.statistics import ENERGY_ERROR
 from rigidmd.errors import SimulationError
-from rigidmd.run.pilot.trials import TrialSystem, Trial, final_state, state_difference, measure_errors
-from rigidmd.run.pilot.energy_walk import EnergyWalk, energy_walk
+from rigidmd.run.pilot.energy_walk import EnergyWalk, measure_energy_walk
+from rigidmd.run.pilot.trials import Trial, TrialSystem, final_state, measure_errors, state_difference
 
 #: Tried in this order. A later one is given up at a step that is too long and costs more.
 CANDIDATES = ("srkn_4", "two_stage", "velocity_verlet", "pefrl", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
@@ -48,8 +48,16 @@ class Choice(NamedTuple):
 class _Search:
     """The longest steps of the candidates within a target for an error (an attribute of `Trial`) over a time."""
 
-    def __init__(self, trial_system: TrialSystem, target: float, error: str, longest: dict[str, float], exact: State | None):
-        self.trial_system, self.target, self.error, self.longest, self.exact = trial_system, target, error, longest, exact
+    def __init__(
+        self, trial_system: TrialSystem, target: float, error: str, longest: dict[str, float], exact: State | None
+    ):
+        self.trial_system, self.target, self.error, self.longest, self.exact = (
+            trial_system,
+            target,
+            error,
+            longest,
+            exact,
+        )
         self.energy_walk: EnergyWalk | None = None
         self.time = trial_system.span
         self.slow: dict[str, float] = {}  # regular errors over a longer pilot, in those of the short one
@@ -173,7 +181,7 @@ def choose(
 def _over(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
     """The best trial for a run that is longer than its pilots, its expected error, and in words how it was found."""
     span, target = search.trial_system.span, search.target
-    search.energy_walk, search.time = energy_walk(search.trial_system, first.timestep), duration
+    search.energy_walk, search.time = measure_energy_walk(search.trial_system, first.timestep), duration
     search.target = SAFE * target
     long = min(duration, MOST * span, max(LEAST * span, PART * duration))
     best, value, seen = first, search.expected(first), first

@@ -131,7 +131,7 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     scheme = integrator_of_stage(pilot, k)
     moving = engine.begin(state, scheme)
     moving.step[:] = 0
-    moving.begin_stretch(0.0)
+    moving.begin_segment(0.0)
     every = round(PILOT_RADIANS / PILOT_STEP / PILOT_SAMPLES)
     seen = []
     for measure_errors in range(PILOT_SAMPLES):

@@ -14,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.drift import slope
 from rigidmd.core.integrators import RK4, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.core.statistics import mean
+from rigidmd.core.statistics import mean, slope
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.observables import Observation
 from rigidmd.engines.ode import OdeEngine
@@ -118,7 +117,9 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
-    conserved_errors: dict[str, float] = field(default_factory=dict)  # largest relative errors of other conserved quantities
+    conserved_errors: dict[str, float] = field(
+        default_factory=dict
+    )  # largest relative errors of other conserved quantities
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
@@ -177,7 +178,7 @@ class IntegratorAccuracy:
                 found.append(trial)
         return found
 
-    def time_for(self, integrator: str, error: str, target: float) -> "Reached | None":
+    def time_for(self, integrator: str, error: str, target: float) -> "ReachedError | None":
         """Where an integrator reaches an error, between its trials; None if its shortest step is not exact enough.
 
         At most its longest step, or `STABLE_FRACTION` of it where a longer one diverges.
@@ -230,7 +231,9 @@ def measure(
     steps = 2 * -(-2 * most // reference.force_evaluations)
     exact = final_state(trial_system, reference, steps)
     own_error = state_difference(exact, final_state(trial_system, reference, steps // 2))
-    result = IntegratorAccuracy(trial_system, trials, steps, max(state_difference for state_difference in own_error if not np.isnan(state_difference)), averages)
+    result = IntegratorAccuracy(
+        trial_system, trials, steps, max(error for error in own_error if not np.isnan(error)), averages
+    )
     for trial in trials:  # compile and measure errors
         measure_errors(trial_system, trial, exact)
     if extend:
@@ -364,7 +367,9 @@ def _largest_difference(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.abs(x - y).max()) if len(x) else np.nan
 
 
-def measure_errors(trial_system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS) -> None:
+def measure_errors(
+    trial_system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS
+) -> None:
     """One run that measures all errors of a trial. Its end is compared with `exact`."""
     engine, state = _begin_trial(trial_system, trial)
     first = trial_system.energy(engine, state)

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.integrators import DRIFT, KICK, Scheme
-from rigidmd.run.pilot.trials import TrialSystem, Trial, measure_errors
+from rigidmd.run.pilot.trials import Trial, TrialSystem, measure_errors
 
 #: The integrator of the pilot runs: its own regular error is small beside the walk.
 PILOT_INTEGRATOR = "srkn_6"
@@ -66,7 +66,7 @@ def weight(scheme: Scheme, jump: float) -> float:
     return float(np.sum(np.abs(total) ** 2 / n ** (2 * jump + 2)))
 
 
-def energy_walk(trial_system: TrialSystem, timestep: float) -> EnergyWalk:
+def measure_energy_walk(trial_system: TrialSystem, timestep: float) -> EnergyWalk:
     """The walk, from runs at about this step (in the subject's unit) and at half of it."""
     scheme, rates = trial_system.methods[PILOT_INTEGRATOR].scheme, []
     if not isinstance(scheme, Scheme):

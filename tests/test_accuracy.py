@@ -1,4 +1,4 @@
-"""`rigidmd precision`: what it measures, what it says, what it writes."""
+"""`rigidmd accuracy`: measurements, recommendations, files."""
 
 import csv
 import dataclasses
@@ -14,27 +14,27 @@ from support import (
     ROOT,
     SCHEMES,
     SPRING,
+    IntegratorAccuracy,
     Method,
-    Precision,
     Trial,
     averages,
     averages_report,
-    body_subject,
+    body_trial_system,
     choosing,
     extrapolate,
     measure,
     measuring,
-    precision,
+    measure_accuracy,
     sampling,
     small_scene,
     springs,
-    timing,
-    write_precision,
+    time_span,
+    write_accuracy,
 )
 from support import BiasPoint as Point
-from support import precision_advice as advice
-from support import precision_row as row
-from support import precision_table as table_text
+from support import accuracy_recommendations as recommendations
+from support import accuracy_row as row
+from support import accuracy_table as table_text
 
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
@@ -48,13 +48,13 @@ TOP = ROOT / "systems" / "heavy_top_3.toml"
 def short_timings():
     """Seconds of computing are not what most of these tests are about."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measuring, "TIMED", 0.002)
+        patch.setattr(measuring, "TIMING_SECONDS", 0.002)
         yield
 
 
 @pytest.fixture(scope="module")
 def top(short_timings):
-    return precision(Scene.read(TOP), ["velocity_verlet", "srkn_4", "srkn_6"], span=0.4, repeats=3)
+    return measure_accuracy(Scene.read(TOP), ["velocity_verlet", "srkn_4", "srkn_6"], span=0.4, repeats=3)
 
 
 def trials(found, name):
@@ -96,7 +96,7 @@ class Clockwork:
         """As `Engine.begin`."""
         return state.copy()
 
-    def advance(self, state, scheme, dt, until, looked=False):
+    def advance(self, state, scheme, dt, until, observed=False):
         """As `Engine.advance`."""
         steps, self.at = max(0, until - self.at), until
         if self.at > self.lasts:
@@ -111,48 +111,48 @@ class Clockwork:
 @pytest.fixture
 def clockwork(monkeypatch):
     """(subject, engines made) of a subject moved by clockwork, for a given lifetime in steps."""
-    monkeypatch.setattr(measuring, "TIMED", 0.2)
+    monkeypatch.setattr(measuring, "TIMING_SECONDS", 0.2)
     monkeypatch.setattr(measuring.clock, "perf_counter", lambda: Clockwork.now)
 
-    def subject(goes_on, lasts=10**9):
+    def trial_system(can_continue, lasts=10**9):
         made = []
         method = Method(lambda: Clockwork(made, lasts), SCHEMES["velocity_verlet"])
-        own, _ = body_subject(Scene.read(TOP), 0.1)
-        return dataclasses.replace(own, methods={"velocity_verlet": method}, goes_on=goes_on), made
+        own, _ = body_trial_system(Scene.read(TOP), 0.1)
+        return dataclasses.replace(own, methods={"velocity_verlet": method}, can_continue=can_continue), made
 
-    return subject
+    return trial_system
 
 
 @pytest.mark.parametrize("steps", [1, 25, 1000])
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_a_timing_is_of_warm_steps_and_of_nothing_else(clockwork, steps, goes_on):
+def test_a_timing_is_of_warm_steps_and_of_nothing_else(clockwork, steps, can_continue):
     """25 steps of 216 waters took 40 ms where a new engine began with them, and 20 ms after that."""
-    subject, made = clockwork(goes_on)
+    trial_system, made = clockwork(can_continue)
     began = Clockwork.now
-    seconds = timing(subject, Trial("velocity_verlet", 1e-3, steps, steps))
+    seconds = time_span(trial_system, Trial("velocity_verlet", 1e-3, steps, steps))
     assert seconds == pytest.approx(1e-3 * steps)
     assert Clockwork.now - began > 0.2
     assert len(made) == 1
     spans = -(-0.2 // (5e-3 + 1e-3 * steps))
-    assert made[0].at == (steps * spans if goes_on else 0)
+    assert made[0].at == (steps * spans if can_continue else 0)
 
 
 def test_a_step_that_is_good_for_the_span_only_is_timed_on_the_span(clockwork):
-    subject, made = clockwork(goes_on=True, lasts=60)
-    assert timing(subject, Trial("velocity_verlet", 1e-3, 25, 25)) == pytest.approx(0.025)
+    trial_system, made = clockwork(can_continue=True, lasts=60)
+    assert time_span(trial_system, Trial("velocity_verlet", 1e-3, 25, 25)) == pytest.approx(0.025)
     assert made[0].at <= 60
-    subject, _ = clockwork(goes_on=True, lasts=20)
+    trial_system, _ = clockwork(can_continue=True, lasts=20)
     with pytest.raises(SimulationError):
-        timing(subject, Trial("velocity_verlet", 1e-3, 25, 25))
+        time_span(trial_system, Trial("velocity_verlet", 1e-3, 25, 25))
 
 
 def test_timings_alternate_between_trials(monkeypatch):
     order = []
-    monkeypatch.setattr(measuring, "timing", lambda subject, trial: order.append(trial.steps) or 1e-3 * len(order))
-    subject, _ = body_subject(Scene.read(TOP), 0.01)
+    monkeypatch.setattr(measuring, "time_span", lambda trial_system, trial: order.append(trial.steps) or 1e-3 * len(order))
+    trial_system, _ = body_trial_system(Scene.read(TOP), 0.01)
     trials = [Trial("velocity_verlet", 0.01 / n, n, n) for n in (2, 3, 4)]
     shares = []
-    measure(subject, trials, 2, say=shares.append)
+    measure(trial_system, trials, 2, say=shares.append)
     assert order == [2, 3, 4, 2, 3, 4]
     assert [trial.seconds for trial in trials] == [[1e-3, 4e-3], [2e-3, 5e-3], [3e-3, 6e-3]]
     assert shares == pytest.approx(np.arange(1, 7) / 6)
@@ -160,11 +160,11 @@ def test_timings_alternate_between_trials(monkeypatch):
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning:matplotlib")  # an axis on which all points have one value
 def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_path):
-    subject, _ = body_subject(Scene.read(TOP), 0.1)
+    trial_system, _ = body_trial_system(Scene.read(TOP), 0.1)
 
     def told(*seconds):
         trials = [Trial("velocity_verlet", 1e-3, 100, 100, list(s), *[1e-6] * 6) for s in seconds]
-        found = Precision(subject, trials, 1000, 1e-14)
+        found = IntegratorAccuracy(trial_system, trials, 1000, 1e-14)
         return found, "\n".join(advice(found))
 
     found, words = told((1.0, 1.1, 1.19), (1.0, 1.0, 1.0))
@@ -177,8 +177,8 @@ def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_p
     assert "timed once" in words
     assert "warning" not in words
     assert "±" not in table_text(found).splitlines()[1].replace("drift        ±", "drift")
-    write_precision(tmp_path, found, "a command")
-    with (tmp_path / "precision.csv").open() as file:
+    write_accuracy(tmp_path, found, "a command")
+    with (tmp_path / "accuracy.csv").open() as file:
         assert [line["spread (%)"] for line in csv.DictReader(file)] == ["", ""]
 
 
@@ -202,17 +202,17 @@ def test_the_front_and_the_advice_follow_from_the_numbers(top):
 
 def made(*rows, span=0.1):
     """A body's trials (integrator, step, seconds of three timings or a reason to fail, energy and Q error)."""
-    subject, _ = body_subject(Scene.read(TOP), span)
+    trial_system, _ = body_trial_system(Scene.read(TOP), span)
     trials = []
     for name, step, seconds, error in rows:
         n = round(span / step)
         trial = Trial(name, step, n, n, rotation_error=error, energy_rms=error)
         if isinstance(seconds, str):
-            trial.fault = seconds
+            trial.failure = seconds
         else:
             trial.seconds = list(seconds)
         trials.append(trial)
-    return Precision(subject, trials, 1000, 1e-14)
+    return IntegratorAccuracy(trial_system, trials, 1000, 1e-14)
 
 
 def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a_longest_step_keeps():
@@ -253,24 +253,24 @@ def test_no_advantage_is_claimed_within_the_spread_of_the_timings(slow, fast):
 
 @pytest.mark.parametrize(("longest", "steps"), [(0.05, [12, 25, 50, 100]), (1.0, [6, 12, 25, 50, 100])])
 def test_ladders_continue_to_longer_steps_until_one_fails_or_is_too_long_for_the_span(longest, steps, monkeypatch):
-    def look(subject, trial, exact):
+    def measure_errors(trial_system, trial, exact):
         trial.energy_rms = 1e-9
-        trial.fault = "diverges" if trial.timestep > longest else ""
+        trial.failure = "diverges" if trial.timestep > longest else ""
 
-    subject, _ = body_subject(Scene.read(TOP), 1.0)
-    monkeypatch.setattr(measuring, "look", look)
-    monkeypatch.setattr(measuring, "end_of", lambda *_: subject.state)
-    monkeypatch.setattr(measuring, "timing", lambda *_: 1.0)
+    trial_system, _ = body_trial_system(Scene.read(TOP), 1.0)
+    monkeypatch.setattr(measuring, "measure_errors", measure_errors)
+    monkeypatch.setattr(measuring, "final_state", lambda *_: trial_system.state)
+    monkeypatch.setattr(measuring, "time_span", lambda *_: 1.0)
     for extend, expected in ((True, steps), (False, [50, 100])):
-        trials = measuring.plan(subject, {"velocity_verlet": [0.02, 0.01]})
-        found = measure(subject, trials, 1, extend=extend).trials
+        trials = measuring.plan(trial_system, {"velocity_verlet": [0.02, 0.01]})
+        found = measure(trial_system, trials, 1, extend=extend).trials
         assert [trial.steps for trial in found] == expected
         assert [trial.diverged for trial in found] == [trial.timestep > longest for trial in found]
 
 
 def test_a_step_that_is_too_long_diverges_and_is_stopped():
     scene = Scene.read(ROOT / "systems" / "water_dimer.toml")
-    found = precision(scene, ["velocity_verlet"], [1.0, 80.0], span=2.4, repeats=1)
+    found = measure_accuracy(scene, ["velocity_verlet"], [1.0, 80.0], span=2.4, repeats=1)
     good, bad = found.trials
     assert not good.diverged
     assert bad.diverged
@@ -283,7 +283,7 @@ def test_a_step_that_is_too_long_diverges_and_is_stopped():
 def test_molecules_start_where_the_last_stage_does():
     stages = [{"ensemble": "nvt", "temperature_K": 200.0, "duration_ps": 0.2}, {"duration_ps": 1.0}]
     scene = small_scene({"nitrogen": 8}, 18.5, stages=stages)
-    found = precision(scene, ["velocity_verlet", "srkn_6"], [8.0, 4.0], repeats=1)
+    found = measure_accuracy(scene, ["velocity_verlet", "srkn_6"], [8.0, 4.0], repeats=1)
     assert "kT per degree of freedom, at the" in "\n".join(advice(found))
     verlet = trials(found, "velocity_verlet")
     assert verlet[0].energy_rms / verlet[1].energy_rms == pytest.approx(4, rel=0.5)
@@ -292,29 +292,29 @@ def test_molecules_start_where_the_last_stage_does():
 
 def test_mixed_precision_says_what_its_forces_lose():
     scene = small_scene({"spce": 60}, 18.5, precision="mixed")
-    found = precision(scene, ["velocity_verlet"], [2.0], span=0.01, repeats=1)
-    force, torque = found.subject.rounding
+    found = measure_accuracy(scene, ["velocity_verlet"], [2.0], span=0.01, repeats=1)
+    force, torque = found.trial_system.rounding
     assert 1e-8 < force < 1e-5 and 1e-8 < torque < 1e-5
     assert f"forces differ from double ones by {force:.1e} of their rms" in "\n".join(advice(found))
-    assert precision(small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1).subject.rounding is None
+    assert measure_accuracy(small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1).trial_system.rounding is None
 
 
 def test_only_what_keeps_its_order_is_tried():
     wheel = Scene.read(ROOT / "systems" / "satellite_wheel.toml")
-    found = precision(wheel, span=5.0, repeats=1)
+    found = measure_accuracy(wheel, span=5.0, repeats=1)
     names = {trial.integrator for trial in found.trials}
     assert "suzuki_4" in names
     assert "srkn_6" not in names
     said = "\n".join(advice(found))
     assert "srkn_6: the free motion of a body with wheels has no exact flow: it would be of order 2\n" in said
     with pytest.raises(SceneError, match=r"srkn_6 does not suit this scene: .* wheels .*: it would be of order 2$"):
-        precision(wheel, ["srkn_6"])
+        measure_accuracy(wheel, ["srkn_6"])
     with pytest.raises(SceneError, match="there is no rk5"):
-        precision(wheel, ["rk5"])
+        measure_accuracy(wheel, ["rk5"])
 
 
 def test_steps_suit_what_is_fast_in_a_body():
-    compass = precision(Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1)
+    compass = measure_accuracy(Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1)
     # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's turning
     assert not any(trial.diverged for trial in compass.trials[-3:])
     assert compass.trials[-1].rotation_error < 1e-6
@@ -322,18 +322,18 @@ def test_steps_suit_what_is_fast_in_a_body():
 
 def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     folder = tmp_path / "p"
-    command = ["precision", str(TOP), "--integrators", "velocity_verlet,srkn_6", "--timesteps", "0.002,0.001",
+    command = ["accuracy", str(TOP), "--integrators", "velocity_verlet,srkn_6", "--timesteps", "0.002,0.001",
                "--span", "0.1", "--repeats", "1", "-o", str(folder)]  # fmt: skip
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "velocity_verlet" in said
-    assert "precision.html" in said
-    with (folder / "precision.csv").open() as file:
+    assert "accuracy.html" in said
+    with (folder / "accuracy.csv").open() as file:
         rows = list(csv.reader(file))
     assert len(rows) == 5
     assert float(rows[1][1]) == pytest.approx(0.002)
-    assert (folder / "precision.png").read_bytes().startswith(b"\x89PNG")
-    page = (folder / "precision.html").read_text()
+    assert (folder / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "accuracy.html").read_text()
     assert page.count("<svg") == 1
     assert "<script" not in page
     trials = page[page.index(">All trials</h2>") :]
@@ -341,7 +341,7 @@ def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     assert "the cheapest is" in page
     assert main(command) == 2  # nothing is overwritten
     assert main([*command, "--force"]) == 0
-    assert main(["precision", str(TOP), "--timesteps", "a"]) == 2
+    assert main(["accuracy", str(TOP), "--timesteps", "a"]) == 2
     capsys.readouterr()
 
 
@@ -353,7 +353,7 @@ def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     (["--averages", "--integrators", "rk5"], "there is no rk5"),
 ])  # fmt: skip
 def test_arguments_are_refused_before_anything_is_compiled_or_run(arguments, error, capsys, tmp_path):
-    water = ["precision", str(ROOT / "systems" / "water.toml"), "-o", str(tmp_path / "p")]
+    water = ["accuracy", str(ROOT / "systems" / "water.toml"), "-o", str(tmp_path / "p")]
     thermal = ["--set", "stages.1.ensemble=nvt", "--set", "stages.1.temperature_K=298.15"]
     assert main([*water, *thermal, *arguments]) == 2
     said = capsys.readouterr()
@@ -372,7 +372,7 @@ def water():
 
 
 def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
-    found = precision(water, ["velocity_verlet", "srkn_4"], [4.0, 1.0], span=0.02, repeats=1, averages=3.0)
+    found = measure_accuracy(water, ["velocity_verlet", "srkn_4"], [4.0, 1.0], span=0.02, repeats=1, averages=3.0)
     coarse, fine = trials(found, "velocity_verlet")
     loss = {}
     for trial in (coarse, fine):
@@ -392,17 +392,17 @@ def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
     assert "T_rot - T_trans (K): on the steps" in said
     assert "(reference)" in said
     assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(advice(found))
-    written = write_precision(tmp_path, found, "a command")
-    rows = list(csv.DictReader((tmp_path / "precision_averages.csv").read_text().splitlines()))
-    assert [path.name for path in written][-1] == "precision_averages.csv"
+    written = write_accuracy(tmp_path, found, "a command")
+    rows = list(csv.DictReader((tmp_path / "accuracy_averages.csv").read_text().splitlines()))
+    assert [path.name for path in written][-1] == "accuracy_averages.csv"
     assert float(rows[0]["T_rot unbiased (K)"]) == pytest.approx(coarse.averages["T_rot unbiased"][0])
-    assert "Averages over 3 ps" in (tmp_path / "precision.html").read_text()
+    assert "Averages over 3 ps" in (tmp_path / "accuracy.html").read_text()
 
 
 def test_comparators_stand_beside_the_schemes_and_fail_in_words():
     upright = tomllib.loads(TOP.read_text()) | {"start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}}
     names = ["velocity_verlet", "rk4", "rk4_quaternion", "rk4_euler_angles", "dop853"]
-    found = precision(Scene.from_dict(upright), names, [1e-3, 5e-4], span=0.2, repeats=1)
+    found = measure_accuracy(Scene.from_dict(upright), names, [1e-3, 5e-4], span=0.2, repeats=1)
     assert {trial.integrator for trial in found.trials if trial.diverged} == {"rk4_euler_angles"}
     assert "rk4_euler_angles: the Euler angles became singular" in "\n".join(advice(found))
     drift = {trial.integrator: trial.orthogonality_error for trial in found.trials if not trial.diverged}
@@ -422,22 +422,22 @@ def changed(**run):
 def test_the_formulation_of_the_scene_is_the_one_measured():
     errors = {}
     for name in ("rk4_matrix", "rk4_quaternion", "rk4_euler_angles"):
-        (trial,) = precision(Scene.read(TOP), [name], [1e-3], span=0.2, repeats=1).trials
+        (trial,) = measure_accuracy(Scene.read(TOP), [name], [1e-3], span=0.2, repeats=1).trials
         assert trial.integrator == name.removesuffix("_matrix")
         errors[name.removeprefix("rk4_")] = trial.rotation_error
     assert len(set(errors.values())) == 3
     for form in FORMULATIONS:
-        (trial,) = precision(changed(integrator="rk4", formulation=form), ["rk4"], [1e-3], span=0.2, repeats=1).trials
+        (trial,) = measure_accuracy(changed(integrator="rk4", formulation=form), ["rk4"], [1e-3], span=0.2, repeats=1).trials
         assert trial.rotation_error == errors[form]
 
 
 @pytest.fixture
 def planned(monkeypatch):
     """(names tried, what was left out) by default on a scene; nothing is run."""
-    monkeypatch.setattr(choosing, "measure", lambda subject, trials, *_: Precision(subject, trials, 1, 0.0))
+    monkeypatch.setattr(choosing, "measure", lambda trial_system, trials, *_: IntegratorAccuracy(trial_system, trials, 1, 0.0))
 
     def plan(scene):
-        found = precision(scene)
+        found = measure_accuracy(scene)
         return {trial.integrator for trial in found.trials}, found.left_out
 
     return plan
@@ -466,12 +466,12 @@ def test_what_cannot_be_measured_is_left_out_in_words(planned):
     _, left_out = planned(Scene.read(ROOT / "systems" / "gyroscope_friction.toml"))
     assert left_out["rk4"] == "dry friction jumps where a body stops, which it cannot step over"
     with pytest.raises(SceneError, match="rk4_quaternion does not suit this scene: it is for single bodies"):
-        precision(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["rk4_quaternion"])
+        measure_accuracy(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["rk4_quaternion"])
 
 
 def test_help_names_the_formulations(capsys):
     with pytest.raises(SystemExit):
-        main(["precision", "--help"])
+        main(["accuracy", "--help"])
     said = capsys.readouterr().out
     assert "--integrators rk4,rk4_quaternion,rk4_euler_angles" in said
     assert "dop853_euler_angles" in said
@@ -479,12 +479,12 @@ def test_help_names_the_formulations(capsys):
 
 def test_what_else_is_kept_is_shown(top):
     verlet = trials(top, "velocity_verlet")[0]
-    assert set(verlet.kept) == {"L_z", "L_3"}
-    assert max(verlet.kept.values()) < 1e-12
+    assert set(verlet.conserved_errors) == {"L_z", "L_3"}
+    assert max(verlet.conserved_errors.values()) < 1e-12
     assert "L_z" in table_text(top).splitlines()[1]
-    dimer = precision(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["velocity_verlet"], [1.0], repeats=1)
-    assert set(dimer.trials[0].kept) == {"momentum", "L"}
-    assert max(dimer.trials[0].kept.values()) < 1e-11
+    dimer = measure_accuracy(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["velocity_verlet"], [1.0], repeats=1)
+    assert set(dimer.trials[0].conserved_errors) == {"momentum", "L"}
+    assert max(dimer.trials[0].conserved_errors.values()) < 1e-11
 
 
 def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():
@@ -604,18 +604,18 @@ def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypat
     scene = small_scene({"argon": 40}, 18.5, start={"temperature_K": 90.0}, stages=[{"duration_ps": 0.1}, stage])
     monkeypatch.setattr(Scene, "read", lambda path, overrides: scene)
     folder = tmp_path / "p"
-    command = ["precision", "liquid.toml", "--averages", "--sample-ps", "20", "--timesteps", "5,10,400",
+    command = ["accuracy", "liquid.toml", "--averages", "--sample-ps", "20", "--timesteps", "5,10,400",
                "--integrators", "velocity_verlet", "-o", str(folder)]  # fmt: skip
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "bias of averages over 20 ps of npt" in said
     assert "velocity_verlet + velocity_rescaling at 400 fs: stopped at step" in said
-    with (folder / "precision.csv").open() as file:
+    with (folder / "accuracy.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["step (fs)"] for row in rows] == ["5.0", "10.0", "400.0"]
     assert float(rows[0]["density (g/cm³)"]) > 0
     assert rows[2]["density (g/cm³)"] == ""
-    told = json.loads((folder / "precision.json").read_text())
+    told = json.loads((folder / "accuracy.json").read_text())
     assert told["runs"][0]["averages"]["density"]["mean"] == float(rows[0]["density (g/cm³)"])
     assert told["runs"][2]["fault"].startswith("stopped at step")
     assert "pressure" not in told["quantities"]
@@ -630,11 +630,11 @@ def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypat
 
 def test_averages_need_a_thermostat_at_one_temperature(capsys):
     water = str(ROOT / "systems" / "water.toml")
-    assert main(["precision", water, "--averages"]) == 2
+    assert main(["accuracy", water, "--averages"]) == 2
     said = capsys.readouterr().err
     assert "--averages samples the last stage, and nve has no thermostat" in said
     assert len([line for line in said.splitlines() if "averages" in line]) == 1
-    assert main(["precision", water, "--sample-ps", "3"]) == 2
+    assert main(["accuracy", water, "--sample-ps", "3"]) == 2
     assert "it goes with --averages" in capsys.readouterr().err
     with pytest.raises(SceneError, match="a single body has no thermostat"):
         averages(Scene.read(TOP))
@@ -667,7 +667,7 @@ def test_orders_cost_and_temperatures_of_512_waters():
         "stages.0.duration_ps": 10.0,
     }  # fmt: skip
     scene = Scene.read(ROOT / "systems" / "water.toml", changes)
-    found = precision(scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1)
+    found = measure_accuracy(scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1)
     for name, order, margin, most in (
         ("velocity_verlet", 2, 0.1, 0.1), ("chin_4a", 4, 0.2, 1e-3), ("srkn_4", 4, 0.2, 1e-3)
     ):  # fmt: skip
@@ -676,7 +676,7 @@ def test_orders_cost_and_temperatures_of_512_waters():
         slope = np.log(a.rotation_error / b.rotation_error) / np.log(a.timestep / b.timestep)
         assert a.rotation_error / b.rotation_error > 10
         assert slope == pytest.approx(order, abs=margin)
-    unit = found.subject.energy_size / 100 / 512  # of the energy error, in kJ/mol per molecule
+    unit = found.trial_system.energy_size / 100 / 512  # of the energy error, in kJ/mol per molecule
     for trial in found.trials:
         trial.seconds = [float(trial.forces)]  # in forces, which no noise can touch
     target = 1e-5 / unit
@@ -684,7 +684,7 @@ def test_orders_cost_and_temperatures_of_512_waters():
     best = min(at.seconds for name in ("two_stage", "chin_4a", "srkn_4", "srkn_6")
                if (at := found.time_for(name, "energy_rms", target)))  # fmt: skip
     assert verlet / best > 2
-    found = precision(scene, ["velocity_verlet"], [4.0, 2.0], span=0.02, repeats=1, averages=40.0)
+    found = measure_accuracy(scene, ["velocity_verlet"], [4.0, 2.0], span=0.02, repeats=1, averages=40.0)
     for trial in found.trials:
         on, on_error = trial.averages["T_rot - T_trans"]
         unbiased, error = trial.averages["T_rot - T_trans unbiased"]
